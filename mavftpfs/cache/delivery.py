@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 
 import trio
 
@@ -47,8 +48,8 @@ log = logging.getLogger("mavftpfs.cache")
 MISMATCHES = 2
 """After so many copies that are not what was sent the delivery fails."""
 
-LATE_WRITES = 1.0
-"""Seconds before it is sent again: over two radios a copy of a write may come so late, into the new file."""
+RESEND_PAUSE = 1.0
+"""Seconds before it is sent again: what spoiled it may last a moment."""
 
 SENT_TWICE = 4096
 """Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
@@ -225,7 +226,7 @@ class Deliverer:
                 if mismatches == MISMATCHES or isinstance(error.__cause__, Armed):  # none can be checked
                     raise
                 log.warning("%s; sending it again", error)
-                await trio.sleep(LATE_WRITES)
+                await trio.sleep(RESEND_PAUSE)
             except MavftpfsError as error:
                 if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
@@ -240,18 +241,18 @@ class Deliverer:
             As Directories.ask and Verifier.check.
         """
         await self._cleaner.mend(node)
-        there = await self._context.directories.current(node.path) is not None
+        there = await self._context.directories.current(node.path)
         self._context.own.torn.pop(node.path, None)
         if draft.state is not State.TORN:
             return
-        try:
-            crc32 = await self.verifier.check(node.path, draft, doubted=True) if there else None
-        except VerificationFailed:
-            there = False
-        if there:
-            self._on_delivered(node, draft, crc32)
+        if there is None:
+            draft.base = None
         else:
-            draft.on(Event.REFUSED)
+            with suppress(VerificationFailed):
+                crc32 = await self.verifier.check(node.path, draft, doubted=True)
+                self._on_delivered(node, draft, crc32)
+                return
+        draft.on(Event.REFUSED)
 
     # --- sending
 
@@ -265,14 +266,15 @@ class Deliverer:
         await attempt.upload.finish()
         if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        doubted = self._context.store.in_doubt(attempt.begun_at)
-        crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
+        store = self._context.store
+        await store.settle(attempt.path)
+        crc32 = await self.verifier.check(attempt.path, draft, doubted=store.in_doubt(attempt.begun_at))
         if attempt.in_place:
             node.attempt = None
             await attempt.upload.end()
         else:
             await self._require_expected(node, draft)
-            await self._commit(node, draft, attempt)
+            await self._commit(node, draft, attempt, summed=crc32 is not None)
         self._on_delivered(node, draft, crc32)
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
@@ -324,25 +326,23 @@ class Deliverer:
         elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
             raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
 
-    async def _commit(self, node: Node, draft: Draft, attempt: Attempt) -> None:
-        """Rename what was sent and verified into place.
+    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, *, summed: bool) -> None:
+        """Rename what was sent and verified into place. summed: the vehicle told its CRC32.
 
         Raises:
-            As Names.rename and replace. VerificationFailed: it is not what it was any more.
+            As Names.rename and replace, and as _confirm.
         """
-        own, path = self._context.own, node.path
+        own, store, path = self._context.own, self._context.store, node.path
         node.attempt = None
         try:
             await attempt.upload.end()
             self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
+            compared = summed or store.in_doubt()  # that is as quick as a listing, and tells more
             if draft.base is None:
-                await self._names.rename(attempt.path, path)
+                await self._names.rename(attempt.path, path, compared=compared)
             else:
-                await self._names.replace(attempt.path, path)
-            if attempt.upload.resent and await self._names.size(path) != draft.size:
-                draft.interrupted(ours=True)
-                raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
+                await self._names.replace(attempt.path, path, compared=compared)
         except BaseException as error:
             draft.give_up()  # unless it commits already
             if draft.state is State.COMMITTING:
@@ -355,6 +355,30 @@ class Deliverer:
             raise
         finally:
             own.live.discard(attempt.path)  # what is left there is for the next listing to clean up
+        await self._confirm(node, draft, attempt)
+
+    async def _confirm(self, node: Node, draft: Draft, attempt: Attempt) -> None:
+        """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.
+
+        A copy of its CreateFile may have emptied it after it was compared, a copy of an earlier rename may
+        have taken it away, and some server may ACK a rename and do something else.
+
+        Raises:
+            VerificationFailed: it is not there. Else as Verifier.check. The draft is torn then.
+        """
+        store, path = self._context.store, node.path
+        doubted, unproven = store.in_doubt(attempt.begun_at), store.traits.rename_works is None
+        try:
+            if unproven or doubted:
+                await self.verifier.check(path, draft, doubted=doubted)
+            elif attempt.upload.resent and await self._names.size(path) != draft.size:
+                raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
+        except BaseException as error:
+            draft.interrupted(ours=True)
+            if unproven and isinstance(error, VerificationFailed):
+                await self._names.find_out(path)
+            raise
+        store.traits.rename_works = True
 
     # --- after
 

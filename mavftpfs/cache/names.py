@@ -41,6 +41,9 @@ from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
+KEEP_OLD = 10.0
+"""Seconds for which the old file is kept when it was replaced in doubt."""
+
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
 """Refusals that mean what they say; others do not tell whether the server replaces files at all."""
 
@@ -165,19 +168,36 @@ class Names:
             log.info("%r stays until its directory is listed again: %s", path, error)
             self._context.directories.expire(split(path)[0])
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
-        """Rename; both paths fit a request. completes: see VehicleStore. over: a file has the new name.
+    async def rename(
+        self,
+        old: bytes,
+        new: bytes,
+        *,
+        completes: bool = False,
+        over: bool = False,
+        compared: bool = False,
+    ) -> None:
+        """Rename; both paths fit a request. A listing confirms it until this server was seen to rename, and
+        in doubt.
+
+        completes: see VehicleStore. over: a file has the new name. compared: the caller looks at the file
+        itself, so no listing does.
 
         Raises:
-            NotSupported: the card cannot rename. AlreadyExists: the new name is not free, though not `over`.
-            Else as VehicleStore.
+            NotSupported: the card cannot rename, though its server may say that it did. AlreadyExists: the
+            new name is not free, though not `over`. Else as VehicleStore.
         """
         store = self._context.store
         if store.traits.rename_works is False:
             raise NotSupported("this server cannot rename")
         try:
             async with self._changing(old, new):
-                await store.rename(old, new, completes=completes)
+                confirm = not compared and (store.traits.rename_works is None or store.in_doubt())
+                await store.rename(old, new, completes=completes, confirm=confirm)
+        except NotSupported:
+            if store.traits.rename_works is None:
+                store.traits.rename_works = False
+            raise
         except FtpNak as nak:
             taken = nak.code == NakCode.FILE_EXISTS
             if store.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
@@ -187,14 +207,15 @@ class Names:
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
-        store.traits.rename_works = True
+        if not compared:
+            store.traits.rename_works = True
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
         """See on an empty file of ours whether the card can rename.
 
         A refusal of another rename does not tell: its number proves nothing (servers.md 12), and it may be
-        that name which the card does not take.
+        that name which the card does not take. Nor does an ACK: the file must be found under its new name.
 
         Raises:
             As VehicleStore, but FtpNak and OutcomeUnknown.
@@ -210,12 +231,16 @@ class Names:
         try:
             await context.store.create_empty(first)
             await context.store.rename(first, second)
-            left, context.store.traits.rename_works = second, True
+            left = second
+            await self.remove(second)
+            context.store.traits.rename_works = True
+            return
         except OutcomeUnknown:
             return  # the next listing removes it
         except FtpNak as nak:
-            if nak.opcode == Opcode.RENAME:
+            if nak.opcode == Opcode.RENAME or (left == second and not await self._is_listed(second)):
                 context.store.traits.rename_works = False
+                left = first
         finally:
             context.own.live -= {first, second}
             context.directories.expire(split(first)[0])
@@ -227,6 +252,7 @@ class Names:
         Raises:
             As VehicleStore: then the name has to stay.
         """
+        await self._forget_old(path)
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
         needed = own.live | set(own.torn.values()) - {own.torn.get(path)}
@@ -240,8 +266,10 @@ class Names:
 
     # --- giving a verified file its name
 
-    async def replace(self, source: bytes, target: bytes, *, keep_old: bool = False) -> bytes | None:
-        """Rename over a file that exists.
+    async def replace(
+        self, source: bytes, target: bytes, *, keep_old: bool = False, compared: bool = False
+    ) -> bytes | None:
+        """Rename over a file that exists. compared: see rename.
 
         keep_old: return the reserved name that this file has from now on, which is in `OwnNames.live`; None
         if it was gone.
@@ -256,7 +284,7 @@ class Names:
         traits = self._context.store.traits
         if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
             try:
-                await self.rename(source, target, over=True)
+                await self.rename(source, target, over=True, compared=compared)
                 traits.rename_replaces = True
                 return None
             except FtpNak as nak:
@@ -265,19 +293,20 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
+        await self._forget_old(target)
         own, moved = self._context.own, None
         aside = own.beside(target, Kind.OLD)
         own.live.add(aside)
         try:
             try:
-                await self.rename(target, aside)
+                await self.rename(target, aside, compared=compared)
                 moved = True
             except FtpNak as nak:
                 gone = errno_for(nak) == errno.ENOENT
                 if not gone or await self._context.directories.current(target) is not None:
                     raise
                 moved = False
-            await self.rename(source, target, completes=moved)
+            await self.rename(source, target, completes=moved, compared=compared)
         except (OutcomeUnknown, trio.Cancelled):
             if moved is not False:
                 self._note_torn(target, aside)
@@ -288,15 +317,38 @@ class Names:
             raise
         else:
             if moved and not keep_old:
-                await self.discard(aside)
+                await self._discard_old(target, aside)
         finally:
-            own.live.discard(aside)
+            if own.old.get(target, (b"", 0.0))[0] != aside:
+                own.live.discard(aside)
         if not (moved and keep_old):
             return None
         own.live.add(aside)
         return aside
 
     # --- inside
+
+    async def _discard_old(self, target: bytes, aside: bytes) -> None:
+        """Remove the file that a new one replaced. In doubt a listing has to show the new one first: a copy
+        of the first rename may have moved it over the old one. `Cleaner.remove_old` goes on."""
+        context = self._context
+        if not context.store.in_doubt():
+            await self.discard(aside)
+            context.own.live.discard(aside)
+        context.own.old[target] = (aside, context.clock() + KEEP_OLD)
+        context.retry_later()
+
+    async def _forget_old(self, path: bytes) -> None:
+        """Remove the old file of this name that is kept, if one is: the name is about to change again."""
+        own = self._context.own
+        aside, _ = own.old.pop(path, (b"", 0.0))
+        if aside in own.live:
+            own.live.discard(aside)
+            await self.remove_if_there(aside)
+
+    async def _is_listed(self, path: bytes) -> bool:
+        parent, name = split(path)
+        return name in (await self._context.directories.ask(parent)).entries
 
     def _note_torn(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""

@@ -188,6 +188,11 @@ class VehicleStore(RemoteStore, Protocol):
         """
         ...
 
+    async def settle(self, path: bytes) -> None:
+        """Return when no late copy of the CreateFile of this name is to be feared any more: at once, unless
+        copies were seen to come late."""
+        ...
+
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it: CreateFile + Terminate."""
         ...
@@ -204,7 +209,11 @@ class VehicleStore(RemoteStore, Protocol):
         """Remove what is known to be an empty directory."""
         ...
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
         """Rename; both paths together must fit one request (238 bytes). completes: without it a name stays
-        missing, so it is done though the vehicle was armed meanwhile."""
+        missing, so it is done though the vehicle was armed meanwhile. confirm: a listing has to show it.
+
+        Raises:
+            NotSupported: the listing shows that it was not done, though the server said so.
+        """
         ...

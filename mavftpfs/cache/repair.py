@@ -88,6 +88,16 @@ class Cleaner:
         for directory in {split(place)[0] for place in own.torn.values() if place not in own.live}:
             await self._list(directory)
 
+    async def remove_old(self, *, at_once: bool = False) -> None:
+        """Have the old files removed that were kept long enough: a listing shows whether the new ones are
+        there. One that was removed at once is looked for only if copies of requests came meanwhile."""
+        own, now = self._context.own, self._context.clock()
+        due = [path for path, (_, until) in own.old.items() if at_once or until <= now]
+        for path in due:
+            own.live.discard(own.old.pop(path)[0])
+        for directory in {split(path)[0] for path in due if self._context.store.in_doubt()}:
+            await self._list(directory)
+
     async def mend(self, node: Node) -> None:
         """Do so for one file, whose lock the caller has."""
         self._being_delivered.add(node)

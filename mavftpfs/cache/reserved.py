@@ -107,6 +107,8 @@ class OwnNames:
     Attributes:
         owner: the mount's token.
         live: names in use, so no listing's repair touches them.
+        old: paths that were replaced -> the name under which the old file lies, or lay, and until when it is
+            to be looked for there, by the caches' clock.
         torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies. What
             became of a draft is another question: its state says that.
     """
@@ -114,6 +116,7 @@ class OwnNames:
     def __init__(self, owner: bytes, rng: Random) -> None:
         self.owner = owner
         self.live: set[bytes] = set()
+        self.old: dict[bytes, tuple[bytes, float]] = {}
         self.torn: dict[bytes, bytes] = {}
         self._serial = rng.randrange(_SERIALS)
 
@@ -136,6 +139,9 @@ class OwnNames:
     def follow_rename(self, old: bytes, new: bytes) -> None:
         """A directory has another name."""
         rename_keys(self.torn, old, new)
+        rename_keys(self.old, old, new)
+        for path, (place, until) in self.old.items():
+            self.old[path] = (renamed(place, old, new), until)
         for path, place in self.torn.items():
             self.torn[path] = renamed(place, old, new)
         for path in list(self.live):

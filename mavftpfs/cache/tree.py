@@ -341,6 +341,10 @@ class Tree:
         await self._writing.drain(timeout)
         return self.undelivered()
 
+    async def tidy_up(self) -> None:
+        """Remove what is left on the vehicle of files that were replaced just now. For the end of a mount."""
+        await self._writing.tidy_up()
+
     def recover_to(self, directory: Path) -> Sequence[Path]:
         """Move what could not be delivered to a directory, which is made, with what is known of each file.
 

@@ -55,9 +55,9 @@ class Verifier:
         doubted: what was sent may be elsewhere, or older: the size alone proves nothing.
 
         Raises:
-            VerificationFailed: it is another file, or its CRC32 was not told though verify=crc. Armed: it is
-            not asked for now. SessionBusy: another client keeps it from being read back. Else as
-            VehicleStore.stat_size.
+            VerificationFailed: it is another file, or is gone, or its CRC32 was not told though verify=crc.
+            Armed: it is not asked for now. SessionBusy: another client keeps it from being read back. Else
+            as VehicleStore.stat_size.
         """
         options, crc32 = self._context.options, None
         if options.verify == "none" and not doubted:
@@ -72,7 +72,9 @@ class Verifier:
         if crc32 is not None and crc32 != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
         if not crc32:
-            size = await self._names.size(path)
+            size = await self._size(path)
+            if size is None:
+                raise VerificationFailed(f"{path!r} is not there any more")
             if size != draft.size:
                 raise VerificationFailed(f"{path!r} has {size} bytes there, {draft.size} were written")
         if crc32 is not None:
@@ -104,14 +106,18 @@ class Verifier:
                     return crc32 == base.crc32
         if context.directories.tells_times:
             return True
+        return await self._size(path) == base.size
+
+    # --- inside
+
+    async def _size(self, path: bytes) -> int | None:
+        """Return the size of a file on the vehicle, None if there is none."""
         try:
-            return await self._names.size(path) == base.size
+            return await self._names.size(path)
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
-            return False
-
-    # --- inside
+            return None
 
     def _go_without(self, path: bytes, error: Exception) -> None:
         """No checksum came.

@@ -233,6 +233,11 @@ class Writeback:
                 passing = any(isinstance(n.error, PASSING) for n in nodes if n.undelivered)
                 refused = 0 if passing else refused + 1
 
+    async def tidy_up(self) -> None:
+        """See Tree.tidy_up."""
+        if self._context.own.old and not self._context.store.is_silent():
+            await self._cleaner.remove_old(at_once=True)
+
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
         context, kept = self._context, []
@@ -317,10 +322,11 @@ class Writeback:
         looks at its heartbeats is no news to anybody."""
         nodes, own, (pause, longest) = self._context.nodes, self._context.own, PAUSES
         try:
-            while own.torn or any(n.undelivered and may_pass(n) for n in nodes):
+            while own.torn or own.old or any(n.undelivered and may_pass(n) for n in nodes):
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
                 await self._cleaner.mend_torn()
+                await self._cleaner.remove_old()
                 await self._deliver_each(lambda node: may_pass(node) and self._is_left_to_us(node))
         finally:
             self._retrying = False

@@ -224,6 +224,7 @@ async def attached(
                     await _list_root(connection, tree, deadline, options)
                 try:
                     yield Attached(connection, tree, Watcher(connection.status, writing=writing), notice)
+                    await tree.tidy_up()
                 finally:
                     connection.news.clear()  # the tree can begin nothing while the session is closed
                     if spool is not None and (rescue_for is None or not tree.undelivered()):

@@ -5,9 +5,7 @@ request twice, the second time late. Whatever shows that this happened raises th
 nothing outstanding and no repetition of ours explains, another FTP client, a session that vanished under us,
 a restart of the vehicle. For ten minutes from then on the caches compare what was written.
 
-Where requests were seen to come late, a name is not changed twice within that time, and a file that was sent
-is left alone for so long: a copy of its CreateFile, and one of the rename that follows, would put an empty
-file in the place of it.
+Where copies of requests were seen to come late, names rest between two changes (`LateCopies`).
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ from mavftpfs.protocol.payload import Opcode
 LASTS = 600.0
 """Seconds for which a doubt lasts: a second radio or another client stays for a while."""
 
-LEAST_LATE = 1.0
-MOST_LATE = 10.0
-"""Seconds by which a copy of a request is taken to be late at least, and at most."""
+LEAST_REST = 1.0
+MOST_REST = 10.0
+"""Seconds between two changes of a name, at least and at most, where copies of requests come late."""
 
 
 _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
@@ -51,19 +49,78 @@ def session_used_by(payload: bytes) -> int | None:
     return payload[_SESSION] if opcode in _OF_SESSIONS else None
 
 
+class LateCopies:
+    """Tells how long a name is to rest before it is changed again. All times are of the session's clock.
+
+    The copy of a request, carried out late, does to the name's next file what was meant for the last one: a
+    REMOVE removes it, a RENAME takes it away. So a name rests after such a request: for twice the largest
+    lateness that was seen in the last ten minutes, and a second at least. Where no copy was seen it does not
+    rest at all.
+
+    A file that CreateFile made rests for as long before it is compared, but without that least second: a copy
+    that comes even later empties it, which is found when it is compared again under its final name. But
+    copies of its CreateFile and of that rename, both later than all this, would put an empty file there.
+
+    Names that differ by case alone count as one, as on many cards.
+    """
+
+    def __init__(self) -> None:
+        self._lateness = 0.0
+        self._seen_at = -inf
+        self._changed: dict[bytes, float] = {}
+        self._made: dict[bytes, float] = {}
+
+    def saw(self, lateness: float, now: float) -> None:
+        """A copy was answered so many seconds after the request was sent first (0: that is not known)."""
+        if lateness >= self._lateness or not self._is_fresh(now):
+            self._lateness, self._seen_at = lateness, now
+
+    def on_changed(self, path: bytes, now: float) -> None:
+        """A request took the file of this name away, or may have done so."""
+        _remember(self._changed, path.lower(), now)
+
+    def on_made(self, path: bytes, now: float) -> None:
+        """CreateFile made, or emptied, the file of this name."""
+        _remember(self._made, path.lower(), now)
+
+    def on_replaced(self, path: bytes) -> None:
+        """The name got its file by a rename: a copy of that finds nothing to rename."""
+        self._changed.pop(path.lower(), None)
+        self._made.pop(path.lower(), None)
+
+    def rest(self, path: bytes, now: float) -> float:
+        """Return for how many seconds more the name is not to be changed."""
+        if not self._is_fresh(now):
+            return 0.0
+        twice, name = min(MOST_REST, 2 * self._lateness), path.lower()
+        changed = self._changed.get(name, -inf) + max(LEAST_REST, twice)
+        return max(0.0, changed - now, self._made.get(name, -inf) + twice - now)
+
+    def _is_fresh(self, now: float) -> bool:
+        return now - self._seen_at <= LASTS
+
+
+def _remember(times: dict[bytes, float], name: bytes, now: float) -> None:
+    """Note when something happened to a name, and forget what is too long ago to matter."""
+    times.pop(name, None)
+    times[name] = now  # the oldest are in front
+    while now - next(iter(times.values())) > MOST_REST:
+        del times[next(iter(times))]
+
+
 class Doubt:
     """Whether, and since when, what was ACKed is not believed without a look.
 
     Attributes:
         on_raised: called each time that what was read is in doubt, with the reason, for people.
+        late: which names rest.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self.on_raised: Callable[[str], None] = lambda reason: None
+        self.late = LateCopies()
         self._clock = clock
         self._at = self._reads_at = -inf
-        self._late = 0.0
-        self._late_at = -inf
 
     def raise_it(self, reason: str, *, reads: bool = True) -> None:
         """Something was noticed now; reads: what was read lately may be another file's, too."""
@@ -79,15 +136,3 @@ class Doubt:
     def reads_arose_since(self, at: float) -> bool:
         """Return whether what was read then may be another file's."""
         return self._reads_at >= at
-
-    def note_late(self, seconds: float) -> None:
-        """A copy of a request was answered so long after the request was sent first."""
-        now, late = self._clock(), min(MOST_LATE, max(LEAST_LATE, seconds))
-        if late >= self.lateness:
-            self._late, self._late_at = late, now
-
-    @property
-    def lateness(self) -> float:
-        """Seconds for which a copy of a request may still come: the most by which one was late in the last
-        ten minutes, within bounds; 0 if none was."""
-        return self._late if self._clock() - self._late_at <= LASTS else 0.0

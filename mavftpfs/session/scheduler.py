@@ -343,7 +343,7 @@ class Scheduler:
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in _OPENING
         other = opens and session is not None and session.seq != reply.seq
-        self.doubt.note_late(late)
+        self.doubt.late.saw(late, self.clock())
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
         if other:
             self.server.abandon()

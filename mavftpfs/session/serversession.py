@@ -254,6 +254,8 @@ class ServerSession:
             self._enter(State.OPEN, session)
         finally:
             self._opening = None
+            if opcode == Opcode.CREATE_FILE:
+                self.doubt.late.on_made(path, self.clock())
         return session
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
@@ -406,8 +408,6 @@ class ServerSession:
             SessionBusy: nothing is left that applies. FtpNak: nor did anything say that it was taken.
         """
         if left.closings and await self._close_ours(nak):
-            if left.closings < _LOST_ACKS:  # a copy of the open before found it closed, and opened it again
-                await trio.sleep(self.doubt.lateness)
             left.closings -= 1
             return
         if nak.code == NakCode.FAIL:

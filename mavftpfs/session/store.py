@@ -3,8 +3,7 @@
 Did that change happen? A request whose answer may have been lost can be carried out twice, and the second
 answer is then a refusal (docs/servers.md 14.4). Such a refusal, and a silence, are never interpreted: a
 listing tells what became of it. While there is doubt (session.doubt) the network may do the same to a request
-that we sent once. Then a name is not changed twice within the time by which requests were seen to be late,
-either: the same request, carried out late once more, would change what has the name by then.
+that we sent once. Then names rest between two changes: `_rest` is the one place that waits for late copies.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import trio
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.upload import Upload
@@ -28,6 +26,7 @@ from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
     MavftpfsError,
+    NotSupported,
     OutcomeUnknown,
     PathTooLong,
     RemoteProtocolError,
@@ -117,7 +116,7 @@ class Store:
         self._op_deadline = scheduler.server.op_deadline
         self._sent = 0
         self._under_way = 0
-        self._changed_at: dict[bytes, float] = {}
+        self._late = scheduler.doubt.late
 
     def why_lost(self) -> str | None:
         """Return why the vehicle counts as lost (see RemoteStore)."""
@@ -216,10 +215,11 @@ class Store:
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
         await self._rest(path)
-        try:
-            await self._scheduler.use_session(path, Opcode.CREATE_FILE)
-        finally:
-            self._note_changed(path)
+        await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+
+    async def settle(self, path: bytes) -> None:
+        """Wait as long as a copy of the CreateFile of this name may come (see VehicleStore)."""
+        await self._rest(path)
 
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
@@ -240,16 +240,20 @@ class Store:
         async with self._changing(path):
             await self._perform(request, partial(self._is_new_directory, path))
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
-        """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
+        """Rename; who reads the old path goes on under the new one. completes: in flight, too. confirm: the
+        ACK alone is not believed."""
         data = wire_path(old) + b"\0" + wire_path(new)
         if len(data) > RENAME_ROOM:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
+            is_renamed = partial(self._is_renamed, old, new)
+            await self._perform(partial(Simple, Opcode.RENAME, data), is_renamed)
+            if confirm:
+                await self._confirm(is_renamed)
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
-            self._changed_at.pop(new.lower(), None)  # nothing has the old name: a late copy is refused
+            self._late.on_replaced(new)
 
     @asynccontextmanager
     async def _changing(
@@ -269,25 +273,14 @@ class Store:
                 try:
                     yield
                 finally:
-                    self._note_changed(*paths)
+                    for path in paths:
+                        self._late.on_changed(path, self._clock())
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
 
     async def _rest(self, path: bytes) -> None:
-        """Wait while a late copy of the last change of this name may yet be carried out.
-
-        Names that differ by case alone count as one, as on many cards.
-        """
-        until = self._changed_at.get(path.lower(), -inf) + self._scheduler.doubt.lateness
-        await trio.sleep(max(0.0, until - self._clock()))
-
-    def _note_changed(self, *paths: bytes) -> None:
-        now = self._clock()
-        while self._changed_at and now - next(iter(self._changed_at.values())) > MOST_LATE:
-            del self._changed_at[next(iter(self._changed_at))]
-        for path in paths:
-            self._changed_at.pop(path.lower(), None)
-            self._changed_at[path.lower()] = now  # the oldest are in front
+        """Wait until the name may be changed (session.doubt: LateCopies)."""
+        await trio.sleep(self._late.rest(path, self._clock()))
 
     # --- did that change happen?
 
@@ -319,6 +312,19 @@ class Store:
                 return
             if outcome is not Outcome.UNDONE or last:
                 raise error
+
+    async def _confirm(self, verify: Verdict) -> None:
+        """Look whether a change is there that was ACKed. A listing that is not whole contradicts no ACK.
+
+        Raises:
+            NotSupported: it is not. OutcomeUnknown: nothing could be listed.
+        """
+        try:
+            outcome = await verify()
+        except MavftpfsError as error:
+            raise OutcomeUnknown(f"whether it was done cannot be seen: {error}") from error
+        if outcome in (Outcome.UNDONE, Outcome.CONFLICT):
+            raise NotSupported("the server says that it renamed, and its listing says that it did not")
 
     def _may_be_second(self, nak: FtpNak) -> bool:
         """Whether a refusal may answer the second execution of a request.

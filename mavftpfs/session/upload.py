@@ -163,7 +163,7 @@ class Upload(SessionUser):
         self._server.wake()
 
     async def finish(self) -> None:
-        """See cache.remote.Upload. Where requests were seen to come late, their copies have come by then."""
+        """See cache.remote.Upload."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(now := self._clock(), writing=True)
@@ -180,7 +180,6 @@ class Upload(SessionUser):
             if self.error is not None:
                 raise self.error
             await self._changed.park()
-        await trio.sleep(self._scheduler.doubt.lateness)
 
     async def end(self) -> None:
         """See cache.remote.Upload."""

@@ -17,11 +17,12 @@ import trio
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
-from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, crc32
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
+    CrossDevice,
     FileChanged,
     FileTooLarge,
     FtpNak,
@@ -31,6 +32,7 @@ from mavftpfs.shared.errors import (
     VerificationFailed,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.replies import ack
 from tests.support.rigs import KINDS, Rig, card, list_all, read_file, rig, write_file
 from tests.support.worlds import content
 
@@ -61,7 +63,7 @@ async def test_a_new_file_gets_its_name_when_it_is_whole(each: Rig, data: bytes)
     await file.release()
     assert each.data(FRESH) == data
     assert True not in named[: 1 + each.renames]
-    assert each.count(Opcode.CALC_FILE_CRC32) == bool(data) * (1 + (not each.renames))
+    assert each.count(Opcode.CALC_FILE_CRC32) == 2 * bool(data), "the first of a mount is compared again"
     opened = each.count(Opcode.OPEN_FILE_RO)
     assert await read_file(tree, FRESH) == data
     assert not data or each.count(Opcode.OPEN_FILE_RO) == opened, "what was just written is known"
@@ -83,6 +85,64 @@ async def test_a_refusal_of_that_moment_is_not_taken_for_a_card_that_cannot_rena
     await write_file(here.mount(), FILE, NEW)
     assert here.data(FILE) == NEW
     assert here.connection.store.traits.rename_works
+
+
+def never_rename(here: Rig, *, loses: bool) -> None:
+    """Have the server ACK each rename, and do nothing; or remove the file."""
+
+    def answer(request: Payload) -> list[Payload] | None:
+        if request.opcode != Opcode.RENAME:
+            return None
+        if loses:
+            with suppress(OSError):
+                here.world.tree.remove(request.data.split(b"\0")[0])
+        return [ack(request)]
+
+    here.server.answer = answer
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("loses", [False, True], ids=["does nothing", "removes it"])
+@pytest.mark.parametrize("size", [0, 600, 50_000])
+@pytest.mark.parametrize("verify", ["auto", "crc", "size", "none"])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+async def test_a_server_that_says_that_it_renames_and_does_not(
+    profile: str, verify: str, size: int, loses: bool
+) -> None:
+    """Each close() said that the file is there, and nothing was on the card."""
+    async with rig(profile, {FILE: OLD}) as here:
+        tree = here.mount(verify=verify)
+        never_rename(here, loses=loses)
+        for path in (FRESH, b"/d/newer"):
+            await write_file(tree, path, content(size))
+            assert here.data(path) == content(size)
+        if size:
+            with pytest.raises(NotSupported):
+                await write_file(tree, FILE, content(size))
+            assert here.data(FILE) == OLD
+
+
+@pytest.mark.parametrize("loses", [False, True], ids=["does nothing", "removes it"])
+@pytest.mark.parametrize("doubted", [False, True])
+async def test_nor_is_it_believed_when_a_program_renames(here: Rig, doubted: bool, loses: bool) -> None:
+    tree = here.mount()
+    if doubted:
+        await write_file(tree, FRESH, NEW)
+        here.connection.scheduler.doubt.raise_it("a copy was late")
+    never_rename(here, loses=loses)
+    with pytest.raises(CrossDevice):
+        await tree.rename(OTHER, b"/d/another")
+    assert here.files().get(OTHER) == (None if loses else NEW)
+
+
+async def test_renames_are_confirmed_once(here: Rig) -> None:
+    tree = here.mount()
+    await tree.list(b"/d")
+    for name, listings in ((b"/d/a", 2), (b"/d/b", 0)):
+        listed = here.count(Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
+        await tree.rename(OTHER if name == b"/d/a" else b"/d/a", name)
+        now = here.count(Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
+        assert now - listed == listings
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
@@ -240,7 +300,7 @@ async def test_a_mismatch_is_sent_once_more(each: Rig) -> None:
     each.faults.spoil = 1
     await write_file(each.mount(), FRESH, NEW)
     assert each.data(FRESH) == NEW
-    assert each.count(Opcode.CALC_FILE_CRC32) == 2 + (not each.renames)
+    assert each.count(Opcode.CALC_FILE_CRC32) == 3, "one more for the first of a mount"
 
 
 async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(here: Rig) -> None:
@@ -264,7 +324,7 @@ async def test_an_unanswered_checksum_counts_as_verified_by_size_unless_it_is_de
         await write_file(here.mount(verify="crc"), b"/d/newer", NEW)
 
 
-@pytest.mark.parametrize(("verify", "asked"), [("size", 0), ("none", 0), ("auto", 0), ("crc", 1)])
+@pytest.mark.parametrize(("verify", "asked"), [("size", 0), ("none", 0), ("auto", 0), ("crc", 2)])
 async def test_what_is_too_large_or_not_wanted_is_not_summed(here: Rig, verify: str, asked: int) -> None:
     await write_file(here.mount(verify=verify, verify_max=100), FRESH, NEW)
     assert here.count(Opcode.CALC_FILE_CRC32) == asked

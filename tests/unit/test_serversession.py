@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from itertools import pairwise
 from typing import cast
 
 import pytest
@@ -80,15 +79,3 @@ async def test_a_plain_failure_costs_no_silence(resent: bool, autojump_clock: Mo
         await made.open(b"/f")
     assert (len(driver.log) > 1 and driver.log[1][1] is Opcode.TERMINATE_SESSION) is resent
     assert driver.log[-1][0] == driver.log[0][0]
-
-
-async def test_what_was_closed_twice_is_opened_only_when_late_copies_came(autojump_clock: MockClock) -> None:
-    """Over two radios a copy of each open opened it once more, and the next was refused for that."""
-    made, driver, _ = server(NakCode.NO_SESSIONS_AVAILABLE)
-    made.doubt.raise_it("as if a copy had been late")
-    made.doubt.note_late(2.0)
-    with pytest.raises(SessionBusy):
-        await made.open(b"/f")
-    opened = [at for at, opcode in driver.log if opcode is Opcode.OPEN_FILE_RO]
-    assert opened[1] == opened[0], "it may have been one alone"
-    assert [later - earlier for earlier, later in pairwise(opened[1:5])] == [2.0] * 3
