@@ -235,7 +235,7 @@ class Writeback:
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
-        if self._context.own.old and not self._context.store.is_silent():
+        if self._context.own.old and self._context.store.why_lost() is None:
             await self._cleaner.remove_old(at_once=True)
 
     def recover_to(self, directory: Path) -> list[Path]:
