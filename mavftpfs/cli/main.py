@@ -306,6 +306,16 @@ def _status_parser(name: str) -> Parser:
     return parser
 
 
+def _hub_parser(name: str) -> Parser:
+    parser = Parser(f"mavftpfs {name}", description="Show what shares a port, or stop that.", epilog=_SOURCES)
+    parser.add_argument("source", metavar="SOURCE", nargs="?", help="only this port; default: all")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--stop", action="store_true", help="end it; says first what that would cut")
+    parser.add_argument("--force", action="store_true", help="with --stop: also what is in use")
+    parser.add_argument("--take-over", help=argparse.SUPPRESS)
+    return parser
+
+
 def _recover_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
@@ -377,6 +387,12 @@ def _demo(args: argparse.Namespace) -> int:
     return run()
 
 
+def _hub(args: argparse.Namespace) -> int:
+    from mavftpfs.cli.ports import hub
+
+    return hub(args)
+
+
 def _verb(name: str) -> Run:
     """Return the command of that name without a mount."""
 
@@ -404,6 +420,7 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "rmdir": (_rmdir_parser, _verb("rmdir")),
     "mv": (_mv_parser, _verb("mv")),
     "crc": (_crc_parser, _verb("crc")),
+    "hub": (_hub_parser, _hub),
     "recover": (_recover_parser, _verb("recover")),
     "sim": (_sim_parser, _sim),
     "demo": (_demo_parser, _demo),

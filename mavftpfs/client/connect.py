@@ -29,7 +29,9 @@ from mavftpfs.client.options import Options
 from mavftpfs.client.status import Watcher, holder_of, snapshot
 from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.link.base import Link
-from mavftpfs.link.opening import open_link
+from mavftpfs.link.hublink import Wish
+from mavftpfs.link.messages import Address
+from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.driver import PayloadTrace
@@ -139,15 +141,16 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 
 
 @asynccontextmanager
-async def opened(spec: LinkSpec) -> AsyncIterator[Link]:
-    """Open a link for the length of the body, as open_link.
+async def opened(spec: LinkSpec, settings: ConnectOptions) -> AsyncIterator[Link]:
+    """Open a link for the length of the body, alone or with other programs of ours.
 
     Raises:
-        LinkClosed: as open_link; a mount that has the port or the device is named.
+        LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
     """
+    wish = Wish(Address(settings.source_system, settings.source_component), name=process_name())
     async with AsyncExitStack() as stack:
         try:
-            link = await stack.enter_async_context(open_link(spec))
+            link = await stack.enter_async_context(open_shared(spec, wish))
         except LinkClosed as exc:
             cause = exc.__cause__
             status = None
@@ -199,7 +202,7 @@ async def attached(
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
     writing = writing and not options.read_only
-    async with opened(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
+    async with opened(spec, settings) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
         caches = replace(cache_options(options, spec), read_only=not writing)
@@ -229,6 +232,11 @@ async def attached(
                     connection.news.clear()  # the tree can begin nothing while the session is closed
                     if spool is not None and (rescue_for is None or not tree.undelivered()):
                         spool.discard()
+
+
+def process_name() -> str:
+    """Return what a hub shows people of this program: its words, and its number."""
+    return f"{' '.join(sys.argv[1:4])} (process {os.getpid()})"
 
 
 @asynccontextmanager

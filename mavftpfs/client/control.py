@@ -11,10 +11,8 @@ import hashlib
 import json
 import logging
 import os
-import pwd
 import select
 import socket
-import stat
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import suppress
@@ -24,6 +22,9 @@ from typing import Any
 import trio
 
 from mavftpfs.shared.errors import MavftpfsError, MountFailed
+from mavftpfs.shared.private import directories_of, own_directories, private_directory
+
+__all__ = ["directories_of", "own_directories"]
 
 log = logging.getLogger("mavftpfs.control")
 
@@ -37,7 +38,6 @@ QUEUE = 128
 """Clients that wait in the kernel until they are taken."""
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
-_MAX_SOCKET_PATH = 107
 _SUFFIX = ".sock"
 
 
@@ -52,23 +52,6 @@ class NobodyThere(ControlError):
 # -- where the sockets are ------------------------------------------------------------------------
 
 
-def own_directories() -> list[Path]:
-    """Return where this user's sockets may lie, the preferred place first.
-
-    A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
-    """
-    runtime, home = os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("HOME")
-    given = [Path(runtime) / "mavftpfs"] if runtime else []
-    return list(dict.fromkeys([*given, *directories_of(os.getuid(), home)]))
-
-
-def directories_of(uid: int, home: str | None = None) -> list[Path]:
-    """Return where any user's sockets may lie; home: if it is not the one in the table of users."""
-    with suppress(KeyError):
-        home = home or pwd.getpwuid(uid).pw_dir
-    return [Path(f"/run/user/{uid}/mavftpfs"), Path(home or "/tmp") / ".cache" / "mavftpfs"]
-
-
 def socket_name(mountpoint: str) -> str:
     """Return the socket's file name for a mountpoint (an absolute path)."""
     digest = hashlib.sha256(mountpoint.encode("utf-8", "surrogateescape")).hexdigest()
@@ -81,17 +64,9 @@ def usable_directory(directories: list[Path]) -> Path:
     Raises:
         ControlError: none can.
     """
-    for directory in directories:
-        try:
-            # Not parents=True for a runtime directory: only the system creates /run/user/UID.
-            directory.parent.mkdir(mode=0o700, exist_ok=True)
-            directory.mkdir(mode=0o700, exist_ok=True)
-            facts = directory.lstat()
-        except OSError:
-            continue
-        ours = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o077
-        if ours and len(os.fsencode(directory)) + 1 + len(socket_name("")) <= _MAX_SOCKET_PATH:
-            return directory
+    found = private_directory(directories, longest_name=len(socket_name("")))
+    if found is not None:
+        return found
     raise ControlError(
         f"no private directory for the control socket (tried {', '.join(map(str, directories))})"
     )

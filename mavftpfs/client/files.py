@@ -253,12 +253,22 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
 async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     """Return the files of the mount that has this link now, if it is up, of the vehicle that is wanted, and
     we may read it."""
+    for status in await mounts_on(spec):
+        with suppress(KeyError, TypeError):
+            if is_wanted(status, options):
+                return session_on(status, options.root)
+    return None
+
+
+async def mounts_on(spec: LinkSpec) -> list[Mapping[str, Any]]:
+    """Return the status of each mount that has this link now and may be read by us."""
+    found = []
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await mount_status(mountpoint)
-            if has_link(status, spec) and is_wanted(status, options):
-                return session_on(status, options.root)
-    return None
+            if has_link(status, spec):
+                found.append(status)
+    return found
 
 
 def is_wanted(status: Mapping[str, Any], options: Options) -> bool:

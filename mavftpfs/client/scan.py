@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import trio
 
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
-from mavftpfs.client.files import Target, mount_status
+from mavftpfs.client.files import Target, mount_status, mounts_on
 from mavftpfs.client.options import Options
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer
 from mavftpfs.session.connection import HEARD_SOON, connected
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
+from mavftpfs.shared.errors import FtpNak, LinkClosed, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import readable_time
 
 Entry = dict[str, Any]
@@ -41,19 +42,34 @@ async def scan(target: Target) -> list[Entry]:
     if target.mount is not None:
         return _of_mount(await mount_status(target.mount[0]))
     assert target.spec is not None
-    status = await mount_with(target.spec)
-    if status is not None:
+    statuses = await mounts_on(target.spec)
+    found = [_own_entry(status) for status in statuses]
+    try:
+        async with opened(target.spec, connect_options(target.options)) as link:
+            found += await _ask_others(
+                link, target, {Address(one["system"], one["component"]) for one in found}
+            )
+    except LinkClosed:  # the mount is another user's, who does not share the port
+        status = await mount_with(target.spec)
+        if status is None:
+            raise
         return _of_mount(status)
+    return sorted(found, key=itemgetter("system", "component"))
+
+
+async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list[Entry]:
+    """Return who else is heard, and who of them answers MAVLink FTP."""
+    assert target.spec is not None
     options = target.options
     deadline = trio.current_time() + options.connect_timeout
-    async with opened(target.spec) as link:
-        heard = await _listen(link, options, partial(target.sinks.tell, waiting(target.spec, options)))
-        found = []
-        for left, address in zip(range(len(heard), 0, -1), sorted(heard), strict=True):
-            share = (deadline - trio.current_time()) / left
-            patience = min(PROBE_TIME, max(LEAST_PROBE, share))
-            found.append(await _probe(link, options, heard[address], patience))
-        return found
+    heard = await _listen(link, options, partial(target.sinks.tell, waiting(target.spec, options)))
+    others = sorted(heard.keys() - mounted)
+    found = []
+    for left, address in zip(range(len(others), 0, -1), others, strict=True):
+        share = (deadline - trio.current_time()) / left
+        patience = min(PROBE_TIME, max(LEAST_PROBE, share))
+        found.append(await _probe(link, options, heard[address], patience))
+    return found
 
 
 async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
@@ -138,11 +154,10 @@ def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
     return seen
 
 
-def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
-    """Return what a mount tells of its vehicle, and whom else it hears; nobody can be asked while it has the
-    link."""
-    vehicle, lost, mounted = status["vehicle"], status["link"]["state"] == "lost", status["mountpoint"]
-    own: Entry = {
+def _own_entry(status: Mapping[str, Any]) -> Entry:
+    """Return what a mount tells of its vehicle."""
+    vehicle, lost = status["vehicle"], status["link"]["state"] == "lost"
+    return {
         "system": vehicle["system"],
         "component": vehicle["component"],
         "what": f"{vehicle['autopilot'] or 'unknown'}, {'armed' if vehicle['armed'] else 'disarmed'}",
@@ -151,14 +166,20 @@ def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
         "armed": vehicle["armed"],
         "firmware": vehicle["firmware"],
         "uid": vehicle["uid"],
-        "ftp": f"mounted on {mounted}",
+        "ftp": f"mounted on {status['mountpoint']}",
         "answers": not lost,
         "seen": ["the vehicle is silent"] if lost else [],
         "facts": status["connection"],
     }
+
+
+def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
+    """Return what a mount tells of its vehicle, and whom else it hears: the others are not asked."""
+    own = _own_entry(status)
     heard = [
         Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
         for facts in status["connection"]["heard"]
     ]
-    others = [one for one in heard if one.source != (vehicle["system"], vehicle["component"])]
-    return [own, *(_entry(one, f"not asked (the mount on {mounted} has the link)") for one in others)]
+    others = [one for one in heard if one.source != (own["system"], own["component"])]
+    reason = f"not asked (the mount on {status['mountpoint']} has the link)"
+    return [own, *(_entry(one, reason) for one in others)]

@@ -15,6 +15,7 @@ from typing import Protocol
 import trio
 
 from mavftpfs.link.addresses import NetAddress
+from mavftpfs.link.messages import Address
 
 MAX_DATAGRAM = 1400
 """Bytes: below any usual MTU, and far below PX4's receive chunk (31 frames in one datagram were cut)."""
@@ -31,10 +32,24 @@ class LinkStats:
     reopened: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Seat:
+    """Who we are on a port that several of ours share: our MAVLink address there, and the link id that our
+    signatures carry, so that the times in them do not collide."""
+
+    own: Address
+    number: int
+
+
 class Link(Protocol):
-    """A byte or datagram pipe."""
+    """A byte or datagram pipe.
+
+    Attributes:
+        seat: who we are there, where that is not ours to choose; it may change while the link is reopened.
+    """
 
     stats: LinkStats
+    seat: Seat | None
 
     @property
     def description(self) -> str:
@@ -84,6 +99,14 @@ class Link(Protocol):
 
     def keep_peer(self) -> None:
         """The peer that is served was heard just now: its connection keeps its place some seconds more."""
+        ...
+
+    def focus(self, system: int) -> None:
+        """From now on only one system matters: a port that is shared leaves out what concerns others only."""
+        ...
+
+    def descriptors(self) -> list[int]:
+        """Return the open descriptors with which another process can go on (`opening.open_link`)."""
         ...
 
     async def aclose(self) -> None:

@@ -22,8 +22,10 @@ when the next datagram begins with a frame of its own.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 from fastcrc import crc16
@@ -55,11 +57,79 @@ STORAGE_INFORMATION_ID = 261
 _V2 = 0xFD
 _V1 = 0xFE
 _SIGNED = 1
-_HIGHEST_ID = 0xFFFF  # no public dialect goes beyond; keeps garbage from claiming 280 bytes
+HIGHEST_ID = 0xFFFF
+"""No public dialect goes beyond; keeps garbage from claiming 280 bytes."""
 _UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
 _MAGIC = re.compile(b"[\xfd\xfe]")
 _READABLE = frozenset((0, 2, 76, 110, 148, 261))  # the ids of messages whose fields matter
 _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
+
+
+def _target_offsets() -> dict[int, tuple[int, int | None]]:
+    """Return message id -> where in the payload its target system and component stand."""
+    found = {}
+    for number, kind in dialect.mavlink_map.items():
+        places, offset = {}, 0
+        fields = re.findall(r"\d*[a-zA-Z]", kind.unpacker.format)
+        for name, form in zip(kind.ordered_fieldnames, fields, strict=True):
+            places[name] = offset
+            offset += struct.calcsize(f"<{form}")
+        if "target_system" in places:
+            found[number] = (places["target_system"], places.get("target_component"))
+    return found
+
+
+TARGETS = _target_offsets()
+"""Of each message that is for somebody: where in its payload the system and the component stand."""
+
+
+class Verdict(Enum):
+    """What begins at a place in what was received."""
+
+    WHOLE = "whole"  # a frame whose CRC fits, or that no CRC is known for
+    DAMAGED = "damaged"  # it has a frame's bounds, and another CRC
+    GARBAGE = "garbage"
+    UNFINISHED = "unfinished"
+
+
+def frame_at(
+    data: bytes, position: int, *, stream: bool, highest_id: int = HIGHEST_ID
+) -> tuple[Verdict, int, int]:
+    """Return what begins at `position`, where it ends, and a frame's message id.
+
+    stream: more may come behind `data`, so a frame that no CRC proves waits for the byte behind it.
+    """
+    magic = data[position]
+    if magic not in (_V1, _V2):
+        found = _MAGIC.search(data, position)
+        return Verdict.GARBAGE, found.start() if found else len(data), -1
+    header = 10 if magic == _V2 else 6
+    if len(data) - position < header:
+        return Verdict.UNFINISHED, position, -1
+    signature = 0
+    if magic == _V2:
+        flags = data[position + 2]
+        message_id = int.from_bytes(data[position + 7 : position + 10], "little")
+        if flags & ~_SIGNED or message_id > highest_id:
+            return Verdict.GARBAGE, position + 1, -1
+        signature = SIGNATURE_BLOCK if flags else 0
+    else:
+        message_id = data[position + 5]
+    stop = position + header + data[position + 1] + 2 + signature
+    if stop > len(data):
+        return Verdict.UNFINISHED, position, -1
+    crc_at = stop - signature - 2
+    extra = _CRC_EXTRA.get(message_id)
+    if extra is None or crc16.mcrf4xx(data[position + 1 : crc_at] + bytes((extra,))) != (
+        data[crc_at] | data[crc_at + 1] << 8
+    ):
+        if stop == len(data) and stream:
+            return Verdict.UNFINISHED, position, -1  # the byte behind decides
+        if stop < len(data) and data[stop] not in (_V1, _V2):
+            return Verdict.GARBAGE, position + 1, -1
+        if extra is not None:
+            return Verdict.DAMAGED, stop, message_id
+    return Verdict.WHOLE, stop, message_id
 
 
 @dataclass(slots=True)
@@ -123,6 +193,15 @@ class Framer:
         self._sender.srcSystem, self._sender.srcComponent = source
         self._codec.source = source
 
+    @property
+    def link_id(self) -> int:
+        """The link id in the signatures that we send, 0 to 255; may be changed."""
+        return int(self._sender.signing.link_id)
+
+    @link_id.setter
+    def link_id(self, number: int) -> None:
+        self._sender.signing.link_id = number
+
     # ------------------------------------------------------------------ receiving
 
     def feed(self, data: bytes) -> list[Message]:
@@ -174,38 +253,16 @@ class Framer:
 
     def _step(self, data: bytes, position: int, out: list[Message]) -> int:
         """Deal with what begins at `position`; return where to go on, the same if more is needed."""
-        magic = data[position]
-        if magic not in (_V1, _V2):
-            found = _MAGIC.search(data, position)
-            return self._skip(position, found.start() if found else len(data))
-        header = 10 if magic == _V2 else 6
-        if len(data) - position < header:
-            return position
-        signature = 0
-        if magic == _V2:
-            flags = data[position + 2]
-            message_id = int.from_bytes(data[position + 7 : position + 10], "little")
-            if flags & ~_SIGNED or message_id > _HIGHEST_ID:
-                return self._skip(position, position + 1)
-            signature = SIGNATURE_BLOCK if flags else 0
-        else:
-            message_id = data[position + 5]
-        stop = position + header + data[position + 1] + 2 + signature
-        if stop > len(data):
-            return position
-        frame = data[position:stop]
-        crc_at = len(frame) - signature - 2
-        extra = _CRC_EXTRA.get(message_id)
-        body = frame[1:crc_at]
-        if extra is None or crc16.mcrf4xx(body + bytes((extra,))) != frame[crc_at] | frame[crc_at + 1] << 8:
-            if stop == len(data) and self.stream:
-                return position  # the byte behind decides
-            if stop < len(data) and data[stop] not in (_V1, _V2):
-                return self._skip(position, position + 1)
-            if extra is not None:
+        verdict, stop, message_id = frame_at(data, position, stream=self.stream)
+        match verdict:
+            case Verdict.GARBAGE:
+                return self._skip(position, stop)
+            case Verdict.DAMAGED:
                 self.stats.bad_crc += 1
-                return stop
-        self._accept(frame, message_id, signature > 0, out)
+            case Verdict.WHOLE:
+                frame = data[position:stop]
+                signed = frame[0] == _V2 and frame[2] == _SIGNED
+                self._accept(frame, message_id, signed, out)
         return stop
 
     def _skip(self, start: int, stop: int) -> int:

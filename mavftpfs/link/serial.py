@@ -7,8 +7,9 @@ vanishes (unplugged, vehicle rebooted) is opened again when it returns, under th
 from __future__ import annotations
 
 import termios
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from io import FileIO
 
 import serial
 import trio
@@ -21,8 +22,10 @@ _LEAST_OUTBOX = 4096
 
 
 @asynccontextmanager
-async def open_serial(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+async def open_serial(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[StreamLink]:
     """Open a serial port, and again whenever it vanishes.
+
+    inherited: what `descriptors` of another process's link gave; then the first time nothing is opened.
 
     Raises:
         LinkClosed: no such port, no permission, or in use.
@@ -32,7 +35,7 @@ async def open_serial(spec: LinkSpec) -> AsyncIterator[StreamLink]:
         return await trio.to_thread.run_sync(_open_port, spec)
 
     try:
-        pipe = await reopen()
+        pipe = FileIO(inherited[0], "r+") if inherited else await reopen()
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     # About a second of the line: what waits longer than that is answered too late anyway.

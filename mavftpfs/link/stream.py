@@ -8,6 +8,7 @@ gets one, with growing pauses. After that `receive` returns an empty list once: 
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import Protocol
@@ -15,7 +16,7 @@ from typing import Protocol
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox
+from mavftpfs.link.base import LinkStats, Outbox, Seat
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_READS = 64
@@ -48,6 +49,9 @@ class StreamLink:
     Args:
         pipe: the first one, where it is already open.
         outbox_limit: bytes to hold for a slow peer.
+
+    Attributes:
+        listener: where peers connect, if they do.
     """
 
     is_stream = True
@@ -62,6 +66,8 @@ class StreamLink:
         outbox_limit: int,
     ) -> None:
         self.stats = LinkStats()
+        self.seat: Seat | None = None
+        self.listener: socket.socket | None = None
         self.description = description
         self.is_serial = is_serial
         self._opener = opener
@@ -140,6 +146,13 @@ class StreamLink:
     def keep_peer(self) -> None:
         """The present peer is the one to be served, and it is not silent."""
         self._vouched_at = trio.current_time()
+
+    def focus(self, system: int) -> None:
+        """Nothing to leave out."""
+
+    def descriptors(self) -> list[int]:
+        """Return the listener's, if there is one, and the pipe's, if there is one at the moment."""
+        return [end.fileno() for end in (self.listener, self._pipe) if end is not None]
 
     def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
         """Go on with another pipe (a new connection). peer: the address that opened it, if it was not us."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 
@@ -28,9 +28,12 @@ _PAUSE = 0.2
 
 
 @asynccontextmanager
-async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[StreamLink]:
+async def open_tcp(
+    spec: LinkSpec, inherited: Sequence[int] = (), *, patient: bool = False
+) -> AsyncIterator[StreamLink]:
     """Connect to a listening vehicle or bridge, and again whenever the connection is lost.
 
+    inherited: what `descriptors` of another process's link gave: a connection that is used first.
     patient: return at once and connect as soon as somebody listens.
 
     Raises:
@@ -41,7 +44,9 @@ async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[St
         return await _connect(spec)
 
     try:
-        pipe = None if patient else await connect()
+        pipe: Pipe | None = socket.socket(fileno=inherited[0]) if inherited else None
+        if pipe is None and not patient:
+            pipe = await connect()
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     link = StreamLink(spec.description, connect, pipe, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
@@ -50,19 +55,25 @@ async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[St
 
 
 @asynccontextmanager
-async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+async def open_tcp_server(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[StreamLink]:
     """Listen; the link is usable at once and drops what is sent before somebody connects.
+
+    inherited: what `descriptors` of another process's link gave: where it listens, and its connection.
 
     Raises:
         LinkClosed: the port is taken or the address is not ours.
     """
     try:
-        listener = await _listen(spec)
+        listener = socket.socket(fileno=inherited[0]) if inherited else await _listen(spec)
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     with listener:
         bound = replace(spec, port=listener.getsockname()[1])
         link = StreamLink(bound.description, None, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+        link.listener = listener
+        for descriptor in inherited[1:]:
+            peer = socket.socket(fileno=descriptor)
+            link.replace(peer, peer.getpeername()[:1])
 
         async def serve() -> None:
             async with trio.open_nursery() as nursery:

@@ -19,7 +19,7 @@ from dataclasses import replace
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox, background, pack
+from mavftpfs.link.base import LinkStats, Outbox, Seat, background, pack
 from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
@@ -49,6 +49,7 @@ class UdpLink:
 
     def __init__(self, sock: socket.socket, description: str, peer: NetAddress | None = None) -> None:
         self.stats = LinkStats()
+        self.seat: Seat | None = None
         self.description = description
         self._sock = sock
         self._peer = peer
@@ -115,11 +116,20 @@ class UdpLink:
     def answer(self, address: NetAddress) -> None:
         """From now on send to this address; udpout goes on sending to the one it was given."""
         if self._only_host is None:
+            if address != self._peer:
+                self.stats.dropped_sends += self._outbox.clear()  # that was for another one
             self._peer = address
             self._pinned = True
 
     def keep_peer(self) -> None:
         """Nothing to do: nobody waits, all are heard."""
+
+    def focus(self, system: int) -> None:
+        """Nothing to leave out."""
+
+    def descriptors(self) -> list[int]:
+        """Return the socket's."""
+        return [self._sock.fileno()]
 
     async def run_writer(self) -> None:
         """Send what had to wait for the kernel; runs until cancelled."""
@@ -214,18 +224,22 @@ def _segment_size(size: int) -> list[tuple[int, int, bytes]]:
 
 
 @asynccontextmanager
-async def open_udp(spec: LinkSpec) -> AsyncIterator[UdpLink]:
+async def open_udp(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[UdpLink]:
     """Open udpin or udpout and run its writer for the length of the `async with`.
+
+    inherited: what `descriptors` of another process's link gave; then nothing is opened.
 
     Raises:
         LinkClosed: unknown host, or the port is taken.
     """
     family, address = await _resolve(spec)
     listens = spec.kind is LinkKind.UDP_IN
-    sock = socket.socket(family, socket.SOCK_DGRAM)
+    sock = socket.socket(fileno=inherited[0]) if inherited else socket.socket(family, socket.SOCK_DGRAM)
     try:
         _configure(sock)
-        _bind(sock, spec, address if listens else (("::" if family == socket.AF_INET6 else "0.0.0.0"), 0))
+        if not inherited:
+            anywhere = ("::" if family == socket.AF_INET6 else "0.0.0.0", 0)
+            _bind(sock, spec, address if listens else anywhere)
     except BaseException:
         sock.close()
         raise

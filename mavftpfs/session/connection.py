@@ -221,6 +221,8 @@ class Connection:
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
+        if self.vehicle.address is not None:
+            self.link.focus(self.vehicle.address.system)
         if self.was_lost:
             self.was_lost = False
             self.scheduler.server.wake()
@@ -357,8 +359,9 @@ def _build(
     clock: Callable[[], float],
     trace: PayloadTrace | None,
 ) -> Connection:
-    own = Address(options.source_system, options.source_component)
+    own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
     framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key, signing_clock=signing_now)
+    framer.link_id = 0 if link.seat is None else link.seat.number
     write_armed = options.when_armed == "ok"
     vehicle = Vehicle(options.target_system, options.target_component, own, write_armed)
     signature = 0 if options.signing_key is None else SIGNATURE

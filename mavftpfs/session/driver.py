@@ -101,6 +101,9 @@ class Driver:
                     self._handle(self.framer.give_up(), now, self.link.sender(-1))
             elif not chunks:  # the link was reopened
                 self.framer.reset()
+                if self.link.seat is not None:
+                    self.vehicle.own = self.framer.source = self.link.seat.own
+                    self.framer.link_id = self.link.seat.number
                 identity.reopened(now)
             else:
                 self._heard_at = now

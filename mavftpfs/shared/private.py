@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import pwd
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 MODE = 0o600
 DIRECTORY_MODE = 0o700
+_MAX_SOCKET_PATH = 107
 
 
 def open_private(path: str | Path, flags: int) -> int:
@@ -35,3 +39,40 @@ def make_private_directory(path: Path) -> None:
     if not path.is_dir():
         make_private_directory(path.parent)
         path.mkdir(mode=DIRECTORY_MODE, exist_ok=True)
+
+
+# -- where sockets are ----------------------------------------------------------------------------
+
+
+def own_directories() -> list[Path]:
+    """Return where this user's sockets may lie, the preferred place first.
+
+    A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
+    """
+    runtime, home = os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("HOME")
+    given = [Path(runtime) / "mavftpfs"] if runtime else []
+    return list(dict.fromkeys([*given, *directories_of(os.getuid(), home)]))
+
+
+def directories_of(uid: int, home: str | None = None) -> list[Path]:
+    """Return where any user's sockets may lie; home: if it is not the one in the table of users."""
+    with suppress(KeyError):
+        home = home or pwd.getpwuid(uid).pw_dir
+    return [Path(f"/run/user/{uid}/mavftpfs"), Path(home or "/tmp") / ".cache" / "mavftpfs"]
+
+
+def private_directory(directories: list[Path], *, longest_name: int) -> Path | None:
+    """Return the first directory that is, or can be made, ours alone, and where sockets of so long a name
+    can be; None if there is none."""
+    for directory in directories:
+        try:
+            # Not parents=True for a runtime directory: only the system creates /run/user/UID.
+            directory.parent.mkdir(mode=DIRECTORY_MODE, exist_ok=True)
+            directory.mkdir(mode=DIRECTORY_MODE, exist_ok=True)
+            facts = directory.lstat()
+        except OSError:
+            continue
+        ours = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o077
+        if ours and len(os.fsencode(directory)) + 1 + longest_name <= _MAX_SOCKET_PATH:
+            return directory
+    return None

@@ -167,10 +167,10 @@ def join(monkeypatch: pytest.MonkeyPatch, here: World, folder: Path) -> None:
     """Have whoever opens a link, or a spool, get these."""
 
     @asynccontextmanager
-    async def open_link(_: object) -> AsyncIterator[MemoryLink]:
+    async def open_link(*_: object) -> AsyncIterator[MemoryLink]:
         yield here.link
 
-    monkeypatch.setattr(compose, "open_link", open_link)
+    monkeypatch.setattr(compose, "open_shared", open_link)
     monkeypatch.setattr(compose, "spool_for", lambda _: closing(SpoolDirectory(folder / "spool", Random(1))))
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats
+from mavftpfs.link.base import LinkStats, Seat
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim.linkmodel import Direction, LinkModel
 from mavftpfs.sim.vehicle import SimVehicle
@@ -27,6 +27,7 @@ class MemoryLink:
 
     def __init__(self, vehicle: SimVehicle, model: LinkModel, *, is_serial: bool = False) -> None:
         self.stats = LinkStats()
+        self.seat: Seat | None = None
         self.description = "memory"
         self.is_stream = False
         self.is_serial = is_serial
@@ -90,6 +91,13 @@ class MemoryLink:
 
     def keep_peer(self) -> None:
         """Nobody waits."""
+
+    def focus(self, system: int) -> None:
+        """See link.base.Link."""
+
+    def descriptors(self) -> list[int]:
+        """See link.base.Link."""
+        return []
 
     async def aclose(self) -> None:
         """See link.base.Link."""

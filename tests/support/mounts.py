@@ -111,7 +111,16 @@ class Mount:
 
     def start(self) -> None:
         """Start it and wait until it serves; a daemon that ends instead fails the test."""
-        process = self.process = Process("mount", self.argv(), self.folder)
+        self.begin()
+        self.await_serving()
+
+    def begin(self) -> None:
+        """Start it."""
+        self.process = Process("mount", self.argv(), self.folder)
+
+    def await_serving(self) -> None:
+        """Wait until it serves; a daemon that ends instead fails the test."""
+        process = self.alive_or_ended()
         wait_until(f"{self.argv()} mounted", lambda: self.serves() or not process.running)
         assert process.running, f"the mount ended with {process.popen.returncode}:\n{process.text()}"
 

@@ -25,11 +25,12 @@ LAYERS: dict[str, set[str]] = {
     "protocol": {"shared"},
     "link": {"shared"},
     "cache": {"shared"},
+    "hub": {"shared", "link"},
     "session": {"shared", "protocol", "link"},
     "client": {"shared", "protocol", "link", "cache", "session"},
     "mount": {"shared", "protocol", "link", "cache", "session", "client"},
     "sim": {"shared", "protocol", "link"},
-    "cli": {"shared", "protocol", "link", "cache", "session", "client", "mount", "sim"},
+    "cli": {"shared", "protocol", "link", "cache", "session", "client", "mount", "hub", "sim"},
     "api": {"shared", "protocol", "link", "cache", "session", "client"},
 }
 """Layer -> the layers below it that it may import. `__main__` runs the top one."""
@@ -40,6 +41,7 @@ CONTRACTS = {"cache.remote": {"session"}, "protocol.payload": {"cache"}}
 PURE_LAYERS = {"shared", "protocol", "sim"}
 PURE_MODULES = {
     "link.addresses",
+    "link.frames",
     "link.framing",
     "link.fastframe",
     "link.messages",
@@ -54,6 +56,8 @@ PURE_MODULES = {
     "cache.reserved",
     "cache.draft",
     "client.options",
+    "hub.outbox",
+    "hub.routing",
     "mount.handles",
     "mount.options",
 }
@@ -279,6 +283,8 @@ def package(**sources: str) -> dict[str, Module]:
         ("mount__kernel", "sim.vehicle"),
         ("mount__kernel", "cli.report"),
         ("link__udp", "client.files"),
+        ("hub__hub", "session.driver"),
+        ("link__sharing", "hub.hub"),
     ],
 )
 def test_checker_sees_a_wrong_direction(importer: str, target: str) -> None:

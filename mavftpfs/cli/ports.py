@@ -1,0 +1,116 @@
+"""`mavftpfs hub`: the programs that share ports, shown and stopped; and the hub itself. Layer: cli."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
+from mavftpfs.link.rendezvous import hubs, port_name
+from mavftpfs.link.uri import parse_source
+from mavftpfs.mount import daemon
+from mavftpfs.shared.errors import ExitCode, UsageError
+from mavftpfs.shared.private import own_directories
+from mavftpfs.shared.readable import printable, readable_time
+
+PATIENCE = 5.0
+NOTHING = "no port is shared"
+
+Status = Mapping[str, Any]
+
+
+def hub(args: argparse.Namespace) -> int:
+    """Show the hubs, or stop them; with --take-over be one."""
+    if args.take_over is not None:
+        return daemon.in_background(lambda report: _serve(args, report))
+    if args.stop:
+        return _stop(args)
+    found = [facts for _, facts in _hubs(args.source, {"status": True})]
+    if args.json:
+        print(json.dumps(found, indent=2))
+        return ExitCode.OK
+    for facts in found:
+        for line in status_lines(facts):
+            print(printable(line))
+    if not found:
+        print(NOTHING)
+    return ExitCode.OK
+
+
+def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
+    from mavftpfs.hub.process import serve
+
+    daemon.log_in_background(own_directories()[-1] / "mavftpfs.log", logging.INFO)
+    inherited = [int(number) for number in args.take_over.split(",")]
+    serve(args.source, inherited, lambda: report(0, ""))
+    return ExitCode.OK
+
+
+def _stop(args: argparse.Namespace) -> int:
+    """Stop hubs, after it was said what that cuts."""
+    found = list(_hubs(args.source, {"status": True}))
+    cut = [facts for _, facts in found if facts["clients"] or _live(facts)]
+    for facts in cut:
+        for line in status_lines(facts):
+            print(printable(line))
+    if cut and not args.force:
+        raise UsageError("that would be cut (mounts start a new hub); --force does it")
+    for path, _ in found:
+        _ask(path, {"stop": True})
+    if not found:
+        print(NOTHING)
+    return ExitCode.OK
+
+
+def _live(facts: Status) -> list[Status]:
+    """Return the endpoints that are heard."""
+    return [
+        known for known in facts["endpoints"] if known["heard_ago"] is not None and known["heard_ago"] < 10
+    ]
+
+
+def status_lines(facts: Status) -> Iterator[str]:
+    """Yield the lines of one hub."""
+    armed = facts["armed"]
+    flying = f", ARMED: {', '.join(map(str, armed))}" if armed else ""
+    yield f"{facts['source']}: shared by {len(facts['clients'])}{flying}"
+    for client in facts["clients"]:
+        system, component = client["address"]
+        yield f"  {client['name'] or 'a program'} as {system}/{component}"
+    for endpoint in facts["endpoints"]:
+        ago = endpoint["heard_ago"]
+        heard = "not heard" if ago is None else f"heard {readable_time(ago)} ago"
+        yield f"  forward {endpoint['endpoint']}: {endpoint['problem'] or heard}"
+    for double in facts["doubles"]:
+        yield (
+            f"  a second vehicle has the system id {double['system']}: it is ignored at {double['address']}; "
+            "give each an id of its own"
+        )
+
+
+def _hubs(source: str | None, request: Facts) -> Iterator[tuple[Path, Status]]:
+    """Yield each hub's door and what it replies; those of one SOURCE, or all."""
+    name = None if source is None else port_name(parse_source(source))
+    for path in hubs():
+        if name in (None, path.stem):
+            reply = _ask(path, request)
+            if reply is not None:
+                yield path, reply
+
+
+def _ask(path: Path, request: Facts) -> Status | None:
+    """Return what the hub behind a door says; None if there is none, but perhaps a program alone."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock, suppress(OSError):
+        sock.settimeout(PATIENCE)
+        sock.connect(os.fspath(path))
+        sock.send(pack_facts({"protocol": PROTOCOL, **request}))
+        reply = unpack_facts(sock.recv(1 << 16))
+        return reply if reply is not None and "refused" not in reply else None
+    return None

@@ -1,0 +1,1 @@
+"""The process that owns a port which several programs use: it passes whole frames, and reads only headers."""

@@ -1,0 +1,43 @@
+"""A hub as a process: what it inherits, signals, its end. Layer: hub."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import trio
+
+from mavftpfs.hub.hub import Hub
+from mavftpfs.link.rendezvous import Door
+from mavftpfs.link.uri import parse_source
+
+
+def serve(source: str, inherited: Sequence[int], on_ready: Callable[[], None]) -> None:
+    """Be the hub of a port until nobody needs it, or a signal ends it.
+
+    inherited: the descriptors of the first client's connection, of the door, and of the port.
+
+    Raises:
+        LinkClosed: the port cannot be used.
+    """
+    client, door, *port = inherited
+    first = socket.socket(fileno=client)
+    listening = socket.socket(fileno=door)
+    hub = Hub(parse_source(source), port, Door(listening, Path(listening.getsockname())))
+    trio.run(_until_signalled, partial(hub.run, first, on_ready), strict_exception_groups=False)
+
+
+async def _until_signalled(work: Callable[[], object]) -> None:
+    with trio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:
+        async with trio.open_nursery() as nursery:
+
+            async def watch() -> None:
+                async for _ in signals:
+                    nursery.cancel_scope.cancel()
+
+            nursery.start_soon(watch)
+            await work()  # type: ignore[misc]
+            nursery.cancel_scope.cancel()

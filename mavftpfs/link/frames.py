@@ -1,0 +1,113 @@
+"""Whole frames and what their headers say, for programs that pass them on. Layer: link; pure.
+
+A frame is passed on as it came, byte for byte. What is read of it: its bounds, its sender, its target and its
+kind. Frames of unknown dialects pass, too. A frame with a wrong CRC may be one of another dialect: it passes,
+but nothing is learned from it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mavftpfs.link.framing import TARGETS, Verdict, frame_at
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_MODE_FLAG_SAFETY_ARMED, Address
+
+HEARTBEAT_ID = 0
+_ANY_ID = 0xFFFFFF
+_AUTOPILOT_AT, _MODE_AT = 5, 6
+EVERYBODY = Address(0, 0)
+
+
+class Frame(NamedTuple):
+    """One frame.
+
+    target: EVERYBODY where it names none. proven: its CRC fits, or none is known for its kind.
+    """
+
+    data: bytes
+    source: Address
+    target: Address
+    id: int
+    proven: bool
+
+
+class Splitter:
+    """Finds the frames in what one sender's datagrams, or a stream, bring.
+
+    Attributes:
+        waiting: a stream ended in what may be the beginning of a frame.
+        garbage: bytes that were in no frame.
+    """
+
+    def __init__(self, *, stream: bool) -> None:
+        self.waiting = False
+        self.garbage = 0
+        self._stream = stream
+        self._tail = b""
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Take a datagram or a piece of the stream; return the frames that it completed."""
+        if self._tail:
+            if not self._stream and data[:1] in (b"\xfd", b"\xfe"):
+                self.reset()  # a datagram begins with a frame of its own: the cut one is lost
+            data = self._tail + data
+        return self._split(data, stream=self._stream)
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self.garbage += len(self._tail)
+        self._tail = b""
+        self.waiting = False
+
+    def give_up(self) -> list[Frame]:
+        """The stream fell silent: what no byte behind proved counts, and the rest was no frame."""
+        out: list[Frame] = []
+        while self._tail:
+            out += self._split(self._tail, stream=False)
+            if self._tail:
+                self.garbage += 1
+                self._tail = self._tail[1:]
+        self.waiting = False
+        return out
+
+    def _split(self, data: bytes, *, stream: bool) -> list[Frame]:
+        out: list[Frame] = []
+        position, end = 0, len(data)
+        while position < end:
+            verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
+            if verdict is Verdict.UNFINISHED:
+                break
+            if verdict is Verdict.GARBAGE:
+                self.garbage += stop - position
+            else:
+                out.append(_frame(data[position:stop], message_id, proven=verdict is Verdict.WHOLE))
+            position = stop
+        self._tail = data[position:]
+        self.waiting = self._stream and bool(self._tail)
+        return out
+
+
+def _frame(data: bytes, message_id: int, *, proven: bool) -> Frame:
+    header = 10 if data[0] == 0xFD else 6
+    at = 5 if header == 10 else 3
+    source = Address(data[at], data[at + 1])
+    places = TARGETS.get(message_id)
+    if places is None:
+        return Frame(data, source, EVERYBODY, message_id, proven)
+    # MAVLink 2 cuts zeros at the end: what is not there is 0.
+    system, component = (
+        data[header + place] if place is not None and place < data[1] else 0 for place in places
+    )
+    return Frame(data, source, Address(system, component), message_id, proven)
+
+
+def armed_by(frame: Frame) -> bool | None:
+    """Return whether a heartbeat says that its vehicle is armed; None if it is no autopilot's heartbeat."""
+    payload = frame.data[10 if frame.data[0] == 0xFD else 6 :]
+    if (
+        frame.id != HEARTBEAT_ID
+        or len(payload) <= _MODE_AT
+        or payload[_AUTOPILOT_AT] == MAV_AUTOPILOT_INVALID
+    ):
+        return None
+    return bool(payload[_MODE_AT] & MAV_MODE_FLAG_SAFETY_ARMED)

@@ -1,0 +1,319 @@
+"""A port that several of ours share: the link of one of them to the hub that has it. Layer: link.
+
+A Unix socket of whole messages (SOCK_SEQPACKET). The first of each side is a JSON object: a request to join,
+and the hub's reply. So are the few later ones that begin with `{`. All others are frames: `F`, the length of
+a tag, the tag, and whole MAVLink frames. The tag is the network address that they came from, as JSON, or
+nothing where the port has only one.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import trio
+
+from mavftpfs.link.addresses import NetAddress
+from mavftpfs.link.base import LinkStats, Outbox, Seat
+from mavftpfs.link.messages import Address
+from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.shared.errors import LinkClosed
+
+PROTOCOL = 1
+"""Counts up when the messages change: a hub of another version may be running."""
+MAX_MESSAGE = 32 * 1024
+"""Bytes of frames in a message."""
+SOCKET_BUFFER = 1 << 20
+WELCOME_PATIENCE = 20.0
+"""Seconds for the hub, which may have to be started first, to answer."""
+
+_MAX_MESSAGES = 64
+_RECEIVE_SIZE = 64 * 1024
+_OUTBOX_LIMIT = 256 * 1024
+_FRAMES = b"F"
+_MAX_TAG = 255
+
+Facts = dict[str, Any]
+
+
+# -- messages -------------------------------------------------------------------------------------
+
+
+def pack_facts(facts: Facts) -> bytes:
+    """Return the message of a JSON object."""
+    return json.dumps(facts).encode()
+
+
+def unpack_facts(message: bytes) -> Facts | None:
+    """Return the object of a message; None if it holds frames, or makes no sense."""
+    if message[:1] != b"{":
+        return None
+    try:
+        facts = json.loads(message)
+    except ValueError:
+        return None
+    return facts if isinstance(facts, dict) else None
+
+
+def make_tag(address: NetAddress | None) -> bytes:
+    """Return the tag of an address."""
+    tag = b"" if address is None else json.dumps(address).encode()
+    return tag if len(tag) <= _MAX_TAG else b""
+
+
+def pack_frames(frames: Iterable[bytes], tag: bytes = b"") -> list[bytes]:
+    """Return messages that hold the frames in order."""
+    head = _FRAMES + bytes((len(tag),)) + tag
+    messages, batch, size = [], [head], 0
+    for frame in frames:
+        if size + len(frame) > MAX_MESSAGE:
+            messages.append(b"".join(batch))
+            batch, size = [head], 0
+        batch.append(frame)
+        size += len(frame)
+    if size:
+        messages.append(b"".join(batch))
+    return messages
+
+
+def unpack_frames(message: bytes) -> tuple[bytes, bytes]:
+    """Return the tag of a message, and the frames."""
+    stop = 2 + message[1] if len(message) > 1 else len(message)
+    return message[2:stop], message[stop:]
+
+
+def set_buffers(sock: socket.socket) -> None:
+    """Give a socket of the hub room for what comes at once."""
+    sock.setblocking(False)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, SOCKET_BUFFER)  # the kernel caps it silently
+
+
+# -- a client -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What a client wants of a port: who it would like to be, where else its frames are to go, who it is for
+    people. beats: only heartbeats, and not what they are about."""
+
+    own: Address
+    forward: tuple[str, ...] = ()
+    name: str = ""
+    beats: bool = False
+
+
+class HubLink:
+    """Implements link.base.Link by a hub. Made by `join`; run `run` beside it."""
+
+    is_stream = False
+
+    def __init__(self, sock: socket.socket, spec: LinkSpec, welcome: Facts) -> None:
+        self.stats = LinkStats()
+        self.description = spec.description
+        self.is_serial = spec.kind is LinkKind.SERIAL
+        self.seat: Seat | None = Seat(Address(*welcome["own"]), welcome["number"])
+        self.gone = trio.Event()
+        self._sock = sock
+        self._senders: list[NetAddress | None] = []
+        self._tags: dict[bytes, NetAddress | None] = {b"": None}
+        self._outbox = Outbox(_OUTBOX_LIMIT)
+        self._work = trio.Event()
+        self._fresh = False
+        self._closed = False
+
+    @property
+    def backlog(self) -> int:
+        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        return self._outbox.size
+
+    async def receive(self) -> list[bytes]:
+        """Wait for frames and return them, as they came together; none says that the port was reopened.
+
+        Raises:
+            LinkClosed: the hub is gone, or aclose was called.
+        """
+        await trio.lowlevel.checkpoint_if_cancelled()
+        waited = False
+        while True:
+            chunks = self._drain()
+            if chunks or self._fresh:
+                self._fresh = self._fresh and bool(chunks)
+                if not waited:
+                    await trio.lowlevel.cancel_shielded_checkpoint()
+                return chunks
+            if self._closed:
+                raise LinkClosed(f"{self.description}: the hub is gone")
+            waited = True
+            try:
+                await trio.lowlevel.wait_readable(self._sock)
+            except trio.ClosedResourceError:
+                continue
+
+    def send_nowait(self, frames: Sequence[bytes]) -> None:
+        """Hand frames to the hub; drop and count what cannot be kept."""
+        for message in pack_frames(frames):
+            if self._closed or (self._outbox.size and not self._outbox.offer(message)):
+                self.stats.dropped_sends += 1
+            elif not self._outbox.size and not self._send(message):
+                self._outbox.offer(message, force=True)
+                self._work.set()
+
+    def sender(self, index: int) -> NetAddress | None:
+        """Return the network address that a chunk of the last batch came from."""
+        return self._senders[index]
+
+    def answer(self, address: NetAddress) -> None:
+        """From now on the hub sends our frames to this address."""
+        self.tell({"answer": address})
+
+    def keep_peer(self) -> None:
+        """The hub itself hears who is there."""
+
+    def focus(self, system: int) -> None:
+        """Have the hub leave out what concerns only other systems."""
+        self.tell({"focus": system})
+
+    def descriptors(self) -> list[int]:
+        """Return none: the hub has them."""
+        return []
+
+    def tell(self, facts: Facts) -> None:
+        """Send a request that needs no answer."""
+        message = pack_facts(facts)
+        if self._outbox.size or not self._send(message):
+            self._outbox.offer(message, force=True)
+            self._work.set()
+
+    async def run(self) -> None:
+        """Send what had to wait; runs until cancelled."""
+        while True:
+            await self._work.wait()
+            self._work = trio.Event()
+            while not self._closed and (message := self._outbox.head()) is not None:
+                if self._send(message):
+                    self._outbox.advance(len(message))
+                    continue
+                try:
+                    await trio.lowlevel.wait_writable(self._sock)
+                except trio.ClosedResourceError:
+                    return
+
+    async def aclose(self) -> None:
+        """Leave the hub."""
+        self._end()
+        await trio.lowlevel.checkpoint()
+
+    def _end(self) -> None:
+        if not self._closed:
+            self._closed = True
+            trio.lowlevel.notify_closing(self._sock)
+            self._sock.close()
+            self.gone.set()
+
+    def _drain(self) -> list[bytes]:
+        chunks: list[bytes] = []
+        senders: list[NetAddress | None] = []
+        for _ in range(_MAX_MESSAGES):
+            if self._closed:
+                break
+            try:
+                message = self._sock.recv(_RECEIVE_SIZE)
+            except BlockingIOError:
+                break
+            except OSError:
+                message = b""
+            if not message:
+                self._end()
+            elif message[:1] == _FRAMES:
+                tag, chunk = unpack_frames(message)
+                chunks.append(chunk)
+                senders.append(self._sender(tag))
+            elif (unpack_facts(message) or {}).get("reopened"):
+                self._fresh = True
+        if chunks:
+            self._senders = senders
+            self.stats.received_bytes += sum(map(len, chunks))
+        return chunks
+
+    def _sender(self, tag: bytes) -> NetAddress | None:
+        try:
+            return self._tags[tag]
+        except KeyError:
+            found = self._tags[tag] = tuple(json.loads(tag))
+            return found
+
+    def _send(self, message: bytes) -> bool:
+        """Return False if there is no room; a hub that is gone takes all."""
+        if self._closed:
+            return True
+        try:
+            self._sock.send(message)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._end()
+            return True
+        self.stats.sent_chunks += 1
+        self.stats.sent_bytes += len(message)
+        return True
+
+
+class Refused(LinkClosed):
+    """The hub does not take us; the text says why."""
+
+
+async def join(
+    sock: socket.socket, spec: LinkSpec, wish: Wish, seat: Seat | None, *, again: bool = False
+) -> HubLink:
+    """Ask the hub at the other end of a socket to be let in, and return the link.
+
+    seat: what we had until now. again: the hub that we had is gone, so its endpoints may take their time.
+
+    Raises:
+        Refused: and why.
+        LinkClosed: nobody answers.
+    """
+    hello = {
+        "protocol": PROTOCOL,
+        "join": spec.description,
+        "own": wish.own if seat is None else seat.own,
+        "number": None if seat is None else seat.number,
+        "forward": wish.forward,
+        "name": wish.name,
+        "beats": wish.beats,
+        "again": again,
+    }
+    try:
+        reply = await ask(sock, hello)
+        return HubLink(sock, spec, reply)
+    except BaseException:
+        sock.close()
+        raise
+
+
+async def ask(sock: socket.socket, request: Facts) -> Facts:
+    """Send a request to a hub and return what it says.
+
+    Raises:
+        Refused: the hub says no.
+        LinkClosed: no answer.
+    """
+    set_buffers(sock)
+    message = b""
+    try:
+        sock.send(pack_facts(request))
+        with trio.move_on_after(WELCOME_PATIENCE):
+            await trio.lowlevel.wait_readable(sock)
+            message = sock.recv(_RECEIVE_SIZE)
+    except OSError:
+        message = b""
+    reply = unpack_facts(message)
+    if reply is None:
+        raise LinkClosed("the program that has the port does not answer; see: mavftpfs hub")
+    if "refused" in reply:
+        raise Refused(str(reply["refused"]))
+    return reply

@@ -1,0 +1,170 @@
+"""Several programs of ours on one port: through the hub, which nobody has to configure."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.link.rendezvous import HUB, hubs
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount, wait_until
+from tests.support.vehicles import HOST, free_udp_port
+
+CONTENT = bytes(range(256)) * 400
+BEGINNING = (r"the hub of .* is gone",)
+
+
+def card(field: Field, name: str) -> Path:
+    """Return a card with one file, which says whose it is."""
+    root = field.local(name)
+    (root / "log.bin").write_bytes(name.encode() + CONTENT)
+    return root
+
+
+def two_vehicles(field: Field) -> tuple[list[Path], str]:
+    """Start two vehicles of other kinds that send to one port; return their cards and the SOURCE."""
+    port = free_udp_port()
+    cards = [card(field, "first"), card(field, "second")]
+    for number, (root, profile) in enumerate(zip(cards, ("px4", "ardupilot5"), strict=True), 1):
+        options = ("--system", str(number), "--seed", str(number))
+        field.sim(root, profile, options, link=f"udpout:{HOST}:{port}")
+    return cards, f"udpin:{HOST}:{port}"
+
+
+def command(mount: Mount, *words: str, code: int | None = 0) -> str:
+    """Run one of our commands and return what it says."""
+    return mount.run(sys.executable, "-m", "mavftpfs", *words, code=code).stdout
+
+
+def hub_of(mount: Mount, source: str) -> dict[str, Any] | None:
+    """Return what the hub of a port says, None if there is none."""
+    found: list[dict[str, Any]] = json.loads(command(mount, "hub", "--json", source))
+    return found[0] if found else None
+
+
+def reads_right(mount: Mount, root: Path) -> bool:
+    """Return whether a file is read anew, and right."""
+    command(mount, "ls", str(mount.path))
+    return mount.read_bytes(mount.path / "log.bin") == (root / "log.bin").read_bytes()
+
+
+def test_two_mounts_and_a_command_share_a_port_that_nobody_configured(field: Field) -> None:
+    cards, source = two_vehicles(field)
+    one = field.mount(source, "target_system=1")
+    assert hub_of(one, source) is None, "a mount alone has its port itself"
+    two = field.mount(source, "target_system=2")
+    listed = command(one, "ls", source, "/", "-o", "target_system=2")
+    assert "log.bin" in listed
+    facts = hub_of(one, source)
+    assert facts is not None
+    assert len({tuple(client["address"]) for client in facts["clients"]}) == 2
+    for mount, root in ((one, cards[0]), (two, cards[1])):
+        assert reads_right(mount, root)
+        mount.run("cp", root / "log.bin", mount.path / "copy.bin")
+        assert (root / "copy.bin").read_bytes() == (root / "log.bin").read_bytes()
+    assert one.unmount() == 0
+    assert reads_right(two, cards[1]), "the hub goes on for the other one"
+    assert two.unmount() == 0
+    wait_until("the hub ended with its last client", lambda: hub_of(one, source) is None)
+
+
+def test_the_hub_is_the_users_alone(field: Field) -> None:
+    _, source = two_vehicles(field)
+    field.mount(source, "target_system=1")
+    field.mount(source, "target_system=2")
+    doors = hubs()
+    assert doors
+    for door in doors:
+        assert door.suffix == HUB
+        assert stat.S_IMODE(door.lstat().st_mode) == 0o600
+        assert stat.S_IMODE(door.parent.lstat().st_mode) == 0o700
+
+
+def test_two_that_begin_at_once_share_the_port(field: Field) -> None:
+    cards, source = two_vehicles(field)
+    one = field.prepare(source, "target_system=1")
+    two = field.prepare(source, "target_system=2")
+    # Both begin at the same moment: one has the port, the other one knocks.
+    for mount in (one, two):
+        mount.begin()
+    for mount, root in ((one, cards[0]), (two, cards[1])):
+        mount.await_serving()
+        assert reads_right(mount, root)
+
+
+def kill_hub(source: str, mounts: list[Mount]) -> None:
+    for mount in mounts:
+        mount.allowed_log += BEGINNING
+    facts = hub_of(mounts[0], source)
+    assert facts is not None
+    os.kill(facts["pid"], signal.SIGKILL)
+
+
+def test_a_killed_hub_is_started_again_and_no_write_is_lost(field: Field) -> None:
+    cards, source = two_vehicles(field)
+    mounts = [field.mount(source, f"target_system={number}") for number in (1, 2)]
+    written: list[tuple[Path, bytes]] = []
+    copy = field.local("copies") / "log.bin"
+    with mounts[0].started("cp", mounts[0].path / "log.bin", copy) as reading:
+        for turn in range(4):
+            kill_hub(source, mounts)
+            for mount, root in zip(mounts, cards, strict=True):
+                data = f"{turn} {root.name}".encode() * 500
+                name = f"turn{turn}"
+                code = "import sys; open(sys.argv[1], 'wb').write(bytes.fromhex(sys.argv[2]))"
+                mount.python(code, mount.path / name, data.hex())
+                written.append((root / name, data))
+            time.sleep(0.2)
+        assert reading.wait(60) == 0
+    assert copy.read_bytes() == (cards[0] / "log.bin").read_bytes()
+    assert [path.read_bytes() for path, _ in written] == [data for _, data in written]
+    for mount, root in zip(mounts, cards, strict=True):
+        assert reads_right(mount, root)
+
+
+def test_a_killed_mount_disturbs_nobody(field: Field) -> None:
+    cards, source = two_vehicles(field)
+    one, two = (field.mount(source, f"target_system={number}") for number in (1, 2))
+    one.kill()
+    command(two, "umount", str(one.path))
+    assert reads_right(two, cards[1])
+    again = field.mount(source, "target_system=1")
+    assert reads_right(again, cards[0])
+
+
+@pytest.mark.parametrize("link", ["pty", "tcpin"])
+def test_streams_are_handed_over_too(field: Field, link: str) -> None:
+    root = field.local("card")
+    (root / "log.bin").write_bytes(CONTENT[:20_000])
+    place = "pty" if link == "pty" else f"tcpin:{HOST}:{free_udp_port()}"
+    vehicle = field.sim(root, "px4", link=place)
+    source = vehicle.source
+    one = field.mount(source)
+    two = field.mount(source)
+    for mount in (one, two):
+        mount.run("cp", root / "log.bin", mount.path / f"{mount.folder.name}.bin")
+        assert (root / f"{mount.folder.name}.bin").read_bytes() == (root / "log.bin").read_bytes()
+    assert hub_of(one, source) is not None
+    kill_hub(source, [one, two])
+    for mount in (one, two):
+        wait_until("it reads again", reading_again(mount, root))
+
+
+def reading_again(mount: Mount, root: Path) -> Callable[[], bool]:
+    return lambda: reads_right(mount, root)
+
+
+def test_scan_shows_all_vehicles_of_a_port_that_is_mounted(field: Field) -> None:
+    _, source = two_vehicles(field)
+    one = field.mount(source, "target_system=1")
+    found = json.loads(command(one, "scan", "--json", source))
+    assert {entry["system"] for entry in found if entry["answers"]} == {1, 2}

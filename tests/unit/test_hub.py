@@ -1,0 +1,295 @@
+"""The hub's pure parts: finding frames, where they go, who is next on the line."""
+
+from __future__ import annotations
+
+import random
+from itertools import pairwise
+
+import pytest
+
+from mavftpfs.hub.outbox import LINE_TIME, Line, Outbox, Waiting
+from mavftpfs.hub.routing import BEATS, PORT, Kind, Place, Router
+from mavftpfs.link.addresses import PATIENCE, NetAddress
+from mavftpfs.link.fastframe import FTP_PAYLOAD_SIZE
+from mavftpfs.link.frames import EVERYBODY, Frame, Splitter, armed_by
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.sim.vehicle import telemetry
+
+ONE, TWO = Address(1, 1), Address(2, 1)
+STATION = Address(255, 190)
+AT_ONE, AT_TWO = ("10.0.0.1", 14550), ("10.0.0.2", 14550)
+EAST, WEST, MOUNT, OTHER = 1, 2, 3, 4
+
+
+def parsed(data: bytes) -> Frame:
+    """Return the one frame of a datagram."""
+    (frame,) = Splitter(stream=False).feed(data)
+    return frame
+
+
+def beat(source: Address, *, autopilot: int = 12, armed: bool = False) -> Frame:
+    return parsed(Framer(source, stream=False).encode_heartbeat(2, autopilot, 0x80 if armed else 0))
+
+
+def ftp(source: Address, target: Address) -> Frame:
+    return parsed(Framer(source, stream=False).encode_ftp(target, bytes([7]) * FTP_PAYLOAD_SIZE))
+
+
+def attitude(source: Address) -> Frame:
+    return parsed(Framer(source, stream=False).encode(*telemetry(0, 1000)))
+
+
+def foreign(source: Address, number: int, payload: bytes = b"whatever") -> bytes:
+    """Return a frame of a dialect that nobody here knows."""
+    head = bytes((len(payload), 0, 0, 9, *source)) + number.to_bytes(3, "little")
+    return b"\xfd" + head + payload + b"\x12\x34"
+
+
+# -- frames ---------------------------------------------------------------------------------------
+
+
+def test_of_a_frame_the_header_is_read_and_whom_it_is_for() -> None:
+    frame = ftp(ONE, STATION)
+    assert (frame.source, frame.target, frame.id, frame.proven) == (ONE, STATION, 110, True)
+    assert beat(ONE).target == EVERYBODY
+    command = parsed(Framer(STATION, stream=False).encode_request_message(TWO, 148))
+    assert (command.source, command.target, command.id) == (STATION, TWO, 76)
+
+
+def test_zeros_that_mavlink_2_cut_are_read_as_zeros() -> None:
+    empty = parsed(Framer(ONE, stream=False).encode_ftp(Address(7, 0), bytes(FTP_PAYLOAD_SIZE)))
+    assert empty.target == Address(7, 0)
+
+
+def test_signed_frames_and_frames_of_unknown_dialects_pass_unchanged() -> None:
+    signed = Framer(ONE, stream=False, signing_key=bytes(32)).encode_heartbeat(2)
+    unknown = foreign(TWO, 0xABCDEF)
+    frames = Splitter(stream=False).feed(signed + unknown)
+    assert [frame.data for frame in frames] == [signed, unknown]
+    assert [frame.source for frame in frames] == [ONE, TWO]
+
+
+def test_a_damaged_frame_passes_and_proves_nothing() -> None:
+    good = bytearray(beat(ONE).data)
+    good[-1] ^= 1
+    frame = parsed(bytes(good))
+    assert not frame.proven
+    assert frame.data == bytes(good)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_stream_gives_the_same_frames_however_it_is_cut(seed: int) -> None:
+    rng = random.Random(seed)
+    framer = Framer(ONE, stream=True)
+    parts: list[bytes] = []
+    for step in range(60):
+        parts.append(framer.encode(*telemetry(step, step)) if step % 3 else foreign(TWO, 40_000 + step))
+        parts.append(rng.randbytes(rng.randrange(4)).replace(b"\xfd", b"").replace(b"\xfe", b""))
+    sent = parts[::2]
+    data = b"".join(parts) + framer.encode_heartbeat(2)
+    cuts = sorted(rng.sample(range(len(data)), 40))
+    splitter = Splitter(stream=True)
+    found = [
+        frame.data
+        for start, stop in pairwise([0, *cuts, len(data)])
+        for frame in splitter.feed(data[start:stop])
+    ]
+    found += [frame.data for frame in splitter.give_up()]
+    missing = [frame for frame in sent if frame not in found]
+    # An unknown frame in front of garbage cannot be told from garbage.
+    assert all(
+        frame[7:10] != b"\x1e\0\0" and int.from_bytes(frame[7:10], "little") >= 40_000 for frame in missing
+    )
+    assert found[:-1] == [frame for frame in sent if frame in found]
+
+
+def test_what_a_stream_ended_in_counts_when_it_falls_silent() -> None:
+    splitter = Splitter(stream=True)
+    unknown = foreign(TWO, 777)
+    assert splitter.feed(unknown) == []
+    assert splitter.waiting
+    assert [frame.data for frame in splitter.give_up()] == [unknown]
+    assert splitter.feed(b"\xfd\xff\x00") == []
+    assert splitter.give_up() == []
+    assert not splitter.waiting
+
+
+def test_only_autopilots_are_armed() -> None:
+    assert armed_by(beat(ONE, armed=True)) is True
+    assert armed_by(beat(ONE)) is False
+    assert armed_by(beat(STATION, autopilot=MAV_AUTOPILOT_INVALID, armed=True)) is None
+    assert armed_by(attitude(ONE)) is None
+
+
+# -- where they go --------------------------------------------------------------------------------
+
+
+class Net:
+    """A router with two endpoints and two clients, and a clock."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.router = Router()
+        self.router.add(PORT, Kind.PORT, fixed=False)
+        self.router.add(EAST, Kind.ENDPOINT, fixed=True)
+        self.router.add(WEST, Kind.ENDPOINT, fixed=False)
+        self.router.add(MOUNT, Kind.CLIENT, fixed=True)
+        self.router.add(OTHER, Kind.CLIENT, fixed=True)
+
+    def send(self, frame: Frame, side: int, address: NetAddress | None = None) -> set[Place]:
+        """Return where a frame goes; each place gets it once."""
+        places = self.router.route(frame, Place(side, address), self.now)
+        assert len(set(places)) == len(places)
+        return set(places)
+
+    def sides(self, frame: Frame, side: int, address: NetAddress | None = None) -> set[int]:
+        """Return the sides that a frame goes to."""
+        return {place.side for place in self.send(frame, side, address)}
+
+
+@pytest.fixture
+def net() -> Net:
+    """Two vehicles on the port, a ground station in the east; each client has its vehicle."""
+    net = Net()
+    net.send(beat(ONE), PORT, AT_ONE)
+    net.send(beat(TWO), PORT, AT_TWO)
+    net.send(beat(STATION, autopilot=MAV_AUTOPILOT_INVALID), EAST)
+    for side, component, system in ((MOUNT, 191, 1), (OTHER, 192, 2)):
+        net.send(beat(Address(254, component), autopilot=MAV_AUTOPILOT_INVALID), side)
+        net.router.focus(side, system)
+        net.router.answer(side, AT_ONE if system == 1 else AT_TWO)
+    net.now += 1
+    return net
+
+
+def test_telemetry_goes_to_all_endpoints_and_to_the_client_of_that_vehicle(net: Net) -> None:
+    net.send(beat(Address(255, 191), autopilot=8), WEST, ("127.0.0.1", 40))
+    assert net.send(attitude(ONE), PORT, AT_ONE) == {
+        Place(EAST, None),
+        Place(WEST, ("127.0.0.1", 40)),
+        Place(MOUNT, None),
+    }
+
+
+def test_answers_go_where_the_asker_was_heard_and_to_clients_who_watch_the_session(net: Net) -> None:
+    assert net.sides(ftp(ONE, STATION), PORT, AT_ONE) == {EAST, MOUNT}
+    assert net.sides(ftp(ONE, Address(254, 191)), PORT, AT_ONE) == {MOUNT}
+
+
+def test_requests_go_to_their_vehicle_alone(net: Net) -> None:
+    assert net.send(ftp(STATION, TWO), EAST) == {Place(PORT, AT_TWO), Place(OTHER, None)}
+    assert net.send(ftp(Address(254, 191), ONE), MOUNT) == {Place(PORT, AT_ONE)}
+
+
+def test_what_the_station_says_to_all_goes_to_each_vehicle(net: Net) -> None:
+    assert {place for place in net.send(beat(STATION, autopilot=8), EAST) if place.side == PORT} == {
+        Place(PORT, AT_ONE),
+        Place(PORT, AT_TWO),
+    }
+    assert net.sides(attitude(STATION), EAST) == {PORT}
+
+
+def test_a_client_speaks_to_its_vehicle_only(net: Net) -> None:
+    assert net.send(beat(Address(254, 191), autopilot=8), MOUNT) == {Place(PORT, AT_ONE)}
+    net.router.answer(MOUNT, None)
+    assert net.sides(beat(Address(254, 191), autopilot=8), MOUNT) == {PORT}
+
+
+def test_clients_of_one_vehicle_see_each_others_sessions(net: Net) -> None:
+    net.router.focus(OTHER, 1)
+    assert net.sides(ftp(Address(254, 191), ONE), MOUNT) == {PORT, OTHER}
+    assert net.sides(ftp(ONE, Address(254, 191)), PORT, AT_ONE) == {MOUNT, OTHER}
+
+
+def test_heartbeats_of_others_are_told_to_clients_but_no_flood_of_them(net: Net) -> None:
+    told = [OTHER in net.sides(beat(ONE), PORT, AT_ONE) for _ in range(100)]
+    assert told.count(True) == 1
+    assert all(MOUNT in net.sides(beat(ONE), PORT, AT_ONE) for _ in range(100)), "its own vehicle's all"
+    net.router.focus(OTHER, BEATS)
+    assert OTHER not in net.sides(ftp(ONE, EVERYBODY), PORT, AT_ONE)
+    net.now += 1
+    assert OTHER in net.sides(beat(ONE), PORT, AT_ONE)
+
+
+@pytest.mark.holds("promise 1")
+def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> None:
+    somewhere = ("10.0.0.66", 1)
+    assert net.sides(ftp(ONE, STATION), PORT, somewhere) == {MOUNT}, "which judges for itself"
+    assert net.router.doubles == {ONE: somewhere}
+    assert net.send(ftp(STATION, ONE), EAST) >= {Place(PORT, AT_ONE)}
+    net.now += PATIENCE + 1
+    assert EAST in net.sides(attitude(ONE), PORT, somewhere), "the first one fell silent"
+
+
+def test_what_comes_back_by_another_way_is_not_passed_on(net: Net) -> None:
+    assert net.sides(attitude(ONE), EAST) == set(), "an endpoint that leads back to the port"
+    assert net.sides(beat(STATION, autopilot=8), PORT, ("10.0.0.66", 1)) == set()
+    assert net.sides(beat(Address(254, 191), autopilot=8), PORT, AT_ONE) == set()
+
+
+def test_two_stations_with_one_id_both_get_answers_and_start_no_echo(net: Net) -> None:
+    at = ("127.0.0.1", 40)
+    net.send(beat(STATION, autopilot=8), WEST, at)
+    assert net.sides(beat(STATION, autopilot=8), EAST) - {MOUNT, OTHER} == {PORT}
+    assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None), Place(WEST, at)}
+
+
+def test_vehicles_at_endpoints_are_no_business_of_clients(net: Net) -> None:
+    assert not net.sides(beat(Address(9, 1)), WEST, ("127.0.0.1", 40)) & {MOUNT, OTHER}
+    assert net.sides(ftp(Address(9, 1), Address(1, 1)), WEST, ("127.0.0.1", 40)) == {PORT, MOUNT}
+
+
+def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
+    damaged = attitude(ONE)._replace(proven=False)
+    assert EAST in net.sides(damaged, PORT, AT_ONE)
+    unheard = attitude(Address(77, 1))._replace(proven=False)
+    assert not net.sides(unheard, PORT, AT_TWO) & {EAST, WEST}
+    assert not net.router.taken(Address(77, 1), net.now)
+
+
+def test_who_left_is_forgotten(net: Net) -> None:
+    net.router.remove(EAST)
+    assert net.sides(ftp(ONE, STATION), PORT, AT_ONE) == {MOUNT}
+    assert not net.router.taken(STATION, net.now)
+
+
+# -- who is next ----------------------------------------------------------------------------------
+
+
+def waiting(text: str) -> Waiting:
+    return Waiting(Place(PORT, None), text.encode())
+
+
+def test_a_forwarded_frame_waits_for_at_most_one_of_ours() -> None:
+    outbox = Outbox(1000)
+    for number in range(3):
+        outbox.push(MOUNT, waiting(f"m{number}"), forwarded=False)
+        outbox.push(OTHER, waiting(f"o{number}"), forwarded=False)
+    outbox.pop()
+    outbox.push(EAST, waiting("e0"), forwarded=True)
+    outbox.push(WEST, waiting("w0"), forwarded=True)
+    outbox.push(EAST, waiting("e1"), forwarded=True)
+    order = [outbox.pop().frame.decode() for _ in range(8)]
+    assert order == ["e0", "o0", "w0", "m1", "e1", "o1", "m2", "o2"]
+    assert not outbox
+
+
+def test_a_side_that_floods_loses_its_own_frames() -> None:
+    outbox = Outbox(10)
+    for _ in range(100):
+        outbox.push(EAST, waiting("12345"), forwarded=True)
+    outbox.push(MOUNT, waiting("mine"), forwarded=False)
+    assert outbox.dropped == 98
+    assert [outbox.pop().frame for _ in range(3)] == [b"12345", b"mine", b"12345"]
+
+
+def test_a_serial_line_is_given_50_ms_ahead() -> None:
+    line = Line(57600)
+    now, given = 10.0, 0
+    while line.ready_at() <= now:
+        line.sent(266, now)
+        given += 266
+    assert LINE_TIME * 5760 <= given <= LINE_TIME * 5760 + 266
+    assert line.ready_at() == pytest.approx(now + given / 5760 - LINE_TIME)
+    assert Line(None).ready_at() <= 0
