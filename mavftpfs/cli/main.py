@@ -159,7 +159,9 @@ def _source_parser(name: str, description: str, *, short_help: bool = True) -> P
     parser = Parser(f"mavftpfs {name}", description=description, epilog=_SOURCES, add_help=False)
     help_words = ("-h", "--help") if short_help else ("--help",)
     parser.add_argument(*help_words, action="help", help="show this and exit")
-    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle, or where it is mounted")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="how to reach the vehicle, or a directory in a mount"
+    )
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
