@@ -3,10 +3,14 @@
 One Unix socket (0600, in a 0700 directory) for each mount, named after a hash of the mountpoint. One
 request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and
 the session is closed. The server runs under trio; the client is plain blocking code for short-lived commands.
+
+File descriptors are few where a limit is low, and the mount needs them for itself. So at most MAX_CLIENTS
+connections are taken at once, and those that ask nothing are ended when there is no room.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
@@ -16,6 +20,7 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +41,14 @@ REQUEST_PATIENCE = 10.0
 """Seconds for a client to send its line, and for us to hand it the reply."""
 QUEUE = 128
 """Clients that wait in the kernel until they are taken."""
+MAX_CLIENTS = 16
+"""Connections that are taken at once; others wait in the kernel's queue."""
+MAX_IDLE = 4
+"""How many of these may have asked nothing yet before others are taken. A command of ours asks right after
+it has connected."""
+IDLE = 0.1
+"""Seconds after which a connection that asked nothing yet is ended where there is no room."""
+_NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 _SUFFIX = ".sock"
@@ -75,6 +88,15 @@ def usable_directory(directories: list[Path]) -> Path:
 # -- the mount's side -----------------------------------------------------------------------------
 
 
+@dataclass(slots=True, eq=False)
+class _Client:
+    """A connection that was taken. since: when (trio's clock); idle: it asked nothing yet."""
+
+    since: float = field(default_factory=trio.current_time)
+    scope: trio.CancelScope = field(default_factory=trio.CancelScope)
+    idle: bool = True
+
+
 class ControlServer:
     """Answers requests at a socket path: one `command` after its name."""
 
@@ -82,6 +104,8 @@ class ControlServer:
         self._path = path
         self._commands = commands
         self._accepting = trio.CancelScope()
+        self._clients: set[_Client] = set()
+        self._crowded = False
         self.closed = trio.Event()
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
@@ -96,7 +120,8 @@ class ControlServer:
             async with trio.open_nursery() as clients:
                 task_status.started()
                 with self._accepting:
-                    await trio.serve_listeners(self._serve_client, [listener], handler_nursery=clients)
+                    async with listener:
+                        await self._accept(listener, clients)
         finally:
             with suppress(FileNotFoundError):
                 # While we delivered, the next mount may have put its socket there.
@@ -108,11 +133,64 @@ class ControlServer:
         """Take no more clients."""
         self._accepting.cancel()
 
-    async def _serve_client(self, stream: trio.SocketStream) -> None:
-        with suppress(trio.BrokenResourceError, trio.ClosedResourceError):  # it went away
-            reply = await _answer(stream, self._commands)
-            with trio.move_on_after(REQUEST_PATIENCE):
-                await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
+    async def _accept(self, listener: trio.SocketListener, nursery: trio.Nursery) -> None:
+        """Take clients until cancelled, as many as there is room for."""
+        while True:
+            while len(self._clients) >= MAX_CLIENTS or self._idle > MAX_IDLE:
+                await self._make_room(f"{len(self._clients)} connections")
+            try:
+                stream = await listener.accept()
+            except OSError as error:
+                if error.errno not in _NO_DESCRIPTORS:
+                    raise
+                await self._make_room(os.strerror(error.errno))
+            else:
+                client = _Client()
+                self._clients.add(client)
+                nursery.start_soon(self._serve_client, stream, client)
+
+    @property
+    def _idle(self) -> int:
+        return sum(client.idle for client in self._clients)
+
+    async def _make_room(self, why: str) -> None:
+        """Wait a moment, and end the connections that ask nothing. Said once in a mount."""
+        if not self._crowded:
+            self._crowded = True
+            log.warning("the control socket is crowded (%s): connections that ask nothing are ended", why)
+        await trio.sleep(IDLE)
+        for client in self._clients:
+            if client.idle and client.since <= trio.current_time() - IDLE:
+                client.scope.cancel()
+
+    async def _serve_client(self, stream: trio.SocketStream, client: _Client) -> None:
+        try:
+            # It may go away at any time.
+            with client.scope, suppress(trio.BrokenResourceError, trio.ClosedResourceError):
+                line = b""
+                with trio.move_on_after(REQUEST_PATIENCE):
+                    line = await _receive_line(stream)
+                client.idle = False
+                reply = await self._answer(line)
+                with trio.move_on_after(REQUEST_PATIENCE):
+                    await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
+        finally:
+            self._clients.discard(client)
+            await trio.aclose_forcefully(stream)
+
+    async def _answer(self, line: bytes) -> Reply:
+        try:
+            request = json.loads(line)
+            command = self._commands[request["command"]]
+        except (ValueError, KeyError, TypeError, RecursionError):  # the last for a line of many brackets
+            return failure("not a command of this mount")
+        try:
+            return {"ok": True, **await command(request)}
+        except MavftpfsError as exc:
+            return failure(str(exc))
+        except Exception as exc:
+            log.exception("bug in a control command")
+            return failure(f"internal error: {exc!r}")
 
 
 def _bind(path: Path) -> trio.SocketListener:
@@ -129,24 +207,6 @@ def _bind(path: Path) -> trio.SocketListener:
     finally:
         os.umask(mask)
     return trio.SocketListener(trio.socket.from_stdlib_socket(listener))
-
-
-async def _answer(stream: trio.SocketStream, commands: Mapping[str, Command]) -> Reply:
-    line = b""
-    with trio.move_on_after(REQUEST_PATIENCE):
-        line = await _receive_line(stream)
-    try:
-        request = json.loads(line)
-        command = commands[request["command"]]
-    except (ValueError, KeyError, TypeError, RecursionError):  # the last for a line of many brackets
-        return failure("not a command of this mount")
-    try:
-        return {"ok": True, **await command(request)}
-    except MavftpfsError as exc:
-        return failure(str(exc))
-    except Exception as exc:
-        log.exception("bug in a control command")
-        return failure(f"internal error: {exc!r}")
 
 
 def failure(reason: str) -> Reply:

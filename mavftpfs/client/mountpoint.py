@@ -37,6 +37,10 @@ ended a moment after its parent was told, and desktop services look at what is n
 _BUSY_PAUSE = 0.1
 
 
+class CannotStart(MountFailed):
+    """The program that unmounts could not be started by this process."""
+
+
 class DeadMount(MountFailed):
     """What is mounted there has lost its program."""
 
@@ -166,10 +170,18 @@ def unmount_what_is_left(path: str) -> None:
 
 
 def _said_by(words: list[str], path: str) -> str | None:
-    """Return what a program that mounts or unmounts complained of, None if it succeeded."""
+    """Return what a program that mounts or unmounts complained of, None if it succeeded.
+
+    Raises:
+        CannotStart: it is missing, or this process has no descriptors left.
+        MountFailed: it does not end.
+    """
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
-    except (OSError, subprocess.TimeoutExpired) as exc:
+    except OSError as exc:
+        command = " ".join(words)
+        raise CannotStart(f"cannot start {words[0]} here: {exc.strerror}; run: {command}") from exc
+    except subprocess.TimeoutExpired as exc:
         raise MountFailed(f"{words[0]} {path}: {exc}") from exc
     return done.stderr.strip() if done.returncode != 0 else None
 

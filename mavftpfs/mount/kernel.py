@@ -28,7 +28,7 @@ import trio
 import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached
 from mavftpfs.client.control import ControlServer, Reply
-from mavftpfs.client.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
+from mavftpfs.client.mountpoint import CannotStart, is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.client.status import network_namespace
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mount.daemon import Report
@@ -263,6 +263,8 @@ class _Life:
         if not self._let_go:
             try:
                 await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+            except CannotStart:
+                raise
             except MountFailed:
                 if await trio.to_thread.run_sync(is_ours, self.request.mountpoint):
                     raise

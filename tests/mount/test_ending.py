@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from mavftpfs.client.control import find_socket, own_directories
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, mounted_at, wait_until
 
@@ -17,6 +22,8 @@ BIG = 300 << 20
 """Bytes of a sparse file that no server sends within a test."""
 SILENCE = 60.0
 """Seconds within which everything that waits for a dead vehicle must have ended."""
+FEW = 40
+"""Descriptors of a mount's process, which needs some 25 to unmount."""
 QUICK = ("op_deadline=6",)
 
 READ_ALL = """
@@ -159,6 +166,21 @@ def test_unmounting_from_a_dead_vehicle_ends(field: Field, big_tree: Path) -> No
     mount.run("cat", mount.path / "dir0/small.txt")
     vehicle.pause()
     assert mount.unmount() == 0
+
+
+def test_a_mount_with_few_descriptors_and_idle_connections_ends_in_order(
+    field: Field, big_tree: Path
+) -> None:
+    mount = field.mount(field.sim(big_tree).source)
+    process = mount.alive()
+    resource.prlimit(process.popen.pid, resource.RLIMIT_NOFILE, (FEW, FEW))
+    path = find_socket(os.path.realpath(mount.path), own_directories())
+    with ExitStack() as idle:
+        for _ in range(FEW):
+            idle.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
+        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
+    assert process.wait() == 0
+    assert process.text().count("crowded") == 1
 
 
 def test_a_busy_mount_refuses_umount_and_goes_on(field: Field, big_tree: Path) -> None:
