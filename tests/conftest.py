@@ -14,7 +14,7 @@ import pytest
 import trio._core._run as scheduler
 from hypothesis import HealthCheck, settings
 
-TIERS = ("unit", "property", "sim", "ops", "conformance", "mount")
+TIERS = ("unit", "property", "sim", "ops", "conformance", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
 
 TESTS = Path(__file__).parent
@@ -96,7 +96,7 @@ def packed(items: list[pytest.Item]) -> list[pytest.Item]:
     for item in items:
         files.setdefault(item.path, []).append(item)
     longest = sorted(files, key=lambda path: -len(files[path]))
-    waiting = [path for path in longest if tier_of(path) == "mount"]
+    waiting = [path for path in longest if tier_of(path) in ("mount", "api")]
     computing = [path for path in longest if tier_of(path) == "sim"]
     turns = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
     rest = [path for path in longest if path not in turns]

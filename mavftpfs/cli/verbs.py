@@ -21,16 +21,17 @@ from typing import Any, TypeVar
 import trio
 
 from mavftpfs.cli import drawing
-from mavftpfs.cli.commands import connection_of, left_by_killed_mounts_line
+from mavftpfs.cli.commands import left_by_killed_mounts_line
 from mavftpfs.cli.report import count_files
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
 from mavftpfs.client import scan as scanning
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
-from mavftpfs.client.files import Session, Target, mountpoint_of
+from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.source import target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
@@ -43,15 +44,7 @@ Args = argparse.Namespace
 def _target(args: Args, component: int | None) -> Target:
     if component is not None:
         args.options.append(f"target_component={component}")
-    mount = mountpoint_of(args.source)
-    if mount is not None:
-        return Target(None, parse_options(args.options).client, mount=mount)
-    place = args.source.partition("#")[0]
-    no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
-    if no_device or os.path.isdir(place):
-        raise UsageError(f"no vehicle is mounted on {place}")
-    options, spec = connection_of(args)
-    return Target(spec, options.client)
+    return target_of(args.source, parse_options(args.options).client)
 
 
 def run(

@@ -355,8 +355,10 @@ _HINTS = {
 
 
 def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
-    kind = _BY_ERRNO.get(error.errno or 0, errors.MavftpfsError)
-    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{_HINTS.get(kind, '')}")
+    number = error.errno or errno.EIO
+    kind = _BY_ERRNO.get(number)
+    text = f"{name_text(path)}: {os.strerror(number)}"
+    return errors.OtherRefusal(text, number) if kind is None else kind(text + _HINTS.get(kind, ""))
 
 
 async def _call(path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
@@ -546,10 +548,10 @@ class Target:
         # What the verb asks for first takes the place of the first listing that a mount makes.
         up = attached(self.spec, self.options, sinks=self.sinks, list_root=False, writing=writing)
         async with up as vehicle, _answered_by(deadline, vehicle, self.options):
-            yield _session_of(vehicle, self.options)
+            yield session_of(vehicle, self.options)
 
 
-def _session_of(vehicle: Attached, options: Options) -> Session:
+def session_of(vehicle: Attached, options: Options) -> Session:
     async def acknowledged() -> Acknowledged:
         found: Any = vehicle.tree.status().get("transfers", [])
         return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}

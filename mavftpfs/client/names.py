@@ -310,10 +310,10 @@ async def move_paths(session: Session, paths: Sequence[bytes], to: bytes) -> Non
     if not into and len(paths) > 1:
         raise NotADirectory(f"{name_text(to)} is no directory, so only one thing can be moved there")
     for path in paths:
-        await _move(session.files, path, join(to, split(path)[1]) if into else to)
+        await move(session.files, path, join(to, split(path)[1]) if into else to)
 
 
-async def _move(files: Files, old: bytes, new: bytes) -> None:
+async def move(files: Files, old: bytes, new: bytes) -> None:
     """Rename; where the server cannot, copy (which is verified) and delete, as mv does between disks."""
     try:
         await files.rename(old, new)
@@ -326,7 +326,7 @@ async def _move(files: Files, old: bytes, new: bytes) -> None:
         return
     await make_directory(files, new, may_exist=False)
     for name, _ in await files.list(old):
-        await _move(files, join(old, name), join(new, name))
+        await move(files, join(old, name), join(new, name))
     await files.rmdir(old)
 
 

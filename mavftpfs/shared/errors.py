@@ -14,7 +14,7 @@ class MavftpfsError(Exception):
     """Base of every error this package raises on purpose; its text is one line for a person."""
 
 
-class UsageError(MavftpfsError):
+class UsageError(MavftpfsError, ValueError):
     """The caller asked for something that cannot be (bad option, bad SOURCE); exit code 1."""
 
 
@@ -152,6 +152,18 @@ class SpoolFailed(MavftpfsError):
 
 class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
+
+
+class OtherRefusal(MavftpfsError):
+    """A mount refused with an errno that none of these stands for.
+
+    Attributes:
+        number: the errno.
+    """
+
+    def __init__(self, reason: str, number: int = 0) -> None:
+        super().__init__(reason)
+        self.number = number
 
 
 class MountFailed(MavftpfsError):

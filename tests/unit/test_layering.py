@@ -32,6 +32,8 @@ LAYERS: dict[str, set[str]] = {
     "sim": {"shared", "protocol", "link"},
     "cli": {"shared", "protocol", "link", "cache", "session", "client", "mount", "hub", "sim"},
     "api": {"shared", "protocol", "link", "cache", "session", "client"},
+    "__init__": {"api"},
+    "trio": {"api"},
 }
 """Layer -> the layers below it that it may import. `__main__` runs the top one."""
 

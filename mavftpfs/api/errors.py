@@ -1,0 +1,81 @@
+"""What programs are told: OSErrors of the right kind, with the sentence that people get. Layer: api."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mavftpfs.shared import errors
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.readable import readable
+
+__all__ = ["NotDelivered", "UsageError", "os_error", "translated"]
+
+
+class NotDelivered(OSError):
+    """A file that was written is not on the vehicle, or not provably.
+
+    It is also of the kind of its reason: a TimeoutError, a PermissionError.
+
+    Attributes:
+        on_vehicle: what is there now. True: the file as it was written. False: what was there before, or
+            nothing; what was written is withdrawn, and nothing of it is sent later. None: nobody can tell.
+    """
+
+    on_vehicle: bool | None = None
+
+
+def os_error(error: MavftpfsError) -> Exception:
+    """Return what a program is told in the place of an error of ours.
+
+    A UsageError stays one, which is a ValueError, unless the operating system is behind it.
+    """
+    number, text = _number(error), readable(str(error))
+    if isinstance(error, errors.NotDelivered):
+        told = _undelivered(type(OSError(number, text)))(number, f"{text} ({_whereabouts(error.there)})")
+        told.on_vehicle = error.there
+        return told
+    if isinstance(error, UsageError) and not isinstance(error.__cause__, OSError):
+        return UsageError(text)
+    return OSError(number, text)
+
+
+@contextmanager
+def translated() -> Iterator[None]:
+    """Raise errors of ours in the body as what programs are told."""
+    try:
+        yield
+    except MavftpfsError as exc:
+        told = os_error(exc)
+        raise told from (None if isinstance(told, UsageError) else exc)
+
+
+def _whereabouts(there: bool | None) -> str:
+    if there is None:
+        return "nobody can tell what is on the vehicle now: look before you use it"
+    if there:
+        return "it is on the vehicle, whole"
+    return "withdrawn: the vehicle has what it had, and nothing of it is sent later"
+
+
+def _number(error: MavftpfsError) -> int:
+    cause = error.__cause__
+    match error:
+        case errors.NotDelivered() | errors.NoFtp() | errors.LinkClosed() if isinstance(cause, MavftpfsError):
+            return _number(cause)
+        case errors.LinkClosed() | UsageError() if isinstance(cause, OSError) and cause.errno:
+            return cause.errno
+        case errors.LinkClosed():
+            return errno.ECONNABORTED
+        case errors.NoFtp():
+            return errno.ETIMEDOUT
+    return errno_for(error)
+
+
+def _undelivered(kind: type[OSError]) -> type[NotDelivered]:
+    """Return NotDelivered, of another kind of OSError, too."""
+    if kind is OSError:
+        return NotDelivered
+    return type("NotDelivered", (NotDelivered, kind), {"__module__": NotDelivered.__module__})

@@ -1,0 +1,95 @@
+"""An open file of a vehicle, as the Python files above it need it. Layer: api."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import trio
+
+from mavftpfs.api.errors import translated
+from mavftpfs.client.files import CLOSING_TIME, WITHDRAWAL_TIME, File, written
+from mavftpfs.shared.errors import MavftpfsError
+
+PIECE = 1 << 20
+"""Bytes of one read while a file is read to its end."""
+
+
+class Opened:
+    """An open file. All raise OSErrors (see api.errors), and run in the event loop but `size`.
+
+    Attributes:
+        name: for people. writable: whether it may be changed by this.
+    """
+
+    def __init__(self, name: str, file: File, *, writable: bool, forget: Callable[[Opened], None]) -> None:
+        """`forget(self)` is called when it is closed."""
+        self.name = name
+        self.writable = writable
+        self._file = file
+        self._forget = forget
+        self._failure: BaseException | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes, as programs see it now."""
+        return self._file.size
+
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end."""
+        with translated():
+            return await self._file.read(offset, size)
+
+    async def read_to_end(self, offset: int) -> bytes:
+        """Return all from `offset` on."""
+        parts = []
+        while data := await self.read(offset, PIECE):
+            parts.append(data)
+            offset += len(data)
+        return b"".join(parts)
+
+    async def write(self, offset: int | None, data: bytes) -> int:
+        """Take all of `data`, at the end if no offset is given; return the offset behind it."""
+        with translated():
+            try:
+                offset = self._file.size if offset is None else offset
+                return offset + await self._file.write(offset, data)
+            except BaseException as exc:
+                self._failure = exc
+                raise
+
+    async def truncate(self, size: int) -> None:
+        """Cut or extend it."""
+        with translated():
+            try:
+                await self._file.truncate(size)
+            except BaseException as exc:
+                self._failure = exc
+                raise
+
+    async def close(self) -> None:
+        """Have what was written on the card, checked; or have nothing of it there, and say so.
+
+        Raises:
+            NotDelivered.
+        """
+        self._forget(self)
+        with translated():
+            if self.writable:
+                async with written(self._file):
+                    self._require_whole()
+            else:
+                with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
+                    await self._file.release()
+
+    def _require_whole(self) -> None:
+        """A part of what was to be written is not to pass for the whole."""
+        if isinstance(self._failure, MavftpfsError):
+            raise self._failure
+        if self._failure is not None:
+            raise MavftpfsError(f"{self.name}: writing it was interrupted")
+
+    async def abandon(self) -> None:
+        """Close it without delivering what was written, which is withdrawn. Raises nothing of ours."""
+        self._forget(self)
+        with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
+            await self._file.give_up()

@@ -1,0 +1,235 @@
+"""Python's files over an open file of a vehicle. Layer: api.
+
+`RawFile` is the raw one; Python's own buffers and text lie over it. A finalizer must not wait: garbage is
+collected anywhere, also in the event loop's thread. So none of these delivers anything when it is collected
+without having been closed: the raw file posts that it is to be abandoned, and says what is lost.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import logging
+import os
+import warnings
+from typing import IO, Any
+
+from mavftpfs.api.errors import NotDelivered
+from mavftpfs.api.opened import Opened
+from mavftpfs.api.portal import Portal
+
+log = logging.getLogger("mavftpfs.api")
+
+READ_BUFFER = 256 * 1024
+WRITE_BUFFER = 128 * 1024
+"""Bytes that are asked for, or handed on, at once."""
+
+
+class Mode:
+    """A mode of open(), taken apart.
+
+    Attributes:
+        plain: r, w, a or x, and perhaps +. text: whether it is opened as text.
+    """
+
+    def __init__(self, mode: str) -> None:
+        """Raises: ValueError: it is none."""
+        letters = set(mode)
+        self.plain = "".join(letter for letter in mode if letter in "rwax+")
+        kinds = letters & set("rwax")
+        if (
+            len(letters) != len(mode)
+            or not letters <= set("rwaxbt+")
+            or len(kinds) != 1
+            or {"b", "t"} <= letters
+        ):
+            raise ValueError(f"invalid mode: {mode!r}")
+        self.plain = kinds.pop() + ("+" if "+" in letters else "")
+        self.text = "b" not in letters
+
+    @property
+    def reads(self) -> bool:
+        """Whether it may be read."""
+        return self.plain[0] == "r" or "+" in self.plain
+
+    @property
+    def writes(self) -> bool:
+        """Whether it may be written."""
+        return self.plain != "r"
+
+
+class _Ending:
+    """How a `with` statement ends that wrote a file."""
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: Any) -> None:
+        """Close. An interruption of the body stays one, and says what became of the file."""
+        try:
+            self.close()  # type: ignore[attr-defined]
+        except NotDelivered as exc:
+            if error is None or isinstance(error, OSError):
+                raise
+            error.add_note(str(exc))
+
+
+class RawFile(_Ending, io.RawIOBase):
+    """An open file without a buffer.
+
+    Attributes:
+        name, mode: as of io.FileIO.
+    """
+
+    def __init__(self, opened: Opened, portal: Portal, mode: Mode) -> None:
+        super().__init__()
+        self.name = opened.name
+        self.mode = mode.plain + "b"
+        self._opened = opened
+        self._portal = portal
+        self._mode = mode
+        self._pid = os.getpid()
+        self._at = opened.size if mode.plain[0] == "a" else 0
+
+    def readable(self) -> bool:
+        """Whether it may be read."""
+        return self._mode.reads
+
+    def writable(self) -> bool:
+        """Whether it may be written."""
+        return self._mode.writes
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        """Fill the buffer as far as the file goes; returns the bytes."""
+        self._require(self._mode.reads, "readable")
+        view = memoryview(buffer).cast("B")
+        data = self._portal.call(self._opened.read, self._at, len(view))
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def readall(self) -> bytes:
+        """Return all that follows."""
+        self._require(self._mode.reads, "readable")
+        data = self._portal.call(self._opened.read_to_end, self._at)
+        self._at += len(data)
+        return data
+
+    def write(self, data: Any, /) -> int:
+        """Take all of it; see Opened.write."""
+        taken = bytes(memoryview(data))  # whoever interrupts the call may change the buffer while it is read
+        self._require(self._mode.writes, "writable")
+        at = None if self._mode.plain[0] == "a" else self._at
+        self._at = self._portal.call(self._opened.write, at, taken)
+        return len(taken)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        """Set and return the position."""
+        self._require(True, "")
+        starts = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._opened.size}
+        if whence not in starts:
+            raise ValueError(f"invalid whence ({whence}, should be 0, 1 or 2)")
+        if starts[whence] + offset < 0:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        self._at = starts[whence] + offset
+        return self._at
+
+    def tell(self) -> int:
+        """Return the position."""
+        self._require(True, "")
+        return self._at
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Cut or extend it to `size`, or to the position; returns the size."""
+        self._require(self._mode.writes, "writable")
+        size = self._at if size is None else size
+        self._portal.call(self._opened.truncate, size)
+        return size
+
+    def close(self) -> None:
+        """Return when what was written is on the card, checked.
+
+        Raises:
+            NotDelivered: it is not; `on_vehicle` says what is there.
+        """
+        if self.closed:
+            return
+        super().close()
+        try:
+            self._portal.call(self._opened.close)
+        except KeyboardInterrupt as exc:
+            if self._mode.writes:
+                exc.add_note(
+                    f"{self.name} was being delivered: look what is on the vehicle before you use it"
+                )
+            raise
+
+    def __del__(self) -> None:
+        """Post what is left to do, and wait for nothing."""
+        if self.closed or getattr(self, "_pid", None) != os.getpid():
+            return
+        super().close()
+        lost = ": what was written to it is withdrawn" if self._mode.writes else ""
+        warnings.warn(f"{self.name} was not closed{lost}", ResourceWarning, stacklevel=2, source=self)
+        if lost:
+            log.error("%s was not closed%s", self.name, lost)
+        self._portal.post(self._opened.abandon)
+
+    def _require(self, allowed: bool, what: str) -> None:
+        if self.closed:
+            raise ValueError("I/O operation on closed file")
+        if not allowed:
+            raise io.UnsupportedOperation(f"not {what}")
+
+
+class _Reader(_Ending, io.BufferedReader):
+    def __del__(self) -> None:
+        """As RawFile's, which follows: Python's would wait."""
+
+
+class _Writer(_Ending, io.BufferedWriter):
+    def __del__(self) -> None:
+        """As RawFile's, which follows: Python's would deliver, and wait."""
+
+
+class _Random(_Ending, io.BufferedRandom):
+    def __del__(self) -> None:
+        """As RawFile's, which follows: Python's would deliver, and wait."""
+
+
+class _Text(_Ending, io.TextIOWrapper):
+    def __del__(self) -> None:
+        """As RawFile's, which follows: Python's would deliver, and wait."""
+
+
+def python_file(
+    opened: Opened,
+    portal: Portal,
+    mode: Mode,
+    buffering: int = -1,
+    encoding: str | None = None,
+    errors: str | None = None,
+    newline: str | None = None,
+) -> IO[Any]:
+    """Return what the builtin open() would.
+
+    Raises:
+        ValueError: the arguments contradict one another.
+    """
+    if not mode.text and (encoding, errors, newline) != (None, None, None):
+        raise ValueError("binary mode takes no encoding, errors or newline argument")
+    if mode.text and buffering == 0:
+        raise ValueError("can't have unbuffered text I/O")
+    raw: Any = RawFile(opened, portal, mode)
+    if buffering == 0:
+        return raw  # type: ignore[no-any-return]
+    lines = buffering == 1 and mode.text
+    size = buffering if buffering > 1 else WRITE_BUFFER if mode.writes else READ_BUFFER
+    kind = _Random if mode.reads and mode.writes else _Writer if mode.writes else _Reader
+    buffered: Any = kind(raw, size)
+    if not mode.text:
+        return buffered  # type: ignore[no-any-return]
+    text = _Text(buffered, encoding or "utf-8", errors, newline, lines)
+    text.mode = mode.plain  # type: ignore[misc]
+    return text

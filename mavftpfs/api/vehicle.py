@@ -1,0 +1,432 @@
+"""A vehicle's files for trio programs: `mavftpfs.trio`. Layer: api."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import trio
+
+from mavftpfs.api.errors import os_error, translated
+from mavftpfs.api.opened import Opened
+from mavftpfs.api.portal import TaskPortal
+from mavftpfs.api.pythonfile import Mode, python_file
+from mavftpfs.cache.attributes import Stat
+from mavftpfs.client import download, names, upload
+from mavftpfs.client.connect import attached, open_sinks, plain_nursery
+from mavftpfs.client.fetch import Fetcher, known_time
+from mavftpfs.client.files import File, Files, Session, Target, mount_status, session_of, walk
+from mavftpfs.client.options import options_of
+from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import Verify
+from mavftpfs.client.source import target_of
+from mavftpfs.shared.errors import NotADirectory, NotFound, UsageError
+from mavftpfs.shared.model import EntryKind, join, normalise, split
+from mavftpfs.shared.readable import name_text
+
+log = logging.getLogger("mavftpfs.api")
+
+PathLike = str | bytes | os.PathLike[str]
+"""A path on the vehicle. A relative one begins at the root."""
+
+NEVER_LOCAL = ""
+"""local=: an editor's swap file may stay in a mount's memory; what a program writes is meant for the card."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A file or directory. size: bytes; mtime: seconds since 1970 UTC, None if the vehicle does not tell."""
+
+    name: str
+    path: str
+    size: int
+    mtime: float | None
+    kind: EntryKind
+
+    def is_dir(self) -> bool:
+        """Return whether it is a directory."""
+        return self.kind is EntryKind.DIRECTORY
+
+    def is_file(self) -> bool:
+        """Return whether it is a file."""
+        return self.kind is EntryKind.FILE
+
+
+def remote(path: PathLike) -> bytes:
+    """Return a path as the client has it.
+
+    Raises:
+        LocalProtocolError: it holds `..` or NUL.
+    """
+    return normalise(b"/" + os.fsencode(path))
+
+
+def entry(path: bytes, stat: Stat) -> Entry:
+    """Return what a program is told of a path."""
+    mtime = None if known_time(stat.mtime) is None else stat.mtime_ns / 1e9
+    name = split(path)[1]
+    return Entry(os.fsdecode(name), os.fsdecode(path), stat.size, mtime, stat.kind)
+
+
+Status = Callable[[], Awaitable[Mapping[str, Any]]]
+
+
+class Drone:
+    """A vehicle's files. Made by `connect`; every call may be made by several tasks at once.
+
+    Paths are text, bytes or path-like. Errors are OSErrors of the right kind (FileNotFoundError,
+    PermissionError, TimeoutError ...), whose text is a sentence for people.
+
+    Attributes:
+        source: as it was given. mountpoint: of the mount whose files these are; None for a connection of its
+            own.
+    """
+
+    def __init__(self, source: str, session: Session, status: Status, nursery: trio.Nursery) -> None:
+        self.source = source
+        self.mountpoint = session.mountpoint
+        self._session = session
+        self._status = status
+        self._nursery = nursery
+        self._opened: set[Opened] = set()
+
+    def __repr__(self) -> str:
+        return f"<Drone {self.source}>"
+
+    @property
+    def _files(self) -> Files:
+        return self._session.files
+
+    # --- looking
+
+    async def stat(self, path: PathLike) -> Entry:
+        """Return what a path is.
+
+        Raises:
+            FileNotFoundError, NotADirectoryError.
+        """
+        with translated():
+            wanted = remote(path)
+            return entry(wanted, await self._files.stat(wanted))
+
+    async def scandir(self, path: PathLike = "/") -> list[Entry]:
+        """Return what is in a directory. A listing that did not come whole is an error.
+
+        Raises:
+            FileNotFoundError, NotADirectoryError.
+        """
+        with translated():
+            wanted = remote(path)
+            return [entry(join(wanted, name), stat) for name, stat in await self._files.list(wanted)]
+
+    async def listdir(self, path: PathLike = "/") -> list[str]:
+        """Return the names in a directory."""
+        return [found.name for found in await self.scandir(path)]
+
+    async def walk(self, path: PathLike = "/") -> list[Entry]:
+        """Return all that is below a directory, parents first.
+
+        Raises:
+            As scandir, of any directory below, too.
+        """
+        with translated():
+            top = remote(path)
+            found, unlisted = await walk(self._files, top)
+            for _, error in unlisted:
+                raise error
+            return [entry(join(top, below), stat) for below, stat in found]
+
+    async def exists(self, path: PathLike) -> bool:
+        """Return whether there is something of that name."""
+        return await self._kind(path) is not None
+
+    async def is_dir(self, path: PathLike) -> bool:
+        """Return whether there is a directory of that name."""
+        return await self._kind(path) is EntryKind.DIRECTORY
+
+    async def is_file(self, path: PathLike) -> bool:
+        """Return whether there is a file of that name."""
+        return await self._kind(path) is EntryKind.FILE
+
+    async def _kind(self, path: PathLike) -> EntryKind | None:
+        with translated():
+            try:
+                return (await self._files.stat(remote(path))).kind
+            except (NotFound, NotADirectory):
+                return None
+
+    async def crc32(self, path: PathLike) -> int:
+        """Have the vehicle compute a file's CRC32: start value 0, and no final xor."""
+        with translated():
+            return await self._files.crc32(remote(path))
+
+    async def status(self) -> dict[str, Any]:
+        """Return what `mavftpfs status --json` tells of vehicle, link and transfers."""
+        with translated():
+            return dict(await self._status())
+
+    async def refresh(self) -> None:
+        """Have the vehicle asked again for what is remembered of it; others may have changed it."""
+        self._files.forget_caches()
+
+    # --- changing names
+
+    async def mkdir(self, path: PathLike, *, parents: bool = False, exist_ok: bool = False) -> None:
+        """Make a directory, and with `parents` those above it.
+
+        Raises:
+            FileExistsError, FileNotFoundError.
+        """
+        with translated():
+            wanted = remote(path)
+            for above in names.ancestors(wanted) if parents else []:
+                await names.make_directory(self._files, above, may_exist=True)
+            await names.make_directory(self._files, wanted, may_exist=exist_ok)
+
+    async def rmdir(self, path: PathLike) -> None:
+        """Remove an empty directory."""
+        with translated():
+            await self._files.rmdir(remote(path))
+
+    async def remove(self, path: PathLike, *, recursive: bool = False) -> None:
+        """Remove a file; with `recursive` a directory with all below, too.
+
+        Raises:
+            FileNotFoundError, IsADirectoryError.
+        """
+        with translated():
+            wanted = [remote(path)]
+            names.refuse_root(wanted)
+            await names.remove_paths(self._session, wanted, recursive=recursive)
+
+    async def rename(self, old: PathLike, new: PathLike) -> None:
+        """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
+        with translated():
+            await names.move(self._files, remote(old), remote(new))
+
+    async def truncate(self, path: PathLike, size: int) -> None:
+        """Cut a file, or extend it by zeros."""
+        with translated():
+            await self._files.truncate(remote(path), size)
+
+    # --- whole files
+
+    async def read_bytes(self, path: PathLike) -> bytes:
+        """Return a file's content."""
+        opened = await self.open_raw(path, "r")
+        try:
+            return await opened.read_to_end(0)
+        finally:
+            await opened.close()
+
+    async def write_bytes(self, path: PathLike, data: bytes) -> None:
+        """Make a file or replace its content; back when it is on the card, checked.
+
+        Raises:
+            NotDelivered: it is not; see there.
+        """
+        opened = await self.open_raw(path, "w")
+        try:
+            await opened.write(0, data)
+        finally:
+            await opened.close()
+
+    async def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
+        """Return a file's content as text."""
+        return (await self.read_bytes(path)).decode(encoding)
+
+    async def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:
+        """Make a file or replace its content by a text."""
+        await self.write_bytes(path, text.encode(encoding))
+
+    # --- many files
+
+    async def get(
+        self,
+        path: PathLike,
+        local: str | os.PathLike[str] = ".",
+        *,
+        recursive: bool = False,
+        verify: Verify = "auto",
+    ) -> list[Path]:
+        """Fetch a file, or with `recursive` a directory, proven; return what came.
+
+        A file goes into `local` if that is a directory, else under that name. All else goes into `local`.
+
+        Raises:
+            OSError: something did not come; the text says how much did.
+        """
+
+        async def work(downloads: download.Downloads) -> None:
+            await downloads.get([remote(path)], Path(local), into=False, recursive=recursive)
+
+        outcome = await self._download(verify, work)
+        return [fetched.wanted.local for fetched in outcome.fetched]
+
+    async def sync(
+        self,
+        local: str | os.PathLike[str],
+        *,
+        place: PathLike | None = None,
+        newest: int | None = None,
+        since: float | None = None,
+        verify: Verify = "auto",
+    ) -> list[Path]:
+        """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here.
+
+        place: their directory on the vehicle; None to find it. newest: at most so many; since: not older,
+        seconds since 1970 UTC.
+
+        Raises:
+            OSError: a log did not come; the text says how many did.
+        """
+        where = None if place is None else remote(place)
+        wish = download.Wish(Path(local), where, newest, since)
+        outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
+        return [fetched.wanted.local for fetched in outcome.fetched]
+
+    async def _download(
+        self, verify: Verify, work: Callable[[download.Downloads], Awaitable[None]]
+    ) -> download.Outcome:
+        outcome = download.Outcome()
+        fetcher = Fetcher(self._session, Progress(), verify)
+        with translated():
+            await work(download.Downloads(fetcher, outcome, _ignore, _ignore))
+            for path, error in outcome.failed.items():
+                count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
+                failure = os_error(error)
+                failure.args = (
+                    failure.args[0],
+                    f"{name_text(path)}: {failure.args[-1]}; {count} of {of} files are here",
+                )
+                raise failure from error
+        return outcome
+
+    async def put(
+        self, local: str | os.PathLike[str], path: PathLike, *, recursive: bool = False
+    ) -> list[str]:
+        """Put a file, or with `recursive` a directory, on the vehicle; return the paths that are there.
+
+        `path` is an existing directory, or the new name.
+
+        Raises:
+            NotDelivered: a file is not there; see there.
+        """
+        told: list[str] = []
+        with translated():
+            found = upload.collect(Path(local), recursive=recursive)
+            batches = [(Path(local), found)]
+            tell = lambda where, size: told.append(os.fsdecode(where))  # noqa: E731
+            await upload.put_paths(self._session, batches, remote(path), Progress(), tell)
+        return told
+
+    # --- opening
+
+    async def open(
+        self,
+        path: PathLike,
+        mode: str = "r",
+        buffering: int = -1,
+        encoding: str | None = None,
+        errors: str | None = None,
+        newline: str | None = None,
+    ) -> Any:
+        """Open a file as the builtin does; its methods are async, as those of trio.open_file.
+
+        Text is UTF-8 unless `encoding` says otherwise. What was written is on the card, checked, when
+        `aclose` returns.
+
+        Raises:
+            FileNotFoundError, FileExistsError, IsADirectoryError ... ValueError: of the mode.
+        """
+        how = Mode(mode)
+        opened = await self.open_raw(path, how.plain)
+        build = partial(
+            python_file, opened, TaskPortal(self._nursery), how, buffering, encoding, errors, newline
+        )
+        return trio.wrap_file(await trio.to_thread.run_sync(build))
+
+    async def open_raw(self, path: PathLike, mode: str) -> Opened:
+        """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""
+        with translated():
+            wanted, files = remote(path), self._files
+            match mode[0]:
+                case "r":
+                    file = await files.open(wanted, write="+" in mode)
+                case "w":
+                    file = await names.emptied(files, wanted)
+                case "x":
+                    file = await files.create(wanted, exclusive=True)
+                case _:
+                    file = await _opened_or_made(files, wanted)
+        opened = Opened(os.fsdecode(wanted), file, writable=mode != "r", forget=self._opened.discard)
+        self._opened.add(opened)
+        return opened
+
+    async def close_files(self) -> None:
+        """Close what is open, take back what was written to it, and say so."""
+        for opened in list(self._opened):
+            if opened.writable:
+                log.error("%s was not closed: what was written to it is withdrawn", opened.name)
+            await opened.abandon()
+
+
+async def _opened_or_made(files: Files, path: bytes) -> File:
+    try:
+        return await files.open(path, write=True)
+    except NotFound:
+        return await files.create(path, exclusive=False)
+
+
+def _ignore(told: object) -> None:
+    """Nothing is shown of single files."""
+
+
+@asynccontextmanager
+async def connect(source: str, *, use_mount: bool = True, **options: object) -> AsyncIterator[Drone]:
+    """Give a vehicle's files to the body; back when its session is closed.
+
+    source: as for `mavftpfs`: a link (`udpin:0.0.0.0:14550`, `/dev/ttyACM0`), or where it is mounted. A mount
+    of that vehicle that is up is used, unless `use_mount` is False. options: those of a mount, by name:
+    `target_system=2, signing_key="key", ro=True`.
+
+    Raises:
+        TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
+        opened. UsageError (a ValueError): of source or options, which it names.
+    """
+    with translated():
+        target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))
+        if target.mount is not None and not use_mount:
+            raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
+        up = _session(target, use_mount=use_mount)
+        async with up as (session, status), plain_nursery() as nursery:
+            drone = Drone(source, session, status, nursery)
+            try:
+                yield drone
+            finally:
+                with trio.CancelScope(shield=True):
+                    await drone.close_files()
+
+
+@asynccontextmanager
+async def _session(target: Target, *, use_mount: bool) -> AsyncIterator[tuple[Session, Status]]:
+    session = await target.mounted() if use_mount else None
+    if session is not None:
+        assert session.mountpoint is not None
+        yield session, partial(mount_status, session.mountpoint)
+        return
+    assert target.spec is not None
+    with open_sinks(target.options, debug=False, tell=log.info) as sinks:
+        up = attached(target.spec, target.options, sinks=sinks, writing=True)
+        async with up as vehicle:
+
+            async def status() -> Mapping[str, Any]:
+                return vehicle.status()
+
+            yield session_of(vehicle, target.options), status

@@ -1,0 +1,325 @@
+"""mavftpfs.connect: names, errors, many files; and a mount that is used in place of a connection."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mavftpfs
+from mavftpfs.protocol.payload import crc32
+from tests.mount.conftest import Field
+from tests.support.trees import content
+from tests.support.vehicles import SimVehicle
+
+DATA = content("f", 70_000)
+Call = Callable[[Any, str], object]
+
+
+class Local:
+    """A local directory with the same methods."""
+
+    stat, listdir, rmdir = staticmethod(os.stat), staticmethod(os.listdir), staticmethod(os.rmdir)
+    remove, rename, truncate = staticmethod(os.remove), staticmethod(os.rename), staticmethod(os.truncate)
+
+    def mkdir(self, path: str, *, parents: bool = False, exist_ok: bool = False) -> None:
+        Path(path).mkdir(parents=parents, exist_ok=exist_ok)
+
+    def exists(self, path: str) -> bool:
+        return Path(path).exists()
+
+    def is_dir(self, path: str) -> bool:
+        return Path(path).is_dir()
+
+    def is_file(self, path: str) -> bool:
+        return Path(path).is_file()
+
+    def read_text(self, path: str) -> str:
+        return Path(path).read_text()
+
+    def write_text(self, path: str, text: str) -> None:
+        Path(path).write_text(text)
+
+    def read_bytes(self, path: str) -> bytes:
+        return Path(path).read_bytes()
+
+    def write_bytes(self, path: str, data: bytes) -> None:
+        Path(path).write_bytes(data)
+
+
+CALLS: dict[str, Call] = {
+    "list": lambda on, d: sorted(on.listdir(d)),
+    "list a file": lambda on, d: on.listdir(d + "/a"),
+    "list nothing": lambda on, d: on.listdir(d + "/nothing"),
+    "sizes": lambda on, d: (on.stat(d + "/a") is None, on.is_dir(d + "/e"), on.is_file(d + "/e")),
+    "stat nothing": lambda on, d: on.stat(d + "/nothing"),
+    "stat through a file": lambda on, d: on.stat(d + "/a/b"),
+    "exists": lambda on, d: [on.exists(d + name) for name in ("", "/a", "/nothing", "/a/b", "/e/")],
+    "mkdir": lambda on, d: (on.mkdir(d + "/n"), on.is_dir(d + "/n")),
+    "mkdir there": lambda on, d: on.mkdir(d + "/e"),
+    "mkdir there, and fine": lambda on, d: on.mkdir(d + "/e", exist_ok=True),
+    "mkdir over a file": lambda on, d: on.mkdir(d + "/a", exist_ok=True),
+    "mkdir below nothing": lambda on, d: on.mkdir(d + "/n/n"),
+    "mkdir with parents": lambda on, d: on.mkdir(d + "/n/m/o", parents=True),
+    "rmdir": lambda on, d: on.rmdir(d + "/e"),
+    "rmdir full": lambda on, d: on.rmdir(d),
+    "rmdir a file": lambda on, d: on.rmdir(d + "/a"),
+    "rmdir nothing": lambda on, d: on.rmdir(d + "/nothing"),
+    "remove": lambda on, d: on.remove(d + "/a"),
+    "remove a directory": lambda on, d: on.remove(d + "/e"),
+    "remove nothing": lambda on, d: on.remove(d + "/nothing"),
+    "rename": lambda on, d: on.rename(d + "/a", d + "/n"),
+    "rename over": lambda on, d: on.rename(d + "/a", d + "/b"),
+    "rename nothing": lambda on, d: on.rename(d + "/nothing", d + "/n"),
+    "rename over a directory": lambda on, d: on.rename(d + "/a", d + "/e"),
+    "rename a directory": lambda on, d: on.rename(d + "/e", d + "/n"),
+    "rename into itself": lambda on, d: on.rename(d + "/e", d + "/e/e"),
+    "truncate": lambda on, d: on.truncate(d + "/a", 3),
+    "extend": lambda on, d: on.truncate(d + "/a", 10),
+    "truncate nothing": lambda on, d: on.truncate(d + "/nothing", 3),
+    "text": lambda on, d: (on.write_text(d + "/n", "größe"), on.read_text(d + "/n")),
+    "bytes": lambda on, d: (on.write_bytes(d + "/a", DATA), on.read_bytes(d + "/a") == DATA),
+    "read nothing": lambda on, d: on.read_bytes(d + "/nothing"),
+    "read a directory": lambda on, d: on.read_bytes(d + "/e"),
+    "write a directory": lambda on, d: on.write_bytes(d + "/e", b""),
+    "write below nothing": lambda on, d: on.write_bytes(d + "/nothing/n", b""),
+}
+
+
+def outcome(call: Call, on: object, directory: str) -> object:
+    try:
+        return call(on, directory)
+    except OSError as exc:
+        return type(exc), exc.errno
+
+
+def tree(directory: Path) -> dict[str, bytes | None]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes() if path.is_file() else None
+        for path in sorted(directory.rglob("*"))
+    }
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_calls_do_and_raise_what_the_os_does(
+    shared: mavftpfs.Drone, card: Path, tmp_path: Path, name: str
+) -> None:
+    here = tmp_path / "d"
+    for place in (card, here):
+        place.mkdir(exist_ok=True)
+        (place / "a").write_text("hello")
+        (place / "b").write_text("other")
+        (place / "e").mkdir()
+    real = outcome(CALLS[name], Local(), str(here))
+    ours = outcome(CALLS[name], shared, f"/{card.name}")
+    assert kind_of(ours) == kind_of(real)
+    assert tree(card) == tree(here)
+
+
+def kind_of(told: object) -> object:
+    """Return an outcome without what is told of undelivered files beyond the kind of their error."""
+    if isinstance(told, tuple) and isinstance(told[0], type):
+        return next(kind for kind in told[0].__mro__ if kind.__module__ == "builtins"), told[1]
+    return told
+
+
+def test_entries(shared: mavftpfs.Drone, card: Path) -> None:
+    (card / "Flüge").mkdir()
+    (card / "Flüge" / "a b.txt").write_bytes(DATA)
+    (found,) = shared.scandir(f"/{card.name}")
+    assert (found.name, found.path, found.is_dir(), found.is_file()) == (
+        "Flüge",
+        f"/{card.name}/Flüge",
+        True,
+        False,
+    )
+    (found,) = shared.scandir(os.fsencode(found.path))
+    assert (found.name, found.size, found.is_file()) == ("a b.txt", len(DATA), True)
+    assert [entry.name for entry in shared.walk(Path(f"/{card.name}"))] == ["Flüge", "a b.txt"]
+    assert shared.crc32(found.path) == crc32(DATA)
+    shared.remove(f"{card.name}/Flüge", recursive=True)
+    assert shared.listdir(card.name) == []
+
+
+def test_errors_are_sentences(shared: mavftpfs.Drone, card: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=f"'/{card.name}/ä' does not exist") as caught:
+        shared.stat(f"/{card.name}/ä")
+    assert caught.value.errno == errno.ENOENT
+    with pytest.raises(OSError, match="may hold neither"):
+        shared.stat("/a/../b")
+
+
+def test_get_and_put(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:
+    local = tmp_path / "d"
+    (local / "e").mkdir(parents=True)
+    (local / "e" / "f").write_bytes(DATA)
+    assert shared.put(local, card.name, recursive=True) == [f"/{card.name}/d/e/f"]
+    assert shared.get(f"{card.name}/d/e/f", tmp_path / "x") == [tmp_path / "x"]
+    assert (tmp_path / "x").read_bytes() == DATA
+    fetched = shared.get(f"{card.name}/d", tmp_path / "y", recursive=True)
+    assert [path.read_bytes() for path in fetched] == [DATA]
+    with pytest.raises(IsADirectoryError):
+        shared.get(f"{card.name}/d", tmp_path / "z")
+    with pytest.raises(FileNotFoundError):
+        shared.get(f"{card.name}/nothing", tmp_path / "z")
+    with pytest.raises(ValueError, match="is not there"):
+        shared.put(tmp_path / "nothing", card.name)
+
+
+def test_sync(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:
+    (card / "1.ulg").write_bytes(DATA)
+    assert shared.sync(tmp_path / "logs", place=card.name) == [tmp_path / "logs" / "1.ulg"]
+    assert shared.sync(tmp_path / "logs", place=card.name) == []
+    assert (tmp_path / "logs" / "1.ulg").read_bytes() == DATA
+
+
+def test_status_and_refresh(shared: mavftpfs.Drone, card: Path) -> None:
+    assert shared.status()["vehicle"]["autopilot"] == "PX4"
+    assert shared.listdir(card.name) == []
+    (card / "others").touch()
+    shared.refresh()
+    assert shared.listdir(card.name) == ["others"]
+    assert shared.mountpoint is None
+
+
+def test_threads(shared: mavftpfs.Drone, card: Path) -> None:
+    done = []
+
+    def work(number: int) -> None:
+        with shared.open(f"/{card.name}/{number}", "w") as file:
+            for line in range(50):
+                print(number, line, file=file)
+        done.append(shared.read_text(f"/{card.name}/{number}").count("\n"))
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert done == [50] * 8
+
+
+def test_a_notebook_runs_asyncio(shared: mavftpfs.Drone, card: Path) -> None:
+    async def cell() -> list[str]:
+        shared.write_text(f"/{card.name}/f", "text")
+        return shared.listdir(card.name)
+
+    assert asyncio.run(cell()) == ["f"]
+
+
+def test_a_second_vehicle_beside(shared: mavftpfs.Drone, card: Path, field: Field) -> None:
+    (other_card := field.local("card")).joinpath("APM").mkdir()
+    other = field.sim(other_card, "ardupilot5")
+    with mavftpfs.connect(other.source) as second:
+        second.write_bytes("/APM/f", b"two")
+        shared.write_bytes(f"/{card.name}/f", b"one")
+        assert (second.read_bytes("/APM/f"), shared.read_bytes(f"{card.name}/f")) == (b"two", b"one")
+        assert second.status()["vehicle"]["autopilot"] == "ArduPilot"
+
+
+# -- connecting -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "kind", "said"),
+    [
+        ("udpin:127.0.0.1:0", {"connect_timeout": 1}, TimeoutError, "no vehicle on"),
+        ("/dev/ttyNOWHERE", {}, FileNotFoundError, "there is no /dev/ttyNOWHERE"),
+        ("tcp:127.0.0.1:9", {"connect_timeout": 1}, ConnectionRefusedError, "nothing listens"),
+        ("udpin:127.0.0.1:0", {"frobnicate": 1}, mavftpfs.UsageError, "unknown option 'frobnicate'"),
+        ("udpin:127.0.0.1:0", {"window": 0}, ValueError, "window=0: must be within 1 and 256"),
+        ("nonsense", {}, mavftpfs.UsageError, "nonsense"),
+    ],
+)
+def test_why_there_is_no_connection(
+    source: str, options: dict[str, Any], kind: type[Exception], said: str
+) -> None:
+    with pytest.raises(kind, match=said):
+        mavftpfs.connect(source, **options)
+
+
+def test_a_port_that_is_taken(shared: mavftpfs.Drone) -> None:
+    with pytest.raises(OSError, match="in use") as caught:
+        mavftpfs.connect(shared.source)
+    assert caught.value.errno == errno.EADDRINUSE
+
+
+def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
+    card = field.local("card")
+    (card / "sub").mkdir()
+    (card / "sub" / "f").write_bytes(DATA)
+    other = field.sim(card, "px4")
+    with mavftpfs.connect(other.source + "#/sub", ro=True, trace=card / "trace") as drone:
+        assert drone.read_bytes("f") == DATA
+        with pytest.raises(OSError, match="only read") as caught:
+            drone.write_bytes("f", b"")
+        assert caught.value.errno == errno.EROFS
+    assert (card / "trace").stat().st_size
+
+
+def test_closed(field: Field) -> None:
+    vehicle = field.sim(field.local("card"))
+    drone = mavftpfs.connect(vehicle.source)
+    file = drone.open("/f", "w")
+    drone.close()
+    drone.close()
+    for call in (drone.listdir, file.close):
+        with pytest.raises(ValueError, match="is closed"):
+            call()
+    assert list(vehicle.root.iterdir()) == []
+
+
+# -- through a mount ------------------------------------------------------------------------------
+
+
+@pytest.mark.mount
+def test_a_mount_that_is_up_is_used(field: Field) -> None:
+    card = field.local("card")
+    (card / "f").write_bytes(DATA)
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source)
+    for source in (vehicle.source, str(mount.path)):
+        with mavftpfs.connect(source) as drone:
+            assert drone.mountpoint == str(mount.path)
+            assert drone.read_bytes("/f") == DATA
+            drone.write_text("/d.txt", "one\n")
+            with drone.open("/d.txt", "a") as file:
+                file.write("two\n")
+            assert drone.read_text("/d.txt") == (card / "d.txt").read_text() == "one\ntwo\n"
+            drone.truncate("/d.txt", 3)
+            assert (card / "d.txt").read_text() == "one"
+            with pytest.raises(FileNotFoundError):
+                drone.open("/nothing")
+            with pytest.raises(FileExistsError):
+                drone.mkdir("/f")
+            assert drone.put(__file__, "/") == [f"/{Path(__file__).name}"]
+            assert drone.crc32("/f") == crc32(DATA)
+            assert drone.status()["mountpoint"] == str(mount.path)
+        with pytest.raises(
+            (OSError, mavftpfs.UsageError), match=r"use_mount=False|port belongs to the mount"
+        ):
+            mavftpfs.connect(source, use_mount=False)
+
+
+@pytest.mark.mount
+def test_a_permission_is_one_here_and_there(field: Field) -> None:
+    """NuttX lets nothing be written outside of its card."""
+    vehicle = field.sim(field.local("card"), "px4-nuttx")
+    with (
+        mavftpfs.connect(vehicle.source) as drone,
+        pytest.raises(PermissionError, match="protected") as caught,
+    ):
+        drone.write_bytes("/f", b"data")
+    assert isinstance(caught.value, mavftpfs.NotDelivered)
+    assert caught.value.on_vehicle is False
+    mount = field.mount(vehicle.source)
+    with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(PermissionError) as caught:
+        drone.write_bytes("/f", b"data")
+    assert isinstance(caught.value, mavftpfs.NotDelivered)
+    assert caught.value.on_vehicle is False
