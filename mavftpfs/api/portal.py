@@ -110,6 +110,7 @@ class LoopThread(Generic[T]):
         self._nursery: trio.Nursery | None = None
         self._scope = trio.CancelScope()
         self._stopping = False
+        self._stopped = trio.Event()
         self._ready = threading.Event()
         self._ended = threading.Event()
         self._error: BaseException | None = None
@@ -181,7 +182,7 @@ class LoopThread(Generic[T]):
             self._stopping = True
             if self._token is not None:
                 with suppress(trio.RunFinishedError):
-                    self._token.run_sync_soon(self._scope.cancel)
+                    self._token.run_sync_soon(self._stop)
 
     # --- inside
 
@@ -250,7 +251,13 @@ class LoopThread(Generic[T]):
             async with self._context() as value, trio.open_nursery() as self._nursery:
                 self._values.append(value)
                 self._ready.set()
-                await trio.sleep_forever()
+                await self._stopped.wait()
+                self._nursery.cancel_scope.cancel()
+
+    def _stop(self) -> None:
+        self._stopped.set()
+        if not self._values:
+            self._scope.cancel()
 
 
 def _first(error: BaseException) -> BaseException:

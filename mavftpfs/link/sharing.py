@@ -273,16 +273,23 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
     """
     link = SharedLink(spec, wish)
     failure: Exception | None = None
+    lasting = trio.CancelScope()
+
+    async def run(task_status: trio.TaskStatus[None]) -> None:
+        with lasting:
+            await link.run(task_status)
+
     async with trio.open_nursery() as nursery:
         try:
-            await nursery.start(link.run)
+            await nursery.start(run)
+            lasting.shield = True  # whoever is cancelled (Ctrl-C) still closes the vehicle's session
             yield link
         except Exception as exc:  # raised again outside, so that it is not wrapped in a group
             failure = exc
         finally:
             with trio.CancelScope(shield=True):
                 await link.aclose()
-            nursery.cancel_scope.cancel()
+            lasting.cancel()
     if failure is not None:
         raise failure
 
