@@ -183,3 +183,13 @@ def test_another_user_does_not_see_what_he_may_not_read(field: Field, small_tree
     mount = field.mount(field.sim(small_tree).source)
     assert str(mount.path) not in by_nobody(mount, *STATUS).stdout
     by_nobody(mount, *STATUS, mount.path, code=ExitCode.MOUNT_FAILED)
+
+
+def test_a_port_that_another_users_mount_has_is_said_by_its_name(field: Field, small_tree: Path) -> None:
+    """He cannot join it, and a second program cannot have it."""
+    mount = field.mount(field.sim(small_tree).source, "allow_other")
+    own = (sys.executable, "-m", "mavftpfs")
+    said = by_nobody(mount, *own, "ls", "-o", "target_system=7", mount.source, code=2).stderr
+    assert f"belongs to the mount on {mount.path}, of vehicle 1/1" in said
+    assert "another program" not in said
+    assert f"mounted on {mount.path}" in by_nobody(mount, *own, "scan", mount.source).stdout
