@@ -260,7 +260,11 @@ class Deliverer:
         """Send the whole file, compare it, and rename it into place."""
         self._require_deliverable(draft)  # before anything is fetched for it
         if not draft.whole:
-            await base.fetch(self._context, node, draft)
+            try:
+                await base.fetch(self._context, node, draft)
+            except FileChanged:
+                draft.lose_base()
+                raise
         attempt = await self._attempt(node, draft)
         attempt.sending.growing = False
         await attempt.upload.finish()

@@ -520,16 +520,21 @@ async def test_armed_means_an_error_at_once_and_delivery_after(here: Rig) -> Non
 
 @pytest.mark.parametrize("profile", ["px4", "mavsdk"])
 @pytest.mark.parametrize("now", [OLD + b"grown on the vehicle", OLD[:10]])
-async def test_a_part_is_not_written_into_a_file_that_changed(profile: str, now: bytes) -> None:
+@pytest.mark.parametrize("read", [False, True], ids=["fetched", "compared"])
+async def test_a_part_is_not_written_into_a_file_that_changed(profile: str, now: bytes, read: bool) -> None:
+    """The draft is stale from then on, whichever request found it out."""
     async with rig(profile, {FILE: OLD}) as here:
         tree = here.mount()
         file = await tree.open(FILE, write=True)
-        await file.read(0, len(OLD))
+        if read:
+            await file.read(0, len(OLD))
         await file.write(len(OLD), b"appended")
         here.put(FILE, now)
         for _ in range(2):
             with pytest.raises(FileChanged):
                 await file.flush()
+            with pytest.raises(FileChanged):
+                await file.write(0, b"x")
         file.close()
         assert here.files() == {FILE: now}
         assert tree.undelivered() == [FILE]
