@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import trio
 
@@ -25,6 +26,8 @@ from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind
 from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.together import together
+from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -54,6 +57,9 @@ RESEND_PAUSE = 1.0
 SENT_TWICE = 4096
 """Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
 trip or two, so sending it again on the few cards that cannot costs less than four requests in each mount."""
+
+SHORT = 4096
+"""Bytes of the largest file of which the slowest card has the checksum at once."""
 
 START_AT = 64 * 1024
 """A background upload begins when so many bytes wait; fewer wait for the close."""
@@ -157,7 +163,11 @@ class Deliverer:
             await attempt.upload.end()
             if not attempt.in_place and attempt.upload.begun:
                 await self._names.discard(attempt.path)
+            if attempt.trial is not None:
+                await attempt.trial.end()
         finally:
+            if attempt.trial is not None:
+                attempt.trial.leave()
             self._context.own.live.discard(attempt.path)
 
     async def withdraw(self, node: Node) -> bool | None:
@@ -270,14 +280,13 @@ class Deliverer:
         await attempt.upload.finish()
         if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        store = self._context.store
-        await store.settle(attempt.path)
-        crc32 = await self.verifier.check(attempt.path, draft, doubted=store.in_doubt(attempt.begun_at))
+        await self._context.store.settle(attempt.path)
         if attempt.in_place:
+            crc32 = await self._compare(draft, attempt)
             node.attempt = None
             await attempt.upload.end()
         else:
-            await self._require_expected(node, draft)
+            crc32 = await self._compare_and_look(node, draft, attempt)
             await self._commit(node, draft, attempt, summed=crc32 is not None)
         self._on_delivered(node, draft, crc32)
 
@@ -291,12 +300,8 @@ class Deliverer:
         if attempt is not None:
             await self.abandon(node)
         context, path = self._context, node.path
-        # A card may have no room beside the file that `inplace` replaces, and never tell.
-        ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)
-        if ask_first and traits.rename_works is None:
-            await self._names.find_out(node.path)
-            self._require_deliverable(draft)
-            in_place = traits.rename_works is False
+        trial = await self._begin_trial(node, draft)
+        in_place = traits.rename_works is False
         if in_place or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
         if not in_place:
@@ -311,10 +316,60 @@ class Deliverer:
             draft.give_up()
             context.own.live.discard(path)
             raise
-        node.attempt = Attempt(path, in_place, sending, upload, begun_at)
+        attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at, trial)
         if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
-        return node.attempt
+        elif trial is not None and not await trial.rename():  # while the upload begins
+            return await self._attempt(node, draft)  # in place
+        return attempt
+
+    async def _begin_trial(self, node: Node, draft: Draft) -> RenameTrial | None:
+        """Before all of a large file is sent, begin to find out whether the card can rename.
+
+        Raises:
+            As RenameTrial.begin and _require_deliverable.
+        """
+        inplace = self._context.options.inplace and draft.base is not None
+        if self._context.store.traits.rename_works is not None or not (draft.size > SENT_TWICE or inplace):
+            return None
+        trial = await self._names.begin_trial(node.path)
+        try:
+            if inplace:  # the card may have no room beside the file, and never tell
+                await trial.rename()
+                await trial.end()
+            self._require_deliverable(draft)  # it may have changed meanwhile
+        except BaseException:
+            await trial.end()
+            raise
+        return trial
+
+    async def _compare(self, draft: Draft, attempt: Attempt) -> int | None:
+        doubted = self._context.store.in_doubt(attempt.begun_at)
+        return await self.verifier.check(attempt.path, draft, doubted=doubted)
+
+    async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
+        """Compare what was sent, and look what has the name; return the CRC32 if that was compared.
+
+        What the server answers at once goes out together. A long checksum goes alone: whatever waited behind
+        it would be repeated, and the look at the name would be of before it.
+
+        Raises:
+            As Verifier.check and _require_expected.
+        """
+        crc32 = None
+
+        async def compare() -> None:
+            nonlocal crc32
+            crc32 = await self._compare(draft, attempt)
+
+        look = partial(self._require_expected, node, draft)
+        if draft.size <= SHORT:
+            await together(compare, look)
+        else:
+            await compare()
+            await (look() if attempt.trial is None else together(look, attempt.trial.end))
+        self._require_deliverable(draft)
+        return crc32
 
     async def _require_expected(self, node: Node, draft: Draft) -> None:
         """Check that a new file's name is free, or that the file of which a part stays is still the same.

@@ -25,7 +25,8 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.cache.trial import RenameTrial
+from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -35,7 +36,6 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NotSupported,
     OutcomeUnknown,
-    PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
@@ -212,39 +212,17 @@ class Names:
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
-        """See on an empty file of ours whether the card can rename.
+        """See on an empty file of ours whether the card can rename. Raises as RenameTrial.begin."""
+        trial = await self.begin_trial(near)
+        await trial.rename()
+        await trial.end()
 
-        A refusal of another rename does not tell: its number proves nothing (servers.md 12), and it may be
-        that name which the card does not take. Nor does an ACK: the file must be found under its new name.
-
-        Raises:
-            As VehicleStore, but FtpNak and OutcomeUnknown.
-        """
+    async def begin_trial(self, near: bytes) -> RenameTrial:
+        """Begin to find that out. Raises as RenameTrial.begin."""
         context = self._context
-        try:
-            first = context.own.beside(near, Kind.NEW)
-            second = context.own.beside(first, Kind.NEW)
-        except PathTooLong:
-            return
-        context.own.live |= {first, second}
-        left = first
-        try:
-            await context.store.create_empty(first)
-            await context.store.rename(first, second)
-            left = second
-            await self.remove(second)
-            context.store.traits.rename_works = True
-            return
-        except OutcomeUnknown:
-            return  # the next listing removes it
-        except FtpNak as nak:
-            if nak.opcode == Opcode.RENAME or (left == second and not await self._is_listed(second)):
-                context.store.traits.rename_works = False
-                left = first
-        finally:
-            context.own.live -= {first, second}
-            context.directories.expire(split(first)[0])
-        await self.discard(left)
+        trial = RenameTrial(context.store, context.directories, context.own, near)
+        await trial.begin()
+        return trial
 
     async def purge(self, path: bytes) -> None:
         """A path is about to lose its name: have nothing of an earlier replacement bring it back.
@@ -345,10 +323,6 @@ class Names:
         if aside in own.live:
             own.live.discard(aside)
             await self.remove_if_there(aside)
-
-    async def _is_listed(self, path: bytes) -> bool:
-        parent, name = split(path)
-        return name in (await self._context.directories.ask(parent)).entries
 
     def _note_torn(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""

@@ -18,6 +18,7 @@ from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.spool import Spool, SpoolContent
+from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sending import Sending
@@ -28,7 +29,7 @@ class Attempt:
     """One try to deliver a draft.
 
     path: where its bytes go: a reserved name, or the file's own if it is sent `in_place`.
-    begun_at: when, by the caches' clock.
+    begun_at: when, by the caches' clock. trial: of the card's renames, beside the upload.
     """
 
     path: bytes
@@ -36,6 +37,7 @@ class Attempt:
     sending: Sending
     upload: Upload
     begun_at: float
+    trial: RenameTrial | None = None
 
     def fits(self, draft: Draft, *, in_place: bool) -> bool:
         """Return whether what it sent is still right, and where it goes is."""
