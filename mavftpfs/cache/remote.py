@@ -5,6 +5,7 @@ All paths are normalised mount paths (shared.model). All calls raise only Mavftp
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Protocol
 
@@ -80,6 +81,10 @@ class RemoteStore(Protocol):
         """Return why the vehicle counts as lost, None if it does not: nothing was heard of it for 5 s, or
         another one answers in its place. What begins now would wait for nothing; what is under way may go on
         when it comes back."""
+        ...
+
+    def others_heard(self) -> bool:
+        """Return whether another FTP client was heard lately."""
         ...
 
     async def list_directory(self, path: bytes) -> Listing:
@@ -177,6 +182,20 @@ class VehicleStore(RemoteStore, Protocol):
         """Return whether something of the last ten minutes, or after a time of the caches' clock, says that a
         file may hold other bytes than the ACKs say: a late copy of a request, another FTP client, a lost
         session, a restart."""
+        ...
+
+    def address(self) -> tuple[int, int]:
+        """Return the vehicle's system and component id."""
+        ...
+
+    async def write_whole(
+        self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
+    ) -> None:
+        """Write an `@` file by CreateFile, WriteFile in order and one at a time, and Terminate. A piece, of
+        at most 64 bytes, is sent in one request. progress: told how many bytes were ACKed.
+
+        It is not tried again; what came until an error may have been carried out, and an ACK proves nothing.
+        """
         ...
 
     async def open_upload(self, path: bytes, source: Sending) -> Upload:

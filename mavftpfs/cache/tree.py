@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import trio
 
@@ -23,9 +24,11 @@ from mavftpfs.cache.kept import CLOCK_SET, KeptCache
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.parameters import Parameters
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import is_reserved
+from mavftpfs.cache.texts import Program, Texts
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback
@@ -108,6 +111,10 @@ class Tree:
             spool_directory=spool,
         )
         self._context = self._writing.context
+        self._parameters = Parameters(
+            store, self._virtual, wall=wall, require_writable=self._require_texts_writable
+        )
+        self._texts: tuple[Texts[Any], ...] = (self._parameters,)
 
     # --- asking
 
@@ -121,7 +128,8 @@ class Tree:
         if remote == self._options.root:
             return Stat(EntryKind.DIRECTORY, 0, shown_mtime(remote, None), self._options.attr_timeout)
         if is_snapshot(remote):
-            return await self._virtual.stat(remote)
+            texts = self._texts_of(remote)
+            return await (self._virtual.stat(remote) if texts is None else texts.stat(split(remote)[1]))
         if self._local.owns(remote):
             return self._local.stat(remote)
         self._require_not_hidden(remote)
@@ -152,12 +160,17 @@ class Tree:
         """
         remote = self._remote(path)
         if is_snapshot(remote):
-            return await self._virtual.list(remote)
+            files = await self._virtual.list(remote)
+            for texts in self._texts:
+                if texts.directory == remote:
+                    files += await texts.list(self._options.probe_time)
+            return files
         if self._local.owns(remote) and self._local.find(remote):
             raise NotADirectory(f"{remote!r} is not a directory")
         directory = await self._directories.get(remote)
         founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
         if remote == ROOT:
+            await self._virtual.probe(directory.entries)
             for name in self._virtual.shown_in_root(directory.entries):
                 founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
         shown = {}
@@ -174,14 +187,33 @@ class Tree:
             raise ListingIncomplete(f"{remote!r} was not listed to its end", list(shown.items()))
         return list(shown.items())
 
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> OpenFile:
+    async def open(
+        self,
+        path: bytes,
+        *,
+        write: bool = False,
+        truncate: bool = False,
+        append: bool = False,
+        program: Callable[[], Program | None] = lambda: None,
+    ) -> OpenFile:
         """Open a file; with `truncate` it is empty for everybody from now on, here at once, there later.
+
+        Of texts: append: whatever is written is an end. program: tells who opens it.
 
         Raises:
             NotFound, NotADirectory, IsADirectory, ReadOnly, Armed, FileBusy; else as RemoteStore.open_reader
             and read_whole.
         """
         remote = self._remote(path)
+        texts = self._texts_of(remote)
+        if texts is not None:
+            return await texts.open(
+                split(remote)[1],
+                write=write or truncate,
+                truncate=truncate,
+                append=append,
+                program=program(),
+            )
         if write or truncate:
             self._require_writable(remote)
         if is_snapshot(remote):
@@ -205,6 +237,8 @@ class Tree:
             NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
         """
         remote = self._remote(path)
+        if self._texts_of(remote) is not None:
+            raise NotSupported(f"{remote!r} is not a file of the vehicle")
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
         node = self._context.nodes.get(remote)
@@ -228,14 +262,19 @@ class Tree:
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
 
-    async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
-        """Make a file, or open (not empty) the one that is there, for writing.
+    async def create(
+        self, path: bytes, *, exclusive: bool, program: Callable[[], Program | None] = lambda: None
+    ) -> OpenFile:
+        """Make a file, or open (not empty) the one that is there, for writing. program: see open.
 
         Raises:
             AlreadyExists (exclusive), NotFound (its directory), NotADirectory, IsADirectory, Armed,
                 PathTooLong.
         """
         remote = self._remote(path)
+        for texts in self._texts:
+            if split(remote)[0] == texts.directory:
+                texts.note_other_file(program())
         self._require_writable(remote)
         if self._local.owns(remote):
             await self._require_parent(remote)
@@ -263,6 +302,8 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
+        if self._texts_of(remote) is not None:
+            return  # it shows when the vehicle changed
         self._require_writable(remote)
         if self._local.owns(remote):
             self._local.find(remote).mtime_ns = mtime_ns
@@ -372,7 +413,7 @@ class Tree:
         self._directories.forget(ROOT)
         self._checksums.clear()
         self._files.forget_closed()
-        self._virtual.forget()
+        self._forget_virtual()
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
@@ -396,11 +437,16 @@ class Tree:
         """The vehicle restarted: what was known of it must be asked again."""
         self._directories.rebooted()
         self._checksums.clear()
-        self._virtual.forget()
+        self._forget_virtual()
         self._files.rebooted()
         self._writing.retry()
 
     # --- inside
+
+    def _forget_virtual(self) -> None:
+        self._virtual.forget()
+        for texts in self._texts:
+            texts.forget()
 
     def _remote(self, path: bytes) -> bytes:
         return normalise(self._options.root + b"/" + path)
@@ -418,6 +464,14 @@ class Tree:
     def _require_writable(self, remote: bytes) -> None:
         if self._options.read_only or is_virtual(remote):
             raise ReadOnly(f"{remote!r} is only read")
+
+    def _require_texts_writable(self) -> None:
+        if self._options.read_only:
+            raise ReadOnly("what is here is only read")
+        self._context.require_disarmed()
+
+    def _texts_of(self, remote: bytes) -> Texts[Any] | None:
+        return next((texts for texts in self._texts if texts.owns(remote)), None)
 
     def _require_not_hidden(self, remote: bytes) -> None:
         if is_reserved(split(remote)[1]) and not self._options.read_only:

@@ -35,6 +35,7 @@ from mavftpfs.shared.errors import (
     LocalProtocolError,
     NotADirectory,
     NotFound,
+    RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
 )
@@ -48,6 +49,9 @@ UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
 
 PARAM_FILE = b"/@PARAM/param.pck"
 ANNOUNCERS = frozenset({b"@SYS", b"@ROMFS"})
+LIVE_TIME = 1.0
+"""Seconds for which a file of parameters or a mission is what the vehicle has: one `ls -l` and its opens."""
+
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
@@ -118,6 +122,8 @@ class VirtualTrees:
         self._invalidate = invalidate
         self._reading: SingleFlight[bytes, bytes] = SingleFlight(nursery)
         self._seen: OrderedDict[bytes, Seen] = OrderedDict()
+        self._probing: SingleFlight[None, None] = SingleFlight(nursery)
+        self._has_parameters: bool | None = None
 
     @property
     def bytes_cached(self) -> int:
@@ -128,9 +134,35 @@ class VirtualTrees:
 
     def shown_in_root(self, names: Iterable[bytes]) -> tuple[bytes, ...]:
         """Return the directories that appear beside the listed `names` of `/`; costs no traffic."""
-        if self._look(PARAM_FILE).data is None and ANNOUNCERS.isdisjoint(names):
-            return ()
-        return tuple(UNLISTABLE)
+        if not ANNOUNCERS.isdisjoint(names):
+            return tuple(UNLISTABLE)
+        return (tree_of(PARAM_FILE),) if self._has_parameters else ()
+
+    async def probe(self, names: Iterable[bytes], *, asked_for: bool = False) -> None:
+        """Find out once whether a server that announces nothing opens its parameters. asked_for: somebody
+        wants them, so also beside another client.
+
+        Raises:
+            As RemoteStore.stat_size, but for a refusal; if it was asked for.
+        """
+        if self._has_parameters is not None or not ANNOUNCERS.isdisjoint(names):
+            return
+        if asked_for:
+            await self._probing.run(None, self._probe_once)
+        elif not self._store.others_heard():
+            with (
+                suppress(RequestTimeout, LinkError, SessionBusy),
+                trio.move_on_after(self._options.probe_time),
+            ):
+                await self._probing.run(None, self._probe_once)
+
+    async def _probe_once(self) -> None:
+        try:
+            await self._store.stat_size(PARAM_FILE)
+        except (FtpNak, RemoteProtocolError):
+            self._has_parameters = False
+        else:
+            self._has_parameters = True
 
     def absent_until(self, path: bytes) -> float:
         """Return until when a path, listed or not, is not shown because it did not open."""
@@ -145,7 +177,10 @@ class VirtualTrees:
         """
         found = await self._find(path)
         seen = self._look(path)
-        if self._clock() >= seen.until and self._is_read_to_know(found.entry):
+        stays = (
+            seen.data is not None and tree_of(path) in UNLISTABLE
+        )  # as it was read, until it is opened anew
+        if self._clock() >= seen.until and not stays and self._is_read_to_know(found.entry):
             try:
                 await self._read(path)
             except (FtpNak, DataUnproven, LinkError, SessionBusy):
@@ -204,6 +239,25 @@ class VirtualTrees:
             return SnapshotHandle(seen.data)
         return SnapshotHandle(await self._read(path))
 
+    async def content(self, path: bytes, *, reread: bool) -> bytes:
+        """Return a file of a tree that no listing shows. reread: as it is now, by what was read within
+        LIVE_TIME; else as it was read last, if it was.
+
+        Raises:
+            NotFound; else as RemoteStore.read_whole.
+        """
+        await self._find(path)
+        seen = self._look(path)
+        if seen.data is not None and (not reread or self._clock() < seen.until):
+            return seen.data
+        return await self._read(path)
+
+    def outdate(self, path: bytes) -> None:
+        """A file is about to change: whoever reads it from now on asks the vehicle."""
+        seen = self._look(path)
+        if seen.data is not None:
+            self._seen[path] = Seen(seen.data, -math.inf)
+
     async def crc32(self, path: bytes) -> int:
         """Return the CRC32 (start value 0, no final xor) of what a reader gets; the vehicle sums other bytes.
 
@@ -216,6 +270,7 @@ class VirtualTrees:
     def forget(self) -> None:
         """Forget all snapshots, and what opened or did not."""
         self._seen.clear()
+        self._has_parameters = None
 
     # --- finding
 
@@ -250,11 +305,10 @@ class VirtualTrees:
             NotFound: this server has no such trees. One that does not announce any is asked.
         """
         root = await self._directories.get(ROOT)
-        if self.shown_in_root(root.entries):
-            return root
-        if tree != tree_of(PARAM_FILE) or self._clock() < self.absent_until(PARAM_FILE):
+        if tree == tree_of(PARAM_FILE):
+            await self.probe(root.entries, asked_for=True)
+        if tree not in self.shown_in_root(root.entries):
             raise NotFound(f"this vehicle has no {tree.decode()}")
-        await self._read(PARAM_FILE)
         return root
 
     # --- reading
@@ -292,7 +346,10 @@ class VirtualTrees:
             self._note(path, Seen(None, self._clock() + self._options.proof_time if unlistable else math.inf))
             raise NotFound(f"the vehicle does not open {path!r}") from nak
         now, before = self._clock(), self._look(path).data
-        self._note(path, Seen(data, now + max(self._options.proof_time, COST_FACTOR * (now - began))))
+        lasts = max(self._options.proof_time, COST_FACTOR * (now - began))
+        if tree_of(path) in UNLISTABLE:
+            lasts = LIVE_TIME
+        self._note(path, Seen(data, now + lasts))
         if before is not None and len(before) != len(data):
             self._invalidate(path)
         return data

@@ -45,6 +45,7 @@ from mavftpfs.mount.handles import (
     closed_on_failure,
     is_mapped_page,
 )
+from mavftpfs.mount.programs import program_of
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
@@ -264,7 +265,10 @@ class Operations(pyfuse3.Operations):
         writing = flags & os.O_ACCMODE != os.O_RDONLY or bool(flags & os.O_TRUNC)
         known = self._inode(inode)
         path = self._path(inode)
-        file = await self._tree.open(path, write=writing, truncate=bool(flags & os.O_TRUNC))
+        truncate, append = bool(flags & os.O_TRUNC), bool(flags & os.O_APPEND)
+        file = await self._tree.open(
+            path, write=writing, truncate=truncate, append=append, program=lambda: program_of(ctx.pid)
+        )
         if flags & os.O_TRUNC:
             known.told_size = 0
         elif known.told_size not in (None, file.size):
@@ -279,7 +283,8 @@ class Operations(pyfuse3.Operations):
     ) -> tuple[FileInfo, EntryAttributes]:
         """Create a file and open it."""
         path = self._child(parent_inode, name)
-        file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
+        exclusive = bool(flags & os.O_EXCL)
+        file = await self._tree.create(path, exclusive=exclusive, program=lambda: program_of(ctx.pid))
         with closed_on_failure(file.undo_open):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)

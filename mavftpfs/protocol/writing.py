@@ -7,7 +7,7 @@ A lost request goes out again with the same bytes at the same offset, so executi
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
@@ -30,7 +30,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.extents import ExtentSet
 
-__all__ = ["ChunkSource", "WriteTransfer"]
+__all__ = ["ChunkSource", "Pieces", "WriteTransfer"]
 
 MAX_OFFSET = 1 << 32
 """Offsets are 32 bits on the wire; the end of a file must fit too (servers.md 14.27)."""
@@ -64,6 +64,39 @@ class ChunkSource(Protocol):
     def on_unsent(self, offset: int, count: int) -> None:
         """These bytes will not be ACKed by this transfer."""
         ...
+
+
+class Pieces:
+    """A source that is sent once, in order. No request ends within a piece, but where one piece is longer
+    than a request. progress: told how many bytes were ACKed.
+    """
+
+    def __init__(self, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None) -> None:
+        self._left = deque(pieces)
+        self._offset = 0
+        self._progress = progress
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """See ChunkSource."""
+        chunk = b""
+        while self._left and len(chunk) + len(self._left[0]) <= limit:
+            chunk += self._left.popleft()
+        if not chunk and self._left:
+            chunk, rest = self._left[0][:limit], self._left[0][limit:]
+            self._left[0] = rest
+        if not chunk:
+            return None
+        offset = self._offset
+        self._offset += len(chunk)
+        return offset, chunk
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """See ChunkSource."""
+        if self._progress is not None:
+            self._progress(count)
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """See ChunkSource: nothing is sent twice."""
 
 
 class WriteTransfer(Operation):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from math import inf
 from typing import Literal
 
@@ -20,11 +20,11 @@ import trio
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
-from mavftpfs.session.doubt import Doubt
+from mavftpfs.protocol.writing import Pieces, WriteTransfer
+from mavftpfs.session.doubt import Doubt, session_used_by
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.others import OPENING, took_session
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
-from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
+from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
 from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
@@ -56,6 +56,8 @@ IDLE_CLOSE = 1.5
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
 
 _MAYBE_OPEN_RETRY = 5.0
+_OFTEN = 0.25
+_OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 
 Action = Callable[[OpenSession], Awaitable[None]]
 
@@ -93,10 +95,6 @@ class SessionUser(ABC):
 
     def prefetches(self) -> bool:
         """Return whether it wants something that nobody waits for."""
-        return False
-
-    def goes_on(self, session: OpenSession) -> bool:
-        """Return whether it uses what is open and opens nothing."""
         return False
 
     def expire(self, error: MavftpfsError) -> None:
@@ -170,7 +168,8 @@ class _Job(SessionUser):
         """See SessionUser."""
         server = self._server
         try:
-            server.vehicle.require(server.clock())  # it may have died while others had the session
+            # It may have died, or been armed, while others had the session.
+            server.vehicle.require(server.clock(), writing=self._opcode != Opcode.OPEN_FILE_RO)
             self.session = await server.open(self.path, self._opcode)
             if self._action is not None:
                 await self._action(self.session)
@@ -228,22 +227,9 @@ class Scheduler:
         """Return all who wait for the session and could use it now."""
         waiting = []
         for user in self.users:
-            if user.due_at() <= now and self._may_use(user, now):
+            if user.due_at() <= now and not self.server.is_excluded(user.path):
                 waiting.append(user)
         return waiting
-
-    def _may_use(self, user: SessionUser, now: float) -> bool:
-        """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
-        if self.server.is_excluded(user.path):
-            return False
-        session = self.server.session
-        return now >= self.held_until or (session is not None and user.goes_on(session))
-
-    @property
-    def held_until(self) -> float:
-        """Before this nothing is opened: that might end another client's session."""
-        several = self._driver.engine.traits.several_sessions
-        return -inf if several else self.server.others.file_open_until
 
     def first(self) -> SessionUser | None:
         """Return whoever is to use the session now. Readahead comes only if nobody waits for anything, and
@@ -258,7 +244,7 @@ class Scheduler:
             return first
         session = self.server.session
         for user in self.users:
-            if user.prefetches() and self._may_use(user, now):
+            if user.prefetches() and not self.server.is_excluded(user.path):
                 if session is not None and user.path == session.path:
                     return user
                 first = first or user
@@ -280,24 +266,6 @@ class Scheduler:
         for user in self.waiting(now):
             if user.asked_at is not None and user.asked_at < now - self._op_deadline:
                 user.expire(error)
-
-    def expire_held(self) -> float:
-        """Tell the users that wait too long for another client's file to be closed; return when the next one
-        will have done so."""
-        now, next_at = self.clock(), inf
-        if now >= self.held_until:
-            return next_at
-        error = SessionBusy("another client of the vehicle may have a file open, which is not ended for ours")
-        for user in list(self.users):  # who is told may end
-            if user.due_at() > now or user.asked_at is None or self._may_use(user, now):
-                continue
-            expires_at = user.asked_at + self._op_deadline
-            if now >= expires_at:
-                user.expire(error)
-            else:
-                user.on_queued()
-                next_at = min(next_at, expires_at)
-        return next_at
 
     # --- what others ask for
 
@@ -326,6 +294,32 @@ class Scheduler:
         except (SessionLost, DataUnproven):
             await self.use_session(path, Opcode.OPEN_FILE_RO, read)
         return data
+
+    async def write_whole(
+        self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
+    ) -> None:
+        """See cache.remote.VehicleStore."""
+        server, size = self.server, min(self.read_chunks.size, self.write_chunks.size)
+
+        async def write(session: OpenSession) -> None:
+            transfer = WriteTransfer(
+                session.id, Pieces(pieces, progress), ChunkSize(size), in_flight=1, on_starved=server.wake
+            )
+            try:
+                await self._driver.start(transfer, server.wake)
+                while not transfer.done and not transfer.starved:
+                    if server.session is not session:
+                        raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
+                    server.vehicle.require(self.clock(), writing=True)
+                    self._driver.kick()
+                    await server.sleep(_OFTEN)
+                if transfer.error is not None:
+                    raise transfer.error
+            finally:
+                transfer.finish()
+                self._driver.cancel(transfer)
+
+        await self.use_session(path, Opcode.CREATE_FILE, write)
 
     async def use_session(self, path: bytes, opcode: Opcode, action: Action | None = None) -> OpenSession:
         """Open a file, do something, terminate; returns what the open ACK said.
@@ -364,23 +358,19 @@ class Scheduler:
     def on_foreign(self, payload: bytes, *, newcomer: bool) -> None:
         """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
         been missed."""
-        now, engine = self.clock(), self._driver.engine
-        session = self.server.others.hear(payload, now)
+        now, session, engine = self.clock(), session_used_by(payload), self._driver.engine
         echoes = engine.traits.ack_carries_own_session  # then each client has an id of its own
         if session is not None and (not echoes or session == engine.home_session):
             self._touched_at = now
         # Whoever uses sessions may just have used ours, too, in a request that was not heard.
         reads = newcomer or now - self._touched_at <= RECENT
         self.doubt.raise_it("another FTP client is active", reads=reads)
-        if not echoes and self.server.session is not None and took_session(payload):
-            self.server.abandon()  # what we read or write would be its file
-        self.server.wake()
 
     def _on_unexplained(self, reply: Payload, late: float) -> None:
         """An answer came that no request of ours explains. An older open that was carried out once more may
         have put its file in the place of ours (MAVSDK); all else is no other file's."""
         session = self.server.session
-        opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
+        opens = reply.opcode == Opcode.ACK and reply.req_opcode in _OPENING
         other = opens and session is not None and session.seq != reply.seq
         self.doubt.late.saw(late, self.clock())
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
@@ -427,12 +417,9 @@ class Scheduler:
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
         server = self.server
-        expires_at = self.expire_held()
-        if expires_at < inf:
-            await server.find_out_sessions()
-        until_due = expires_at - now
+        until_due = inf
         for user in self.users:
-            due = max(user.due_at(), self.held_until)
+            due = user.due_at()
             if now < due:
                 until_due = min(until_due, due - now)
         if server.session is not None:

@@ -8,7 +8,7 @@ that we sent once. Then names rest between two changes: `_rest` is the one place
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from enum import Enum
 from functools import partial
@@ -202,6 +202,27 @@ class Store:
         return int.from_bytes(data[:4], "little")
 
     # --- changing
+
+    def others_heard(self) -> bool:
+        """Return whether another FTP client was heard lately."""
+        return self._vehicle.foreign_client(self._clock())
+
+    def address(self) -> tuple[int, int]:
+        """Return system and component id, of an autopilot where nothing was heard yet."""
+        address = self._vehicle.address
+        return (1, 1) if address is None else (address.system, address.component)
+
+    async def write_whole(
+        self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
+    ) -> None:
+        """Write an `@` file (see VehicleStore)."""
+        wire_path(path)
+        self._vehicle.require(self._clock(), writing=True)
+        await self._rest(path)
+        try:
+            await self._scheduler.write_whole(path, pieces, progress)
+        finally:
+            self._late.on_changed(path, self._clock())
 
     async def open_upload(self, path: bytes, source: Sending) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""

@@ -115,6 +115,8 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.InvalidMove: errno.EINVAL,
     errors.CrossDevice: errno.EXDEV,
     errors.FileBusy: errno.EBUSY,
+    errors.InvalidText: errno.EINVAL,
+    errors.NotTaken: errno.EIO,
     errors.NotSupported: errno.EOPNOTSUPP,
     errors.FileTooLarge: errno.EFBIG,
     errors.NoSpace: errno.ENOSPC,

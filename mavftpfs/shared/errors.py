@@ -134,6 +134,14 @@ class FileBusy(MavftpfsError):
     """Somebody on the vehicle is writing the file (EBUSY)."""
 
 
+class InvalidText(MavftpfsError):
+    """A saved text has lines that cannot be; nothing of it was done (EINVAL)."""
+
+
+class NotTaken(MavftpfsError):
+    """What a saved text asks for does not hold on the vehicle (EIO)."""
+
+
 class NotSupported(MavftpfsError):
     """This server offers no safe way to do it (EOPNOTSUPP)."""
 
@@ -284,7 +292,7 @@ SIGNALLED = 128
 _NOT_POSSIBLE = (
     UsageError,
     *(NotFound, NotADirectory, IsADirectory, AlreadyExists, DirectoryNotEmpty, InvalidMove, CrossDevice),
-    *(ReadOnly, Armed, FileBusy, NotSupported, LocalProtocolError),
+    *(ReadOnly, Armed, FileBusy, NotSupported, InvalidText, LocalProtocolError),
 )
 """The vehicle is there, but what was asked cannot be done with the files as they are."""
 

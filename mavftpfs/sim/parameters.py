@@ -1,6 +1,6 @@
 """The parameters of one vehicle, and what its server makes of `@PARAM/param.pck`. Layer: sim; pure.
 
-Source: servers.md 11 and 16; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. This packs
+Source: servers.md 11 and 17; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. This packs
 and parses on its own, so that it does not share a mistake with the code that it tests.
 
 A *table* holds the values. It packs a download, and an upload changes it: PX4 parses what comes at once and

@@ -1,6 +1,6 @@
 """ArduPilot's virtual `@` trees, which lie about sizes. Layer: sim; pure.
 
-Source: servers.md 11 and 16; AP_Filesystem_Sys, _Mission, _ROMFS, and recordings.
+Source: servers.md 11 and 17; AP_Filesystem_Sys, _Mission, _ROMFS, and recordings.
 """
 
 from __future__ import annotations
@@ -62,6 +62,32 @@ def _default_parameters() -> list[Parameter]:
     return made
 
 
+def _px4_parameters() -> list[Parameter]:
+    """Return some of PX4's, which has integers of 32 bits and floats only."""
+    made = [
+        parameter("BAT1_CAPACITY", FLOAT, -1, -1),
+        parameter("BAT1_N_CELLS", INT32, 4, 0),
+        parameter("CAL_BARO0_ID", INT32, 6620172, 0),
+        parameter("CAL_BARO0_OFF", FLOAT, 2.4375, 0, drift=0.0625),
+    ]
+    made += [parameter(f"CAL_GYRO{i}_{axis}OFF", FLOAT, i / 64, 0) for i in range(3) for axis in "XYZ"]
+    made += [
+        parameter("COM_FLIGHT_UUID", INT32, 12, 0),
+        parameter("EKF2_ABL_LIM", FLOAT, 0.4, 0.4),
+        parameter("LND_FLIGHT_T_LO", INT32, 3600, 0, drift=1),
+        parameter("MC_PITCHRATE_P", FLOAT, 0.15, 0.15),
+        parameter("MC_ROLLRATE_P", FLOAT, 0.135, 0.15),
+        parameter("MIS_TAKEOFF_ALT", FLOAT, 2.5, 2.5),
+        parameter("MPC_XY_VEL_MAX", FLOAT, 12, 12),
+        parameter("NAV_ACC_RAD", FLOAT, 10, 10),
+    ]
+    made += [
+        parameter(f"PWM_MAIN_{kind}{i}", INT32, 1000, 1000) for kind in ("DIS", "MIN") for i in range(1, 9)
+    ]
+    made += [parameter("SDLOG_MODE", INT32, 0, 0), parameter("SYS_AUTOSTART", INT32, 10040, 0)]
+    return made
+
+
 def _default_sys() -> dict[bytes, bytes]:
     files = dict.fromkeys(_SYS_NAMES, b"")
     files[b"tasks.txt"] = b"TasksV2\n"
@@ -104,7 +130,8 @@ class VirtualTrees:
         self._exact = exact
         self._says_so = says_so
         self.clock: Callable[[], float] = lambda: 0.0
-        self.table = table if table is not None else Table(_default_parameters())
+        made = _px4_parameters() if exact else _default_parameters()
+        self.table = table if table is not None else Table(made)
         self.sys_files = dict(sys_files) if sys_files is not None else _default_sys()
         self.romfs = dict(romfs) if romfs is not None else _default_romfs()
         self._open = dict.fromkeys(trees, 0)

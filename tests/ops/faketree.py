@@ -136,7 +136,9 @@ class FakeTree:
         names = sorted({other[len(prefix) :].split(b"/")[0] for other in below} - {b""})
         return [(name, self.stat_now(prefix + name)) for name in names]
 
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> FakeFile:
+    async def open(
+        self, path: bytes, *, write: bool = False, truncate: bool = False, **more: object
+    ) -> FakeFile:
         await self.pause("open", path)
         if self.kind_of(path) is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
@@ -145,7 +147,7 @@ class FakeTree:
         self.opened.append(file)
         return file
 
-    async def create(self, path: bytes, *, exclusive: bool) -> FakeFile:
+    async def create(self, path: bytes, *, exclusive: bool, **more: object) -> FakeFile:
         await self.pause("create", path)
         if exclusive and path in self.files:
             raise AlreadyExists(f"{path!r} is there")

@@ -48,7 +48,9 @@ class SpoiltTree(FakeTree):
     crc_error: Exception | None = None
     reads = 0
 
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> FakeFile:
+    async def open(
+        self, path: bytes, *, write: bool = False, truncate: bool = False, **more: object
+    ) -> FakeFile:
         file = await super().open(path)
         self.reads += 1
         if self.bad:

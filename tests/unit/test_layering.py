@@ -24,13 +24,16 @@ LAYERS: dict[str, set[str]] = {
     "shared": set(),
     "protocol": {"shared"},
     "link": {"shared"},
-    "cache": {"shared"},
     "hub": {"shared", "link"},
+    "parameters": {"shared"},
+    "cache": {"shared", "parameters"},
     "session": {"shared", "protocol", "link"},
-    "client": {"shared", "protocol", "link", "cache", "session"},
-    "mount": {"shared", "protocol", "link", "cache", "session", "client"},
+    "client": {"shared", "protocol", "link", "parameters", "cache", "session"},
+    "mount": {"shared", "protocol", "link", "parameters", "cache", "session", "client"},
     "sim": {"shared", "protocol", "link"},
-    "cli": {"shared", "protocol", "link", "cache", "session", "client", "mount", "hub", "sim"},
+    "cli": {
+        *("shared", "protocol", "link", "parameters", "cache", "session", "client", "mount", "hub", "sim")
+    },
     "api": {"shared", "protocol", "link", "cache", "session", "client"},
     "__init__": {"api"},
     "trio": {"api"},
@@ -40,7 +43,7 @@ LAYERS: dict[str, set[str]] = {
 CONTRACTS = {"cache.remote": {"session"}, "protocol.payload": {"cache"}}
 """Modules that other layers may import, too: what the caches need of the session, and the refusals' names."""
 
-PURE_LAYERS = {"shared", "protocol", "sim"}
+PURE_LAYERS = {"shared", "protocol", "parameters", "sim"}
 PURE_MODULES = {
     "link.addresses",
     "link.frames",
@@ -51,7 +54,6 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.doubt",
-    "session.others",
     "session.vehicle",
     "cache.attributes",
     "cache.options",

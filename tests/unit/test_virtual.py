@@ -29,6 +29,7 @@ LIE = 100_000
 PARAM = b"/@PARAM/param.pck"
 UARTS = b"/@SYS/uarts.txt"
 SYS = {b"uarts.txt": b"SERIAL0 on", b"tasks.txt": b"TasksV2\n", b"storage.bin": b"s" * 16384}
+TEXTS = {b"params.parm", b"changed.parm", b"params.params", b"last_error.txt"}
 OPEN, READ = Opcode.OPEN_FILE_RO, Opcode.READ_FILE
 
 
@@ -68,17 +69,16 @@ async def names(tree: Tree, path: bytes) -> set[bytes]:
 
 async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree) -> None:
     assert await names(tree, b"/") == {b"APM", b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION"}
-    assert await names(tree, b"/@PARAM") == {b"param.pck"}
+    assert await names(tree, b"/@PARAM") == {b"param.pck", *TEXTS}
     assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat", b"rally.dat"}
     assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
     assert (await tree.stat(b"/@PARAM")).valid_for == 1.0
     assert dict(await tree.list(b"/"))[b"@MISSION"].kind is EntryKind.DIRECTORY
 
 
-async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(px4: Rig) -> None:
+async def test_a_server_without_trees_sees_one_probe(px4: Rig) -> None:
     tree = px4.mount()
     assert await names(tree, b"/") == {b"fs"}
-    asked = len(px4.faults.requests)
     for path in (b"/@MISSION", b"/@MISSION/mission.dat", b"/@PARAM", PARAM, b"/@PARAM/x", b"/@SYS", UARTS):
         with pytest.raises(NotFound):
             await tree.stat(path)
@@ -86,25 +86,35 @@ async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(p
         await tree.list(b"/@PARAM")
     with pytest.raises(NotFound):
         await tree.open(PARAM)
-    assert px4.faults.requests[asked:] == [OPEN]
+    assert px4.count(OPEN) == 1
     assert tree.negative_valid_for(b"/@PARAM") == 2.0
     px4.put(PARAM, b"new firmware")
     await px4.reboot()
     assert (await tree.stat(PARAM)).size == 12
 
 
-async def test_param_that_opens_makes_the_trees_appear(px4_2026: Rig) -> None:
-    """Unless the probe got no answer, which is none."""
+async def test_beside_another_client_a_server_is_probed_only_if_somebody_asks(px4_2026: Rig) -> None:
+    px4_2026.connection.vehicle.foreign_at = trio.current_time()
     tree = px4_2026.mount()
     assert await names(tree, b"/") == {b"fs"}
+    assert px4_2026.count(OPEN) == 0
+    assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
+    assert px4_2026.count(OPEN) == 1
+    assert await names(tree, b"/") == {b"fs", b"@PARAM"}
+
+
+async def test_parameters_that_open_make_their_directory_appear(px4_2026: Rig) -> None:
+    """Unless the probe got no answer, which is none."""
+    tree = px4_2026.mount()
     await px4_2026.lose()
     with pytest.raises((RequestTimeout, VehicleLost)):
         await tree.stat(b"/@PARAM")
     await px4_2026.find()
     assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
-    assert await names(tree, b"/") == {b"fs", b"@PARAM", b"@MISSION"}
-    assert await names(tree, b"/@PARAM") == {b"param.pck"}
-    assert await names(tree, b"/@MISSION") == set()
+    assert await names(tree, b"/") == {b"fs", b"@PARAM"}
+    assert await names(tree, b"/@PARAM") == {b"param.pck", *TEXTS}
+    with pytest.raises(NotFound):
+        await tree.list(b"/@MISSION")
     packed = trees(px4_2026).content(b"@PARAM/param.pck", 239)
     assert (await tree.stat(PARAM)).size == len(packed)
     assert await read_file(tree, PARAM) == packed

@@ -1,4 +1,6 @@
-"""Open a file in nano on a terminal of its own, type a word, save, leave: nano_save.py FILE"""
+"""Open a file in nano on a terminal of its own, type a word, save, leave: nano_save.py FILE [LINE,COLUMN
+WORD]
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,13 @@ def read_until(terminal: int, words: bytes) -> None:
 
 def main() -> None:
     """Play the user."""
+    place, word = ([f"+{sys.argv[2]}"], sys.argv[3]) if len(sys.argv) > 2 else ([], "word ")
     child, terminal = pty.fork()
     if child == 0:
         os.environ["TERM"] = "xterm"
-        os.execvp("nano", ["nano", "--ignorercfiles", sys.argv[1]])
+        os.execvp("nano", ["nano", "--ignorercfiles", *place, sys.argv[1]])
     read_until(terminal, b"Exit")
-    os.write(terminal, b"word \x0f")
+    os.write(terminal, word.encode() + b"\x0f")
     read_until(terminal, b"Write")
     os.write(terminal, b"\r")
     read_until(terminal, b"Wrote")

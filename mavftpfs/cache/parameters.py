@@ -1,0 +1,261 @@
+"""`@PARAM` as texts: what is read, and how a saved text changes the vehicle. Layer: cache.
+
+One download of `param.pck` is what all texts show; it holds for a second. Which lines of a saved text are
+to be set says `parameters.saving`. They go out in one upload, and only a new download tells what became of
+it: servers skip what they do not know, cut numbers to fit, and ACK what they refuse (docs/servers.md 17).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from mavftpfs.cache.attributes import SECOND
+from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, require_found
+from mavftpfs.cache.virtual import PARAM_FILE, VirtualTrees
+from mavftpfs.parameters.packed import Download, pack_upload, unpack
+from mavftpfs.parameters.saving import Values, Verdict, judge, make_plan, pick_base, unchanged
+from mavftpfs.parameters.text import (
+    Line,
+    Problem,
+    parse,
+    render_all,
+    render_changed,
+    render_qgc,
+)
+from mavftpfs.parameters.values import Number, Parameter
+from mavftpfs.shared.errors import (
+    FtpNak,
+    InvalidText,
+    MavftpfsError,
+    NotFound,
+    NotTaken,
+    RemoteProtocolError,
+)
+from mavftpfs.shared.model import split
+
+ALL, CHANGED, QGC = b"params.parm", b"changed.parm", b"params.params"
+DEFAULTS_FILE = PARAM_FILE + b"?withdefaults=1"
+AT_ONCE = 1000
+"""Values in one upload: its length is a number of 16 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """All parameters as one download had them."""
+
+    raw: bytes
+    parameters: Sequence[Parameter]
+    values: Values
+    since_ns: int
+
+
+class Parameters(Texts[Values]):
+    """The texts of `@PARAM`."""
+
+    names = (ALL, CHANGED, QGC)
+
+    def __init__(
+        self,
+        store: VehicleStore,
+        virtual: VirtualTrees,
+        *,
+        wall: Callable[[], float],
+        require_writable: Callable[[], None],
+    ) -> None:
+        super().__init__(split(PARAM_FILE)[0], wall, require_writable)
+        self._store = store
+        self._virtual = virtual
+        self._snapshot: Snapshot | None = None
+        self._rendered: dict[bytes, Shown[Values]] = {}
+        self._defaults: dict[str, Number] | None = None
+        self._tells_defaults: bool | None = None
+
+    def forget(self) -> None:
+        """The vehicle may be another one, or have another firmware."""
+        self._snapshot = None
+        self._rendered.clear()
+        self._defaults = None
+        self._tells_defaults = None
+
+    # --- reading
+
+    async def show(self, name: bytes, *, reread: bool) -> Shown[Values]:
+        """See Texts."""
+        snapshot = await self._read(reread=reread)
+        differing = await self._differing(snapshot) if name == CHANGED else None
+        shown = self._rendered.get(name)
+        if shown is None:
+            shown = self._rendered[name] = self._render(name, snapshot, differing)
+        return shown
+
+    def _render(
+        self, name: bytes, snapshot: Snapshot, differing: Sequence[Parameter] | None
+    ) -> Shown[Values]:
+        if name == CHANGED:
+            differing = require_found(differing, name)
+            values = {one.name: one for one in differing}
+            return Shown(render_changed(differing).encode(), values, snapshot.since_ns)
+        text = render_all(snapshot.parameters)
+        if name == QGC:
+            text = render_qgc(snapshot.parameters, *self._store.address())
+        return Shown(text.encode(), snapshot.values, snapshot.since_ns)
+
+    async def _read(self, *, reread: bool) -> Snapshot:
+        """Return what the vehicle has. reread: now; else as it was read last, if it was.
+
+        Raises:
+            NotFound, RemoteProtocolError; else as RemoteStore.read_whole.
+        """
+        raw = await self._virtual.content(PARAM_FILE, reread=reread)
+        if self._snapshot is None or self._snapshot.raw is not raw:
+            self._take(raw, await self._whole(raw))
+        assert self._snapshot is not None
+        return self._snapshot
+
+    async def _whole(self, raw: bytes) -> Download:
+        """Parse a download; one that does not add up is read once more: it may have changed while it was
+        read.
+        """
+        try:
+            return _complete(unpack(raw))
+        except RemoteProtocolError:
+            self._virtual.outdate(PARAM_FILE)
+            return _complete(unpack(await self._virtual.content(PARAM_FILE, reread=True)))
+
+    def _take(self, raw: bytes, download: Download) -> None:
+        """A download came. Where it says what the last one said, the texts are those of the last one."""
+        values = {one.name: one for one in download.parameters}
+        if self._snapshot is not None and self._snapshot.values == values:
+            self._snapshot = replace(self._snapshot, raw=raw)
+        else:
+            self._snapshot = Snapshot(raw, download.parameters, values, int(self._wall() * SECOND))
+            self._rendered.clear()
+
+    async def _differing(self, snapshot: Snapshot) -> list[Parameter] | None:
+        """Return what differs from its default; None where the vehicle tells no defaults."""
+        if self._tells_defaults is False:
+            return None
+        if self._defaults is None or not snapshot.values.keys() <= self._defaults.keys():
+            await self._read_defaults()
+        defaults = self._defaults
+        if defaults is None:
+            return None
+        with_defaults = (replace(one, default=defaults.get(one.name)) for one in snapshot.parameters)
+        return [one for one in with_defaults if one.changed]
+
+    async def _read_defaults(self) -> None:
+        """Ask for defaults; they stay as they are until the vehicle restarts.
+
+        Where a download with defaults has none with a parameter, its value is the default.
+        """
+        try:
+            download = unpack(await self._virtual.content(DEFAULTS_FILE, reread=True))
+        except (FtpNak, NotFound, RemoteProtocolError):
+            download = None
+        self._tells_defaults = download is not None and download.with_defaults
+        if download is not None and self._tells_defaults:
+            self._defaults = {
+                one.name: one.value if one.default is None else one.default for one in download.parameters
+            }
+
+    # --- saving
+
+    async def carry_out(self, save: Save[Values]) -> Saved[Values] | None:
+        """See Texts."""
+        lines, notes = self._parse(save)
+        base = pick_base(lines, save.bases, rereads=save.rereads)
+        changed = [line for line in lines if base is None or not unchanged(line, base)]
+        if not changed:
+            return None
+        before = (await self._read(reread=True)).values
+        plan = make_plan(changed, base, before, meant=save.appended)
+        if plan.problems:
+            raise _invalid(save.name, plan.problems)
+        if plan.conflicts:
+            raise Refused(NotTaken(plan.conflicts[0]), [*plan.conflicts, "nothing was set"])
+        # What the program changed itself counts from now on whatever it says, also if it goes back.
+        names = {line.name for line in changed}
+        known = None if base is None else {name: one for name, one in base.items() if name not in names}
+        if plan.wanted:
+            notes += (await self._set(plan.wanted, save.progress, known)).notes
+        return Saved(known, notes + plan.notes)
+
+    def _parse(self, save: Save[Values]) -> tuple[list[Line], list[str]]:
+        """Return a text's lines, and notes.
+
+        Raises:
+            Refused: some cannot be.
+        """
+        system, component = self._store.address()
+        try:
+            text = save.text.decode()
+        except UnicodeDecodeError as error:
+            number = save.text.count(b"\n", 0, error.start) + 1
+            raise _invalid(save.name, [Problem(number, "this is no text")]) from None
+        lines, problems = parse(text, component)
+        if problems:
+            raise _invalid(save.name, problems)
+        others = sorted({line.system for line in lines if line.system not in (None, system)} - {None})
+        return lines, [f"the lines are of system {other}, this is system {system}" for other in others]
+
+    async def _set(
+        self, wanted: Sequence[Parameter], progress: Callable[[int], None] | None, known: Values | None
+    ) -> Verdict:
+        """Set values, and read back whether they hold. known: for Refused.
+
+        Raises:
+            Refused: some do not.
+        """
+        failure: MavftpfsError | None = None
+        self._virtual.outdate(PARAM_FILE)
+        try:
+            for start in range(0, len(wanted), AT_ONCE):
+                pieces = pack_upload(wanted[start : start + AT_ONCE])
+                await self._store.write_whole(PARAM_FILE, pieces, progress)
+        except MavftpfsError as error:
+            failure = error
+        self._virtual.outdate(PARAM_FILE)  # somebody may have read it while the upload waited for its turn
+        try:
+            after = (await self._read(reread=True)).values
+        except MavftpfsError as error:
+            said = f"{failure or error}; of {_several(wanted)} it is not known which were set"
+            raise Refused(failure or error, [said], known) from error
+        verdict = judge(wanted, after)
+        if verdict.missed:
+            more = "" if len(verdict.missed) == 1 else f" (and {len(verdict.missed) - 1} more)"
+            refused = failure is None or isinstance(failure, FtpNak)
+            why = NotTaken(verdict.missed[0] + more) if refused or failure is None else failure
+            raise Refused(why, _said(verdict, failure), known)
+        return verdict
+
+
+def _complete(download: Download) -> Download:
+    """Return a download.
+
+    Raises:
+        RemoteProtocolError: it has not all parameters.
+    """
+    if len(download.parameters) != download.total:
+        raise RemoteProtocolError(
+            f"the parameter file has {len(download.parameters)} of {download.total} parameters"
+        )
+    return download
+
+
+def _invalid(name: bytes, problems: Sequence[Problem]) -> Refused:
+    ordered = sorted(problems, key=lambda problem: problem.number)
+    lines = [f"{name.decode()}:{problem.number}: {problem.reason}" for problem in ordered]
+    return Refused(InvalidText(lines[0]), [*lines, "nothing was set"])
+
+
+def _several(wanted: Sequence[Parameter]) -> str:
+    return wanted[0].name if len(wanted) == 1 else f"{len(wanted)} parameters"
+
+
+def _said(verdict: Verdict, failure: MavftpfsError | None) -> list[str]:
+    """Return what people are told of a save that did not come true."""
+    held = ", ".join(verdict.held) if verdict.held else "nothing"
+    why = [] if failure is None else [str(failure)]
+    return [*why, *verdict.missed, *verdict.notes, f"set: {held}"]

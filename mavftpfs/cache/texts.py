@@ -1,0 +1,415 @@
+"""Texts that stand for a packed `@` file: reading shows the vehicle, saving changes it. Layer: cache.
+
+Each handle that writes has a text of its own, which nobody else sees. It is *saved*, as a whole, by fsync
+and by each close (flush) since which it changed. What a save asks for, compared with what the vehicle has,
+is for `Texts.carry_out`, which the parameters and the missions implement. Nothing is kept: a text that was
+refused is gone with its handle.
+
+A program that saves what it read before means the lines that it changed. So what programs read is remembered
+for each, until it saves.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Generic, TypeVar
+
+import trio
+
+from mavftpfs.cache.attributes import SECOND, Stat
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.shared.errors import InvalidText, LocalProtocolError, MavftpfsError, NotFound, ReadOnly
+from mavftpfs.shared.model import EntryKind, split
+
+LAST_ERROR = b"last_error.txt"
+MAX_TEXT = 4 << 20
+"""Bytes of a text that is written."""
+
+MAX_PROGRAMS = 256
+MAX_READ = 8
+"""Of how many programs it is remembered what they read, and how many of their last reads."""
+
+B = TypeVar("B")
+
+Program = Hashable
+"""Tells the process that opened a file from all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown(Generic[B]):
+    """What a reader gets. base: the same, for who saves it later. since_ns: when it changed last."""
+
+    text: bytes
+    base: B
+    since_ns: int
+
+
+@dataclass(slots=True)
+class Reads(Generic[B]):
+    """What a program read, the oldest first. rereads: it tried to make another file beside it, as an editor
+    does that is about to copy the file to a backup.
+    """
+
+    bases: list[B] = field(default_factory=list)
+    rereads: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Save(Generic[B]):
+    """A text that is saved.
+
+    bases: what its writer read, the oldest first; rereads: see Reads. appended: the lines were appended,
+    each is meant. progress: told how many bytes were ACKed.
+    """
+
+    name: bytes
+    text: bytes
+    bases: Sequence[B]
+    rereads: bool
+    appended: bool
+    progress: Callable[[int], None] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Saved(Generic[B]):
+    """A save came true. known: what its program still knows of the vehicle, None if it had read nothing.
+    notes: for people.
+    """
+
+    known: B | None
+    notes: Sequence[str]
+
+
+class Texts(ABC, Generic[B]):
+    """The texts in one `@` directory."""
+
+    def __init__(
+        self, directory: bytes, wall: Callable[[], float], require_writable: Callable[[], None]
+    ) -> None:
+        """`require_writable()`: raises Armed, or ReadOnly."""
+        self.directory = directory
+        self.error_text = b""
+        self._error_at = 0
+        self._wall = wall
+        self._require_writable = require_writable
+        self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
+        self._saving = trio.Lock()
+
+    # --- what the parameters and the missions implement
+
+    @property
+    @abstractmethod
+    def names(self) -> Sequence[bytes]:
+        """The names of all texts that there may be."""
+
+    @abstractmethod
+    async def show(self, name: bytes, *, reread: bool) -> Shown[B]:
+        """Return a text. reread: as the vehicle is now; else as it was read last, if it was.
+
+        Raises:
+            NotFound: the vehicle has nothing that it would stand for. Else as RemoteStore.read_whole.
+        """
+
+    @abstractmethod
+    def forget(self) -> None:
+        """The vehicle restarted, or what is remembered of it is to be asked again."""
+
+    @abstractmethod
+    async def carry_out(self, save: Save[B]) -> Saved[B] | None:
+        """Change the vehicle. None: the text asks for nothing.
+
+        Raises:
+            Refused: it did not, or not wholly. Else as RemoteStore.read_whole.
+        """
+
+    # --- what the tree asks
+
+    def owns(self, path: bytes) -> bool:
+        """Return whether it is the path of a text."""
+        parent, name = split(path)
+        return parent == self.directory and (name in self.names or name == LAST_ERROR)
+
+    async def stat(self, name: bytes) -> Stat:
+        """Return attributes. Raises NotFound; else as show."""
+        if name == LAST_ERROR:
+            return Stat(EntryKind.FILE, len(self.error_text), self._error_at, 0.0)
+        shown = await self.show(name, reread=False)
+        return Stat(EntryKind.FILE, len(shown.text), shown.since_ns, 0.0)
+
+    async def list(self, patience: float) -> list[tuple[bytes, Stat]]:
+        """Return those that are there; after so many seconds, without the sizes of those not read by then."""
+        found = {}
+        with trio.move_on_after(patience) as scope:
+            for name in self.names:
+                with suppress(MavftpfsError):  # it does not open; who opens it is told
+                    found[name] = await self.stat(name)
+        if scope.cancelled_caught:
+            unread = Stat(EntryKind.FILE, 0, 0, 0.0)
+            found = {name: found.get(name, unread) for name in self.names}
+        if found:
+            found[LAST_ERROR] = await self.stat(LAST_ERROR)
+        return list(found.items())
+
+    async def open(
+        self, name: bytes, *, write: bool, truncate: bool, append: bool, program: Program | None
+    ) -> TextHandle[B] | ErrorHandle:
+        """Open one.
+
+        Raises:
+            ReadOnly, Armed, NotFound; else as show.
+        """
+        if name == LAST_ERROR:
+            if write:
+                raise ReadOnly(f"{name.decode()} is only read")
+            return ErrorHandle(self.error_text)
+        if write:
+            self._require_writable()
+        shown = await self.show(name, reread=not truncate)
+        return TextHandle(self, name, shown, write=write, truncate=truncate, append=append, program=program)
+
+    def note_other_file(self, program: Program | None) -> None:
+        """A program tried to make a file beside these."""
+        if program in self._reads:
+            self._reads[program].rereads = True
+
+    # --- what handles ask
+
+    def note_read(self, program: Program | None, base: B) -> None:
+        """A program read this."""
+        if program is None:
+            return
+        reads = self._reads.setdefault(program, Reads())
+        self._reads.move_to_end(program)
+        if not any(known is base for known in reads.bases):
+            reads.bases = [*reads.bases, base][-MAX_READ:]
+        while len(self._reads) > MAX_PROGRAMS:
+            self._reads.popitem(last=False)
+
+    async def save(
+        self,
+        name: bytes,
+        text: bytes,
+        *,
+        program: Program | None,
+        base: B | None,
+        appended: bool,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        """Save a text; one after the other. base: what its handle showed before.
+
+        Raises:
+            InvalidText, NotTaken, Armed; else as RemoteStore.read_whole.
+        """
+        async with self._saving:
+            reads: Reads[B] = self._reads.get(program, Reads())
+            bases = [] if appended else reads.bases
+            if base is not None and not any(known is base for known in bases):
+                bases = [*bases, base]
+            try:
+                self._require_writable()
+                done = await self.carry_out(Save(name, text, bases, reads.rereads, appended, progress))
+            except Refused as refused:
+                self._know(program, refused.known)
+                self._tell(name, refused.lines)
+                raise refused.error from refused.__cause__
+            except MavftpfsError as error:
+                self._tell(name, [f"nothing was set: {error}"])
+                raise
+            if done is not None:
+                self._know(program, done.known)
+                self._tell(name, done.notes)
+
+    def _know(self, program: Program | None, known: B | None) -> None:
+        """A program saved: this is what it still knows."""
+        if known is not None and program is not None:
+            self._reads[program] = Reads([known])
+
+    def refuse_unfinished(self, name: bytes, text: bytes) -> InvalidText:
+        """Say that a text ends in the middle of a line, and return the error."""
+        number = text.count(b"\n") + 1
+        line = f"{name.decode()}:{number}: the last line has no end, so nothing was set"
+        self._tell(name, [line])
+        return InvalidText(line)
+
+    def _tell(self, name: bytes, lines: Sequence[str]) -> None:
+        """Keep what the last save said."""
+        now = self._wall()
+        when = datetime.fromtimestamp(now, UTC)
+        head = f"# {when:%Y-%m-%d %H:%M:%S} UTC, {name.decode()}"
+        self.error_text = ("\n".join([head, *lines]) + "\n").encode() if lines else b""
+        self._error_at = int(now * SECOND)
+
+
+class Refused(Exception):
+    """A save was not carried out, or not wholly.
+
+    error: for the program. lines: for people. known: see Saved; None: what it knew before.
+    """
+
+    def __init__(self, error: MavftpfsError, lines: Sequence[str], known: Any = None) -> None:
+        super().__init__(str(error))
+        self.error = error
+        self.lines = lines
+        self.known = known
+
+
+class ErrorHandle(OpenFile):
+    """One open() of last_error.txt."""
+
+    direct_io = True
+
+    def __init__(self, text: bytes) -> None:
+        self._text = text
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self._text)
+
+    async def read(self, offset: int, size: int) -> bytes:
+        """Return bytes, fewer only at the end."""
+        return self._text[offset : offset + size]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class TextHandle(OpenFile, Generic[B]):
+    """One open() of a text. progress: told how many bytes of a save were ACKed."""
+
+    direct_io = True
+    writable = False
+
+    def __init__(
+        self,
+        texts: Texts[B],
+        name: bytes,
+        shown: Shown[B],
+        *,
+        write: bool,
+        truncate: bool,
+        append: bool,
+        program: Program | None,
+    ) -> None:
+        self.writable = write
+        self.progress: Callable[[int], None] | None = None
+        self._texts = texts
+        self._name = name
+        self._program = program
+        self._append = append and write
+        self._base = None if truncate or self._append else shown.base
+        self._shown = shown.base
+        self._before = b"" if truncate else shown.text  # of what is appended
+        self._content = bytearray() if self._append else bytearray(self._before)
+        self._changed = False
+        self._error: MavftpfsError | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self._content) + (len(self._before) if self._append else 0)
+
+    async def read(self, offset: int, size: int) -> bytes:
+        """Return bytes, fewer only at the end."""
+        if not self._changed and self._before:
+            self._texts.note_read(self._program, self._shown)
+        content = self._before + self._content if self._append else self._content
+        return bytes(content[offset : offset + size])
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """Put bytes into the text; behind its end if it was opened for appending.
+
+        Raises:
+            InvalidText: it becomes too long.
+        """
+        if not self.writable:
+            raise LocalProtocolError("write to a handle opened for reading")
+        at = len(self._content) if self._append else offset
+        if at + len(data) > MAX_TEXT:
+            raise InvalidText(f"{self._name.decode()} may have {MAX_TEXT} bytes")
+        if at > len(self._content):
+            self._content.extend(bytes(at - len(self._content)))
+        self._content[at : at + len(data)] = data
+        self._changed = True
+        return len(data)
+
+    async def truncate(self, size: int) -> None:
+        """Cut the text, or extend it with zeros, which no line may hold.
+
+        Raises:
+            InvalidText: it becomes too long.
+        """
+        if not self.writable:
+            raise LocalProtocolError("truncate of a handle opened for reading")
+        if size > MAX_TEXT:
+            raise InvalidText(f"{self._name.decode()} may have {MAX_TEXT} bytes")
+        if not size:
+            self._base = None  # vim opens, and empties then
+        if self._append:
+            self._before, size = self._before[:size], max(0, size - len(self._before))
+        del self._content[size:]
+        self._content.extend(bytes(size - len(self._content)))
+        self._changed = True
+
+    async def flush(self) -> None:
+        """Save what changed since the last time. An unfinished last line is an error, and stays: more may
+        come.
+
+        Raises:
+            InvalidText, NotTaken, Armed; also of the last time, if nothing changed since.
+        """
+        if not self._changed:
+            if self._error is not None:
+                raise self._error
+            return
+        text = bytes(self._content)
+        if text and not text.endswith(b"\n"):
+            raise self._texts.refuse_unfinished(self._name, text)
+        self._changed, self._error = False, None
+        if not text:
+            return
+        try:
+            await self._texts.save(
+                self._name,
+                text,
+                program=self._program,
+                base=self._base,
+                appended=self._append,
+                progress=self.progress,
+            )
+        except MavftpfsError as error:
+            self._error = error
+            raise
+        if self._append:
+            self._before += text
+            del self._content[: len(text)]
+
+    async def fsync(self) -> None:
+        """As flush."""
+        await self.flush()
+
+    async def release(self) -> None:
+        """Let the text go, saved or not: whoever closed it was told."""
+
+    async def give_up(self) -> bool:
+        """Let the text go; return whether the vehicle has it."""
+        return not self._changed and self._error is None
+
+    def close(self) -> None:
+        """Let the text go."""
+
+
+def require_found(found: B | None, name: bytes) -> B:
+    """Return what was found.
+
+    Raises:
+        NotFound.
+    """
+    if found is None:
+        raise NotFound(f"the vehicle has nothing that {name.decode()} would show")
+    return found

@@ -1,0 +1,124 @@
+"""What a saved text asks for, and whether it came true. Layer: parameters; pure.
+
+A program that saves a text of all parameters means the lines that it changed: barometers, counters and
+learned values have moved since it read the others. So a save has a *base*, what the same program read
+before, and lines that are as in the base ask for nothing. Without one (`cp`, `>`) every line counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from mavftpfs.parameters.own import is_own
+from mavftpfs.parameters.text import Line, Problem
+from mavftpfs.parameters.values import BadValue, Number, Parameter, fit, same, text_of
+
+Values = Mapping[str, Parameter]
+"""Parameters by name."""
+
+
+def unchanged(line: Line, base: Values) -> bool:
+    """Return whether a line says what the base says."""
+    known = base.get(line.name)
+    if known is None:
+        return False
+    try:
+        return same(fit(known.kind, line.value), known.value)
+    except BadValue:
+        return False
+
+
+def pick_base(lines: Sequence[Line], bases: Sequence[Values], *, rereads: bool) -> Values | None:
+    """Return what a text was made from: the base that it shares the most lines with, of several the last.
+
+    bases: what the program read, the oldest first. rereads: it was seen to read the file once more as an
+    editor does to make a backup (vim). Without that a text that is wholly an older one is meant as it is:
+    the program knew the last one, and goes back.
+    """
+    if len(bases) < 2:
+        return bases[0] if bases else None
+    shared = [sum(unchanged(line, base) for line in lines) for base in bases]
+    best = max(range(len(bases)), key=lambda place: (shared[place], place))
+    if shared[best] == len(lines) and not rereads:
+        best = len(bases) - 1
+    return bases[best]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is to be done about a text.
+
+    wanted: what is to be set, and does not hold yet. problems: lines that cannot be; conflicts: why nothing
+    is set though the lines are good; either means that nothing is sent. notes: what the user should know.
+    """
+
+    wanted: list[Parameter] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+    conflicts: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def make_plan(lines: Sequence[Line], base: Values | None, current: Values, *, meant: bool) -> Plan:
+    """Compare a text with what the vehicle has.
+
+    meant: each line was written by itself (`>>`), so that also a parameter which is the vehicle's own is set.
+    """
+    plan = Plan()
+    left_alone: list[str] = []
+    for line in {line.name: line for line in lines}.values():
+        if base is not None and unchanged(line, base):
+            continue
+        now = current.get(line.name)
+        if now is None:
+            plan.problems.append(Problem(line.number, f"the vehicle has no parameter {line.name}"))
+            continue
+        try:
+            value = fit(now.kind, line.value)
+        except BadValue as error:
+            plan.problems.append(Problem(line.number, f"{line.name}: {error}"))
+            continue
+        if same(value, now.value):
+            continue
+        before = None if base is None else base.get(line.name)
+        if before is not None and not same(before.value, now.value) and not is_own(line.name):
+            plan.conflicts.append(_conflict(now, value, before.value))
+        elif base is None and not meant and is_own(line.name):
+            left_alone.append(line.name)
+        else:
+            plan.wanted.append(Parameter(line.name, now.kind, value))
+    if left_alone:
+        plan.notes.append(f"left alone, because the vehicle sets them by itself: {', '.join(left_alone)}")
+    return plan
+
+
+def _conflict(now: Parameter, wanted: Number, before: Number) -> str:
+    was, has, want = (text_of(now.kind, value) for value in (before, now.value, wanted))
+    return f"{now.name}: it was {was} and has become {has} on the vehicle meanwhile; wanted {want}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a plan: names that hold, a line for each that does not, and notes."""
+
+    held: list[str]
+    missed: list[str]
+    notes: list[str]
+
+
+def judge(wanted: Sequence[Parameter], after: Values) -> Verdict:
+    """Compare what was to be set with what was read back."""
+    verdict = Verdict([], [], [])
+    for one in wanted:
+        now = after.get(one.name)
+        want = text_of(one.kind, one.value)
+        if now is None:
+            verdict.missed.append(f"{one.name}: wanted {want}, and it is not there any more")
+        elif same(now.value, one.value):
+            verdict.held.append(one.name)
+        elif is_own(one.name):
+            got = text_of(now.kind, now.value)
+            verdict.notes.append(f"{one.name} is the vehicle's own: wanted {want}, it is {got}")
+        else:
+            verdict.missed.append(f"{one.name}: wanted {want}, got {text_of(now.kind, now.value)}")
+    return verdict

@@ -1,0 +1,167 @@
+"""Parameters as texts, in real programs: editors, cp, the shell's redirections, git (docs/servers.md 17)."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.parameters.packed import unpack
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount
+from tests.support.request_costs import PROGRAMS
+
+FLOAT_NAME = {"ardupilot5": "ATC_RAT_PIT_P", "px4-2026": "MC_PITCHRATE_P"}
+INT_NAME = {"ardupilot5": "RTL_ALT", "px4-2026": "PWM_MAIN_DIS1"}
+
+
+class Texts:
+    """The parameters of a vehicle that is mounted; `told`: what its packed file says."""
+
+    def __init__(self, mount: Mount, profile: str) -> None:
+        self.mount = mount
+        self.folder = mount.path / "@PARAM"
+        self.all = self.folder / "params.parm"
+        self.real = FLOAT_NAME[profile]
+        self.whole = INT_NAME[profile]
+
+    def told(self, name: str) -> float:
+        """Return a value."""
+        packed = self.mount.read_bytes(self.folder / "param.pck")
+        return {one.name: one.value for one in unpack(packed).parameters}[name]
+
+    def errors(self) -> str:
+        """Return what the last save said."""
+        return self.mount.read_bytes(self.folder / "last_error.txt").decode()
+
+    def line(self, name: str) -> int:
+        """Return the number of a parameter's line."""
+        lines = self.mount.read_bytes(self.all).decode().splitlines()
+        return next(place for place, line in enumerate(lines, 1) if line.startswith(name + ","))
+
+    def shell(self, command: str, code: int | None = 0) -> str:
+        """Run a shell there."""
+        done = self.mount.run("sh", "-c", command, cwd=self.folder, code=code)
+        return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module", params=list(FLOAT_NAME))
+def texts(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> Texts:
+    """A mount of a vehicle with parameters."""
+    source = module_field.sim(small_tree, request.param).source
+    return Texts(module_field.mount(source), request.param)
+
+
+@pytest.fixture(autouse=True)
+def restored(texts: Texts) -> Iterator[None]:
+    """Give the next test the values that this one found."""
+    before = {name: texts.told(name) for name in (texts.real, texts.whole)}
+    yield
+    texts.shell("".join(f"echo {name},{value} >> params.parm;" for name, value in before.items()))
+
+
+VIM = "vim -es -N -i NONE -n -u NONE"
+BACKUP = f"{VIM} --cmd 'set writebackup backupskip='"
+PAUSE = "-c 'call system(\"sleep 3\")'"
+MOVING = {"ATC_RAT_PIT_P": "STAT_RUNTIME", "MC_PITCHRATE_P": "LND_FLIGHT_T_LO"}
+
+
+@pytest.mark.parametrize("vim", [VIM, BACKUP])
+def test_vim_sets_what_its_user_changed(texts: Texts, vim: str) -> None:
+    """Also though it reads the file once more to make a backup, and values have moved since."""
+    before, moved = texts.told(texts.whole), texts.told(MOVING[texts.real])
+    texts.shell(f"{vim} -c '%s/^{texts.real},.*/{texts.real},0.5/' {PAUSE} -c wq params.parm")
+    assert texts.told(texts.real) == 0.5
+    assert texts.told(texts.whole) == before
+    assert texts.told(MOVING[texts.real]) > moved
+    assert texts.errors() == ""
+
+
+@pytest.mark.parametrize("vim", [VIM, BACKUP])
+def test_vim_that_changed_nothing_sets_nothing(texts: Texts, vim: str) -> None:
+    before = texts.told(MOVING[texts.real])
+    texts.shell(f"{vim} {PAUSE} -c wq params.parm")
+    assert texts.told(MOVING[texts.real]) > before
+    assert texts.errors() == ""
+
+
+def test_vim_hears_of_a_bad_line(texts: Texts) -> None:
+    texts.shell(f"{BACKUP} -c '1s/.*/rubbish/' -c wq params.parm", code=1)
+    assert "params.parm:1: 'rubbish' is not NAME,VALUE" in texts.errors()
+
+
+def test_nano(texts: Texts) -> None:
+    line, name = texts.line(texts.whole), texts.whole
+    before = texts.told(name)
+    texts.shell(f"{sys.executable} {PROGRAMS / 'nano_save.py'} params.parm {line},{len(name) + 2} 1")
+    assert texts.told(name) == float(f"1{before:.0f}")
+
+
+def test_cp_and_redirections(texts: Texts, tmp_path: Path) -> None:
+    saved = tmp_path / "saved.params"
+    texts.shell(f"cp params.params {saved}; echo '{texts.real},7' > params.parm")
+    assert texts.told(texts.real) == 7
+    texts.shell(f"echo '{texts.whole} 21 # why' >> changed.parm")
+    assert texts.told(texts.whole) == 21
+    texts.shell(f"cp {saved} params.parm")
+    assert texts.told(texts.real) == pytest.approx(0.135 if texts.real.startswith("ATC") else 0.15)
+    assert texts.told(texts.whole) != 21
+
+
+def test_sed_through_another_file(texts: Texts, tmp_path: Path) -> None:
+    new = tmp_path / "new"
+    texts.shell(f"sed 's/^{texts.whole},.*/{texts.whole},33/' params.parm > {new}; cat {new} > params.parm")
+    assert texts.told(texts.whole) == 33
+    said = texts.shell("sed -i 's/33/34/' params.parm", code=4)
+    assert "Read-only file system" in said
+    assert texts.told(texts.whole) == 33
+
+
+def test_rsync_in_place_works_and_else_is_refused(texts: Texts, tmp_path: Path) -> None:
+    wanted = tmp_path / "params.parm"
+    wanted.write_text(f"{texts.whole},44\n")
+    said = texts.shell(f"rsync -I {wanted} params.parm", code=None)
+    assert "Read-only file system" in said
+    texts.shell(f"rsync -I --inplace {wanted} params.parm")
+    assert texts.told(texts.whole) == 44
+
+
+def test_python_hears_of_errors_at_close(texts: Texts) -> None:
+    for text, number in ((f"{texts.whole},1.5\n", errno.EINVAL), (f"{texts.whole},55", errno.EINVAL)):
+        with pytest.raises(OSError, match="Invalid") as caught:
+            texts.all.write_text(text)
+        assert caught.value.errno == number
+    assert texts.told(texts.whole) != 55
+    texts.all.write_text(f"{texts.whole},55\n")
+    assert texts.told(texts.whole) == 55
+
+
+def test_a_child_that_ends_flushes_half_a_line_and_sets_nothing(texts: Texts) -> None:
+    with texts.all.open("w") as file:
+        file.write(f"{texts.whole},6")
+        file.flush()
+        child = os.fork()
+        if child == 0:
+            os._exit(0)  # which closes the descriptor that it inherited
+        os.waitpid(child, 0)
+        assert texts.told(texts.whole) != 6
+        file.write("6\n")
+    assert texts.told(texts.whole) == 66
+
+
+def test_git_shows_what_differs(texts: Texts, tmp_path: Path) -> None:
+    saved = tmp_path / "saved.parm"
+    texts.shell(f"cp params.parm {saved}; echo '{texts.whole},77' >> params.parm")
+    said = texts.shell(f"git diff --no-index --unified=0 {saved} params.parm", code=1)
+    assert f"\n+{texts.whole},77\n" in said
+
+
+def test_a_listing_tells_sizes_that_are_right(texts: Texts) -> None:
+    listed = texts.shell("ls -l").splitlines()[1:]
+    assert len(listed) == 5
+    texts.shell('wc -c params.parm | grep -q "$(stat -c %s params.parm)"')
+    texts.shell("grep -c , params.parm params.params changed.parm")

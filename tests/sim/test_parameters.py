@@ -1,0 +1,534 @@
+"""Parameters as texts, over simulated links: what is read is what the vehicle has, what is saved holds."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.parameters.text import parse
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    Armed,
+    InvalidText,
+    MavftpfsError,
+    NotFound,
+    NotTaken,
+    ReadOnly,
+    RemoteProtocolError,
+    RequestTimeout,
+    VehicleLost,
+)
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.parameters import FLOAT, INT32, Parameter, Selection, Table, parameter
+from tests.support.rigs import Rig, read_file, rig
+
+ALL, CHANGED, QGC = b"/@PARAM/params.parm", b"/@PARAM/changed.parm", b"/@PARAM/params.params"
+ERRORS = b"/@PARAM/last_error.txt"
+PACKED = b"/@PARAM/param.pck"
+PROFILES = ("px4-2026", "ardupilot", "ardupilot5")
+MARKS = pytest.mark.parametrize("profile", PROFILES)
+LINKS = (LinkSettings(delay=0.02), LinkSettings(delay=0.02, loss=0.03), LinkSettings(delay=0.02, loss=0.1))
+
+
+def many(count: int = 300, drifting: int = 20) -> list[Parameter]:
+    """Return parameters of which some change by themselves."""
+    made = [parameter(f"GAIN_{i:03}", FLOAT, i / 7, i / 7 if i % 3 else 0) for i in range(count)]
+    made += [parameter(f"MODE_{i:03}", INT32, i, 0) for i in range(20)]
+    made += [parameter(f"LEARNED_{i:02}", FLOAT, i, 0, drift=0.25) for i in range(drifting)]
+    return [*made, parameter("STAT_RUNTIME", INT32, 100, 0, drift=1)]
+
+
+def table_of(here: Rig) -> Table:
+    return here.server._storage.virtual.table
+
+
+def number(here: Rig, name: str) -> float:
+    return table_of(here).number(name, here.server.firmware.now)
+
+
+@asynccontextmanager
+async def vehicle(
+    profile: str, *, link: LinkSettings = LINKS[0], parameters: list[Parameter] | None = None
+) -> AsyncIterator[tuple[Rig, Tree]]:
+    async with rig(profile, {b"/fs/a": b"a"}, link=link) as here:
+        here.server._storage.virtual.table = Table(many() if parameters is None else parameters)
+        yield here, here.mount()
+
+
+@dataclass
+class Editor:
+    """A program, told from others by itself, that reads a text and saves it."""
+
+    tree: Tree
+    path: bytes = ALL
+    lines: list[str] = field(default_factory=list)
+
+    async def open(self, *, write: bool = False, truncate: bool = False, append: bool = False) -> OpenFile:
+        return await self.tree.open(
+            self.path, write=write, truncate=truncate, append=append, program=lambda: id(self)
+        )
+
+    async def read(self) -> Editor:
+        file = await self.open()
+        self.lines = bytes(await file.read(0, file.size)).decode().splitlines()
+        file.close()
+        return self
+
+    def edit(self, name: str, value: str) -> Editor:
+        found = [i for i, line in enumerate(self.lines) if line.partition(",")[0] == name]
+        assert len(found) == 1
+        self.lines[found[0]] = f"{name},{value}"
+        return self
+
+    async def save(self, text: str | None = None, *, append: bool = False) -> None:
+        content = "".join(line + "\n" for line in self.lines) if text is None else text
+        file = await self.open(write=True, truncate=not append, append=append)
+        try:
+            await file.write(0, content.encode())
+            await file.flush()
+        finally:
+            await file.release()
+            file.close()
+
+
+async def errors(tree: Tree) -> str:
+    return (await read_file(tree, ERRORS)).decode()
+
+
+def writes(here: Rig) -> int:
+    return here.count(Opcode.CREATE_FILE, Opcode.OPEN_FILE_WO, Opcode.WRITE_FILE)
+
+
+# --- reading
+
+
+@MARKS
+@pytest.mark.parametrize("link", LINKS, ids=lambda link: f"{link.loss:.0%}")
+async def test_reading_is_what_the_vehicle_has(profile: str, link: LinkSettings) -> None:
+    async with vehicle(profile, link=link, parameters=many(drifting=0)[:-1]) as (here, tree):
+        for path in (ALL, QGC):
+            lines, problems = parse((await read_file(tree, path)).decode())
+            assert problems == []
+            assert {line.name: line.value for line in lines}.keys() == {
+                one.name.decode() for one in table_of(here).visible(0)
+            }
+            for line in lines:
+                assert table_of(here).number(line.name, 0) == pytest.approx(line.value, rel=1e-6)
+        changed = parse((await read_file(tree, CHANGED)).decode())[0]
+        assert {line.name for line in changed} == {
+            one.name.decode() for one in table_of(here).visible(0) if one.default != one.value
+        }
+
+
+@MARKS
+async def test_one_download_serves_a_listing_and_the_opens_of_a_second(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        names = {name: stat.size for name, stat in await tree.list(b"/@PARAM")}
+        assert list(names) == [
+            *(b"param.pck", b"params.parm", b"changed.parm", b"params.params", b"last_error.txt")
+        ]
+        await trio.sleep(2)
+        before = here.count(Opcode.OPEN_FILE_RO)
+        for path in (ALL, QGC, CHANGED, PACKED):
+            await tree.stat(path)
+            file = await tree.open(path)
+            assert (await tree.stat(path)).size == file.size
+            file.close()
+        assert here.count(Opcode.OPEN_FILE_RO) == before + 1
+        await trio.sleep(2)
+        (await tree.open(ALL)).close()
+        assert here.count(Opcode.OPEN_FILE_RO) == before + 2
+
+
+async def test_size_and_time_stay_until_it_is_read_anew() -> None:
+    async with vehicle("ardupilot5", parameters=[parameter("COUNTER", INT32, 7, drift=1)]) as (here, tree):
+        before = await tree.stat(ALL)
+        await trio.sleep(100)
+        assert await tree.stat(ALL) == before
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
+        (await tree.open(ALL)).close()
+        assert (await tree.stat(ALL)).size == before.size + 2
+
+
+async def test_a_vehicle_that_tells_no_defaults_has_no_changed_parm() -> None:
+    async with vehicle("ardupilot5") as (here, tree):
+        here.faults.refuse(Opcode.OPEN_FILE_RO, NakCode.FILE_NOT_FOUND, nth=2)
+        names = {name for name, _ in await tree.list(b"/@PARAM")}
+        assert names == {b"param.pck", b"params.parm", b"params.params", b"last_error.txt"}
+        with pytest.raises(NotFound):
+            await tree.stat(CHANGED)
+
+
+async def test_a_damaged_download_is_read_again_and_then_an_error() -> None:
+    async with vehicle("px4-2026") as (here, tree):
+        good, damaged = table_of(here).download, 1
+
+        def lie(wanted: Selection, block: int, now: float) -> bytes:
+            broken = here.count(Opcode.OPEN_FILE_RO) <= damaged
+            return good(wanted, block, now)[: -3 if broken else None]
+
+        table_of(here).download = lie  # type: ignore[method-assign]
+        assert b"GAIN_001" in await read_file(tree, ALL)
+        damaged = 100
+        await trio.sleep(2)
+        with pytest.raises(RemoteProtocolError, match="ends before its last entry"):
+            await tree.open(ALL)
+
+
+# --- saving
+
+
+@MARKS
+@pytest.mark.parametrize("link", LINKS, ids=lambda link: f"{link.loss:.0%}")
+async def test_an_editor_sets_only_what_its_user_changed(profile: str, link: LinkSettings) -> None:
+    """Twenty values drift meanwhile: none is written back, and none is an error."""
+    async with vehicle(profile, link=link) as (here, tree):
+        editor = await Editor(tree).read()
+        await trio.sleep(30)
+        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
+        await editor.edit("GAIN_002", "0.5").edit("MODE_003", "77").save()
+        assert (number(here, "GAIN_002"), number(here, "MODE_003")) == (0.5, 77)
+        for one in table_of(here).visible(here.server.firmware.now):
+            if one.name not in (b"GAIN_002", b"MODE_003"):
+                assert one.number >= before[one.name], one.name
+                assert one.drift or one.number == before[one.name]
+        assert await errors(tree) == ""
+        assert "GAIN_002,0.5" in (await editor.read()).lines
+
+
+@MARKS
+async def test_a_file_unchanged_sends_nothing(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        for path in (ALL, QGC, CHANGED):
+            editor = await Editor(tree, path).read()
+            await trio.sleep(10)
+            asked = len(here.faults.requests)
+            await editor.save()
+            assert here.faults.requests[asked:].count(Opcode.OPEN_FILE_RO) <= 1  # of the open itself
+            assert writes(here) == 0
+
+
+@MARKS
+async def test_an_editor_that_reads_again_for_its_backup(profile: str) -> None:
+    """vim tries to make a file beside it, reads the file once more, and saves what it had read first."""
+    async with vehicle(profile) as (here, tree):
+        editor = await Editor(tree).read()
+        lines = list(editor.lines)
+        for changes in (0, 1):
+            await trio.sleep(20)
+            with pytest.raises(ReadOnly):
+                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: id(editor))
+            await editor.read()
+            editor.lines = list(lines)
+            if changes:
+                editor.edit("MODE_001", "5")
+            await editor.save()
+            assert here.count(Opcode.CREATE_FILE) == changes
+        assert number(here, "LEARNED_01") > 10
+
+
+async def test_what_a_program_reads_again_is_its_base() -> None:
+    """Others set it, the program saw that, and goes back to what it had read first."""
+    async with vehicle("px4-2026", parameters=many(drifting=0)[:-1]) as (here, tree):
+        editor = await Editor(tree).read()
+        first = list(editor.lines)
+        table_of(here).set(b"MODE_001", 9, here.server.firmware.now)
+        await trio.sleep(2)
+        await editor.read()
+        editor.lines = first
+        await editor.save()
+        assert number(here, "MODE_001") == 1
+
+
+async def test_an_editor_goes_back_and_forth_without_reading() -> None:
+    """nano keeps its text: what it saved before is no base for what it saves next."""
+    async with vehicle("ardupilot") as (here, tree):
+        editor = await Editor(tree).read()
+        for value in ("5", "1", "5"):
+            await editor.edit("MODE_001", value).save()
+            assert number(here, "MODE_001") == float(value)
+
+
+@MARKS
+async def test_a_copy_sets_all_that_does_not_hold(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        saved = (await read_file(tree, QGC)).decode()
+        for name in (b"GAIN_001", b"MODE_002"):
+            table_of(here).set(name, 50, here.server.firmware.now)
+        await trio.sleep(5)
+        await Editor(tree, QGC).save(saved.replace("\t1\tGAIN_005", "\t1\tGAIN_005"))
+        assert number(here, "GAIN_001") == pytest.approx(1 / 7)
+        assert number(here, "MODE_002") == 2
+        assert number(here, "STAT_RUNTIME") > 100
+        assert "STAT_RUNTIME" in await errors(tree)
+
+
+@MARKS
+async def test_only_appended_lines_count(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        editor = Editor(tree)
+        await editor.save("MODE_001,5\n", append=True)
+        await editor.save("# why\nMODE_001 6\n", append=True)
+        assert number(here, "MODE_001") == 6
+        file = await editor.open(write=True, append=True)
+        for value in (7, 8):
+            await file.write(0, b"MODE_001,%d\n" % value)
+            await file.flush()
+            assert number(here, "MODE_001") == value
+        await file.release()
+        await editor.save("STAT_RUNTIME,0\n", append=True)
+        assert number(here, "STAT_RUNTIME") < 50
+
+
+async def test_a_file_opened_for_both_is_changed_in_place() -> None:
+    async with vehicle("ardupilot5") as (here, tree):
+        editor = Editor(tree)
+        file = await editor.open(write=True)
+        text = bytes(await file.read(0, file.size))
+        at = text.index(b"MODE_001,1\n")
+        await file.write(at + len(b"MODE_001,"), b"4")
+        await trio.sleep(10)
+        await file.fsync()
+        assert number(here, "MODE_001") == 4
+        assert bytes(await file.read(at, 11)) == b"MODE_001,4\n"
+        assert b"MODE_001,4" in await read_file(tree, ALL)
+        await file.release()
+        assert here.count(Opcode.WRITE_FILE) == 1
+
+
+async def test_a_file_that_is_emptied_after_the_open_has_no_other_base() -> None:
+    """vim opens without O_TRUNC, and then cuts."""
+    async with vehicle("ardupilot") as (here, tree):
+        editor = await Editor(tree).read()
+        await trio.sleep(20)
+        file = await editor.open(write=True)
+        await file.truncate(0)
+        await file.write(0, "".join(line + "\n" for line in editor.lines).encode())
+        await file.flush()
+        assert writes(here) == 0
+
+
+async def test_nobody_sees_a_text_before_it_is_saved() -> None:
+    async with vehicle("px4-2026") as (_, tree):
+        whole = await read_file(tree, ALL)
+        file = await Editor(tree).open(write=True, truncate=True)
+        await file.write(0, b"MODE_001,9\n")
+        assert await read_file(tree, ALL) == whole
+        await file.flush()
+        assert b"MODE_001,9\n" in await read_file(tree, ALL)
+
+
+# --- what is refused
+
+
+BAD = [
+    ("MODE_001,x\n", "params.parm:1: 'x' is not a number"),
+    ("MODE_001,1\nMODE_001,2\n", "params.parm:2: MODE_001 has another value on line 1"),
+    ("\n# c\nNO_SUCH,1\n", "params.parm:3: the vehicle has no parameter NO_SUCH"),
+    ("MODE_001,2.9\n", "params.parm:1: MODE_001: 2.9 is not a whole number"),
+    ("MODE_001,3000000000\n", "params.parm:1: MODE_001: 3000000000 does not fit"),
+    ("GAIN_001,1e39\n", "params.parm:1: GAIN_001: 1e+39 is too large"),
+    ("rubbish\n", "params.parm:1: 'rubbish' is not NAME,VALUE"),
+    ("MODE_002,9\n\xff\n", "params.parm:2: this is no text"),
+    ("1\t7\tMODE_001\t5\t6\n", "params.parm:1: MODE_001 is a parameter of component 7"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD)
+async def test_bad_lines_are_named_and_nothing_is_sent(text: str, said: str) -> None:
+    async with vehicle("ardupilot") as (here, tree):
+        file = await Editor(tree).open(write=True, truncate=True)
+        good = b"MODE_005,50\n"
+        await file.write(0, text.encode("latin-1") + good)
+        for _ in range(2):
+            with pytest.raises(InvalidText) as caught:
+                await file.flush()
+            assert errno_for(caught.value) == 22
+        await file.release()
+        assert said in await errors(tree)
+        assert writes(here) == 0
+        await Editor(tree).save(good.decode())
+        assert await errors(tree) == ""
+
+
+@MARKS
+async def test_half_a_last_line_sets_nothing_and_may_be_finished(profile: str) -> None:
+    """A child that a program forks flushes what it inherits."""
+    async with vehicle(profile) as (here, tree):
+        file = await Editor(tree).open(write=True, truncate=True)
+        await file.write(0, b"MODE_001,5\nMODE_002,7")
+        with pytest.raises(InvalidText):
+            await file.flush()
+        assert writes(here) == 0
+        assert "params.parm:2" in await errors(tree)
+        await file.write(21, b"7\n")
+        await file.flush()
+        assert (number(here, "MODE_001"), number(here, "MODE_002")) == (5, 77)
+        half = await Editor(tree).open(write=True, truncate=True)
+        await half.write(0, b"MODE_001,6")
+        await half.release()
+        assert number(here, "MODE_001") == 5
+
+
+STUBBORN = [
+    parameter("CLAMPED", FLOAT, 1, limits=(0, 10)),
+    parameter("FIXED", INT32, 3, read_only=True),
+    parameter("FREE", INT32, 1),
+    parameter("RUNNING", INT32, 0, drift=1),
+]
+
+
+@MARKS
+async def test_what_the_vehicle_changes_or_refuses_is_named(profile: str) -> None:
+    async with vehicle(profile, parameters=STUBBORN) as (here, tree):
+        for name, wanted, got in (("CLAMPED", "70", "10"), ("FIXED", "4", "3")):
+            with pytest.raises(NotTaken, match=f"{name}: wanted {wanted}, got {got}") as caught:
+                await Editor(tree).save(f"FREE,{wanted}\n{name},{wanted}\n")
+            assert errno_for(caught.value) == 5
+            said = await errors(tree)
+            assert f"{name}: wanted {wanted}, got {got}" in said
+            assert "set: FREE" in said
+            assert number(here, "FREE") == float(wanted)
+
+
+@MARKS
+async def test_a_line_changed_here_and_there_names_both_values(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        editor = await Editor(tree).read()
+        table_of(here).set(b"MODE_001", 50, here.server.firmware.now)
+        await trio.sleep(2)
+        with pytest.raises(NotTaken, match="MODE_001: it was 1 and has become 50"):
+            await editor.edit("MODE_001", "9").edit("MODE_002", "9").save()
+        assert writes(here) == 0
+        assert (number(here, "MODE_001"), number(here, "MODE_002")) == (50, 2)
+        await (await editor.read()).edit("MODE_001", "9").save()
+        assert number(here, "MODE_001") == 9
+
+
+@MARKS
+async def test_nothing_is_set_in_flight_nor_after_it(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        early = await Editor(tree).open(write=True, truncate=True)
+        await early.write(0, b"MODE_001,9\n")
+        await here.arm()
+        with pytest.raises(Armed) as caught:
+            await early.flush()
+        assert errno_for(caught.value) == 30
+        await early.release()
+        with pytest.raises(Armed):
+            await Editor(tree).open(write=True)
+        assert "armed" in await errors(tree)
+        assert b"MODE_001,1\n" in await read_file(tree, ALL)
+        await here.disarm()
+        await trio.sleep(120)
+        assert writes(here) == 0
+        assert number(here, "MODE_001") == 1
+
+
+@MARKS
+async def test_arming_in_the_middle_ends_it(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        here.faults.at(Opcode.WRITE_FILE, here.world.vehicle.arm, nth=5)
+        with pytest.raises(Armed):
+            await Editor(tree).save("".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(300)))
+        took = sum(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300))
+        assert took < 300
+        await here.disarm()
+        await trio.sleep(120)
+        assert sum(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300)) == took
+
+
+async def test_with_when_armed_ok_it_is_set_in_flight() -> None:
+    async with vehicle("px4-2026") as (here, _):
+        tree = here.mount(write_armed=True)
+        here.connection.vehicle.write_armed = True
+        await here.arm()
+        await Editor(tree).save("MODE_001,9\n")
+        assert number(here, "MODE_001") == 9
+
+
+@MARKS
+@pytest.mark.parametrize(
+    ("opcode", "nth"),
+    [
+        *((Opcode.OPEN_FILE_RO, 1), (Opcode.CREATE_FILE, 1), (Opcode.WRITE_FILE, 1), (Opcode.WRITE_FILE, 7)),
+        *((Opcode.TERMINATE_SESSION, 2), (Opcode.READ_FILE, 22)),
+    ],
+)
+async def test_cut_in_the_middle(profile: str, opcode: Opcode, nth: int) -> None:
+    """What took is said, and the next save completes it; half a value is never set."""
+    text = "".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(300))
+    async with vehicle(profile) as (here, tree):
+        await tree.stat(ALL)
+        await trio.sleep(2)
+        before = {one.name: one.number for one in table_of(here).visible(0)}
+        here.faults.at(opcode, here.world.link.cut, nth=nth)
+        with pytest.raises((RequestTimeout, VehicleLost)):
+            await Editor(tree).save(text)
+        assert "set" in await errors(tree)
+        await here.find()
+        await trio.sleep(60)
+        for i in range(300):
+            assert number(here, f"GAIN_{i:03}") in (i + 0.5, before[b"GAIN_%03d" % i])
+        await Editor(tree).save(text)
+        assert all(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300))
+        assert await errors(tree) == ""
+
+
+@MARKS
+async def test_a_refused_upload_that_was_set_in_part_is_said(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        here.faults.refuse(Opcode.WRITE_FILE, NakCode.FAIL, nth=4)
+        text = "".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(100))
+        with pytest.raises(MavftpfsError):
+            await Editor(tree).save(text)
+        said = await errors(tree)
+        took = {name for name in said.rpartition("set: ")[2].strip().split(", ") if name != "nothing"}
+        assert took == {f"GAIN_{i:03}" for i in range(100) if number(here, f"GAIN_{i:03}") == i + 0.5}
+        await Editor(tree).save(text)
+        assert all(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(100))
+
+
+@MARKS
+async def test_two_writers_at_once_save_one_after_the_other(profile: str) -> None:
+    async with vehicle(profile) as (here, tree):
+        first, second = await Editor(tree).read(), await Editor(tree).read()
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(first.edit("MODE_001", "11").save)
+            nursery.start_soon(second.edit("MODE_002", "12").save)
+        assert (number(here, "MODE_001"), number(here, "MODE_002")) == (11, 12)
+        opcodes = [op for op in here.faults.requests if op in (Opcode.CREATE_FILE, Opcode.OPEN_FILE_RO)]
+        creates = [place for place, op in enumerate(opcodes) if op == Opcode.CREATE_FILE]
+        assert len(creates) == 2
+        assert creates[1] > creates[0] + 1  # the first was read back before the second began
+
+
+async def test_names_beside_the_texts_are_refused() -> None:
+    async with vehicle("ardupilot") as (_, tree):
+        for name in (b"sedXyz", b"params.parm~", b".params.parm.swp"):
+            with pytest.raises(ReadOnly):
+                await tree.create(b"/@PARAM/" + name, exclusive=True)
+        for change in (tree.unlink(ALL), tree.rename(ALL, b"/@PARAM/x"), tree.mkdir(b"/@PARAM/d")):
+            with pytest.raises(ReadOnly):
+                await change
+        for path in (PACKED, ERRORS):
+            with pytest.raises(ReadOnly):
+                await tree.open(path, write=True, truncate=True)
+        with pytest.raises((ReadOnly, AlreadyExists)):
+            await tree.create(ALL, exclusive=True)
+
+
+async def test_a_mount_that_is_read_only_shows_them() -> None:
+    async with vehicle("ardupilot") as (here, _):
+        tree = here.mount(read_only=True)
+        assert b"MODE_001,1\n" in await read_file(tree, ALL)
+        with pytest.raises(ReadOnly):
+            await tree.open(ALL, write=True)
