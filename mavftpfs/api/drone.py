@@ -72,8 +72,8 @@ class Drone:
         """Have it closed, and wait for nothing."""
         loop = getattr(self, "_loop", None)
         if loop is not None and not loop.closed:
-            warnings.warn(f"{self!r} was not closed", ResourceWarning, stacklevel=2, source=self)
             loop.stop()
+            warnings.warn(f"{self!r} was not closed", ResourceWarning, stacklevel=2, source=self)
 
     def __repr__(self) -> str:
         return f"<Drone {self.source}>"

@@ -34,7 +34,7 @@ def os_error(error: MavftpfsError) -> Exception:
     """
     number, text = _number(error), readable(str(error))
     if isinstance(error, errors.NotDelivered):
-        told = _undelivered(type(OSError(number, text)))(number, f"{text} ({_whereabouts(error.there)})")
+        told = _undelivered(type(OSError(number, text)))(number, f"{text} ({whereabouts(error.there)})")
         told.on_vehicle = error.there
         return told
     if isinstance(error, UsageError) and not isinstance(error.__cause__, OSError):
@@ -52,7 +52,8 @@ def translated() -> Iterator[None]:
         raise told from (None if isinstance(told, UsageError) else exc)
 
 
-def _whereabouts(there: bool | None) -> str:
+def whereabouts(there: bool | None) -> str:
+    """Return what is said of a file that was not delivered; see NotDelivered.on_vehicle."""
     if there is None:
         return "nobody can tell what is on the vehicle now: look before you use it"
     if there:

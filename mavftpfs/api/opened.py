@@ -18,7 +18,8 @@ class Opened:
     """An open file. All raise OSErrors (see api.errors), and run in the event loop but `size`.
 
     Attributes:
-        name: for people. writable: whether it may be changed by this.
+        name: for people. writable: whether it may be changed by this. there: after a close that was
+            interrupted, as NotDelivered.on_vehicle.
     """
 
     def __init__(self, name: str, file: File, *, writable: bool, forget: Callable[[Opened], None]) -> None:
@@ -28,6 +29,8 @@ class Opened:
         self._file = file
         self._forget = forget
         self._failure: BaseException | None = None
+        self._closed = False
+        self.there: bool | None = None
 
     @property
     def size(self) -> int:
@@ -72,14 +75,20 @@ class Opened:
         Raises:
             NotDelivered.
         """
+        if self._closed:
+            return
+        self._closed = True
         self._forget(self)
         with translated():
             if self.writable:
-                async with written(self._file):
+                async with written(self._file, self._on_taken_back):
                     self._require_whole()
             else:
                 with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
                     await self._file.release()
+
+    def _on_taken_back(self, there: bool | None) -> None:
+        self.there = there
 
     def _require_whole(self) -> None:
         """A part of what was to be written is not to pass for the whole."""
@@ -89,7 +98,11 @@ class Opened:
             raise MavftpfsError(f"{self.name}: writing it was interrupted")
 
     async def abandon(self) -> None:
-        """Close it without delivering what was written, which is withdrawn. Raises nothing of ours."""
+        """Close it without delivering what was written, which is withdrawn. Twice is harmless; raises nothing
+        of ours."""
+        if self._closed:
+            return
+        self._closed = True
         self._forget(self)
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             await self._file.give_up()

@@ -14,7 +14,7 @@ import os
 import warnings
 from typing import IO, Any
 
-from mavftpfs.api.errors import NotDelivered
+from mavftpfs.api.errors import NotDelivered, whereabouts
 from mavftpfs.api.opened import Opened
 from mavftpfs.api.portal import Portal
 
@@ -160,9 +160,7 @@ class RawFile(_Ending, io.RawIOBase):
             self._portal.call(self._opened.close)
         except KeyboardInterrupt as exc:
             if self._mode.writes:
-                exc.add_note(
-                    f"{self.name} was being delivered: look what is on the vehicle before you use it"
-                )
+                exc.add_note(f"{self.name} was not closed: {whereabouts(self._opened.there)}")
             raise
 
     def __del__(self) -> None:
@@ -171,10 +169,10 @@ class RawFile(_Ending, io.RawIOBase):
             return
         super().close()
         lost = ": what was written to it is withdrawn" if self._mode.writes else ""
-        warnings.warn(f"{self.name} was not closed{lost}", ResourceWarning, stacklevel=2, source=self)
+        self._portal.post(self._opened.abandon)
         if lost:
             log.error("%s was not closed%s", self.name, lost)
-        self._portal.post(self._opened.abandon)
+        warnings.warn(f"{self.name} was not closed{lost}", ResourceWarning, stacklevel=2, source=self)
 
     def _require(self, allowed: bool, what: str) -> None:
         if self.closed:

@@ -17,6 +17,7 @@ from mavftpfs.api.errors import os_error, translated
 from mavftpfs.api.opened import Opened
 from mavftpfs.api.portal import TaskPortal
 from mavftpfs.api.pythonfile import Mode, python_file
+from mavftpfs.api.triofile import AsyncFile
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client import download, names, upload
 from mavftpfs.client.connect import attached, open_sinks, plain_nursery
@@ -336,7 +337,7 @@ class Drone:
         encoding: str | None = None,
         errors: str | None = None,
         newline: str | None = None,
-    ) -> Any:
+    ) -> AsyncFile:
         """Open a file as the builtin does; its methods are async, as those of trio.open_file.
 
         Text is UTF-8 unless `encoding` says otherwise. What was written is on the card, checked, when
@@ -350,7 +351,7 @@ class Drone:
         build = partial(
             python_file, opened, TaskPortal(self._nursery), how, buffering, encoding, errors, newline
         )
-        return trio.wrap_file(await trio.to_thread.run_sync(build))
+        return AsyncFile(await trio.to_thread.run_sync(build), opened)
 
     async def open_raw(self, path: PathLike, mode: str) -> Opened:
         """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""

@@ -130,8 +130,12 @@ async def reading(files: Files, path: bytes) -> AsyncIterator[File]:
 
 
 @asynccontextmanager
-async def written(file: File) -> AsyncIterator[None]:
+async def written(
+    file: File, tell: Callable[[bool | None], None] = lambda there: None
+) -> AsyncIterator[None]:
     """Write a file in the body: then it is delivered, else taken back, and closed in any case.
+
+    tell: hears what `File.give_up` returned, also where an interruption ends the body.
 
     Raises:
         NotDelivered: it is not delivered; its cause says why, and `there` what is on the card instead.
@@ -143,6 +147,7 @@ async def written(file: File) -> AsyncIterator[None]:
         there: bool | None = None
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             there = await file.give_up()
+        tell(there)
         if isinstance(exc, errors.MavftpfsError):
             raise errors.NotDelivered(str(exc), there=there) from exc
         raise

@@ -27,6 +27,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotDelivered,
     NotFound,
+    RequestTimeout,
     UsageError,
 )
 from mavftpfs.shared.model import join, normalise, split
@@ -133,7 +134,8 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
         told = f"{name} was not delivered: {reason}{done}"
         if isinstance(exc, NotFound | NotADirectory):
             raise type(exc)(told) from exc
-        raise NotDelivered(told, there=exc.there if isinstance(exc, NotDelivered) else None) from exc
+        there = exc.there if isinstance(exc, NotDelivered) else False  # nothing was written yet
+        raise NotDelivered(told, there=there) from exc
     progress.end(planned)
     return size
 
@@ -159,10 +161,12 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
         size = await _copy(source, file)
     try:
         await files.rename(beside, remote)
-    except BaseException:
+    except BaseException as exc:
         with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
             patience.shield = True
             await files.unlink(beside)
+        if isinstance(exc, RequestTimeout):
+            raise NotDelivered(str(exc), there=None) from exc
         raise
     return size
 
