@@ -208,6 +208,23 @@ def _sync_parser(name: str) -> Parser:
         help="only compare what is here by CRC32 with the vehicle; exit code 1 if something differs",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
+    instead.add_argument(
+        "--watch",
+        action="store_true",
+        help="stay, and bring the new logs after each flight, of whoever comes",
+    )
+    parser.add_argument(
+        "--exec",
+        dest="command",
+        metavar="COMMAND",
+        help="with --watch: run it for each log that came, with the file as its last argument",
+    )
+    parser.add_argument(
+        "--by-sysid", action="store_true", help="with --watch: name directories by system ids, not unique ids"
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="with --watch: also what was brought before and was moved away"
+    )
     _add_verify(parser)
     return parser
 

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import trio
 
-from mavftpfs.cli import drawing
+from mavftpfs.cli import drawing, watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line
 from mavftpfs.cli.report import count_files
 from mavftpfs.client import download, names, upload
@@ -130,6 +130,10 @@ def sync(args: Args) -> int:
         (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since)
     wish = download.Wish(Path(args.local), place, args.newest, since, args.dry_run)
+    if args.watch:
+        return watching.watch(args, wish, lambda work: run(args, work, component))
+    if args.command is not None or args.again or args.by_sysid:
+        raise UsageError("--exec, --again and --by-sysid go with --watch")
     outcome = download.Outcome()
     tell = _ignore if args.json else _tell
     error: MavftpfsError | None = None

@@ -15,6 +15,9 @@ from typing import Any
 NAME = ".mavftpfs-logs"
 """Of the file."""
 
+HEAD = 4096
+"""Bytes by which logs of one name and size are told apart where no time tells them."""
+
 _SPARE = 100
 """Lines that no longer count, beyond which the file is written anew."""
 
@@ -24,7 +27,8 @@ class Brought:
     """A log that was brought. path: on the vehicle; vehicle: its unique id, None if that was not asked for;
     file: below the local directory; size: bytes; mtime: seconds UTC, None if unknown.
 
-    proven: its checksum was compared, or did not need to be.
+    head: the CRC32 of its first HEAD bytes, None if that was not noted. proven: its checksum was compared, or
+    did not need to be. handed_on: nothing more is to be done with it.
     """
 
     path: str
@@ -32,7 +36,9 @@ class Brought:
     size: int
     mtime: int | None
     vehicle: str | None = None
+    head: int | None = None
     proven: bool = True
+    handed_on: bool = True
 
 
 Key = tuple[str | None, str]
@@ -56,6 +62,22 @@ class Memory:
     def of(self, vehicle: str | None, path: str) -> Brought | None:
         """Return what is known of a log."""
         return self._logs.get((vehicle, path))
+
+    def logs(self) -> list[Brought]:
+        """Return all logs that are known."""
+        return list(self._logs.values())
+
+    def begin(self) -> None:
+        """Have the file be there, by which the directory is known again.
+
+        Raises:
+            OSError: the local disk does not take it.
+        """
+        self._place.touch()
+
+    def is_there(self) -> bool:
+        """Return whether the file is there."""
+        return self._place.exists()
 
     def note(self, log: Brought) -> None:
         """Remember a log, in place of what was known of it.

@@ -201,37 +201,54 @@ async def attached(
     """
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
-    writing = writing and not options.read_only
     async with opened(spec, settings) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
-        caches = replace(cache_options(options, spec), read_only=not writing)
-        keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
-        async with plain_nursery() as nursery:
-            with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
-                notice: Callable[[], str] = str
-                if spool is not None and rescue_for is not None:
-                    notice = partial(rescue, spool, rescue_for)
-                tree = Tree(
-                    connection.store,
-                    caches,
-                    clock=trio.current_time,
-                    invalidate=invalidate,
-                    nursery=nursery,
-                    spool=spool,
-                    rng=SystemRandom(),
-                    keep=keep,
-                )
-                subscribe(connection, tree)
-                if list_root:
-                    await _list_root(connection, tree, deadline, options)
-                try:
-                    yield Attached(connection, tree, Watcher(connection.status, writing=writing), notice)
-                    await tree.tidy_up()
-                finally:
-                    connection.news.clear()  # the tree can begin nothing while the session is closed
-                    if spool is not None and (rescue_for is None or not tree.undelivered()):
-                        spool.discard()
+        async with with_tree(
+            connection, spec, options, invalidate=invalidate, writing=writing, rescue_for=rescue_for
+        ) as vehicle:
+            if list_root:
+                await _list_root(connection, vehicle.tree, deadline, options)
+            yield vehicle
+
+
+@asynccontextmanager
+async def with_tree(
+    connection: Connection,
+    spec: LinkSpec,
+    options: Options,
+    *,
+    invalidate: Callable[[bytes], None] = lambda path: None,
+    writing: bool = False,
+    rescue_for: str | None = None,
+) -> AsyncIterator[Attached]:
+    """Give a connected vehicle's files for the length of the body; arguments as of `attached`."""
+    writing = writing and not options.read_only
+    caches = replace(cache_options(options, spec), read_only=not writing)
+    keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
+    async with plain_nursery() as nursery:
+        with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
+            notice: Callable[[], str] = str
+            if spool is not None and rescue_for is not None:
+                notice = partial(rescue, spool, rescue_for)
+            tree = Tree(
+                connection.store,
+                caches,
+                clock=trio.current_time,
+                invalidate=invalidate,
+                nursery=nursery,
+                spool=spool,
+                rng=SystemRandom(),
+                keep=keep,
+            )
+            subscribe(connection, tree)
+            try:
+                yield Attached(connection, tree, Watcher(connection.status, writing=writing), notice)
+                await tree.tidy_up()
+            finally:
+                connection.news.clear()  # the tree can begin nothing while the session is closed
+                if spool is not None and (rescue_for is None or not tree.undelivered()):
+                    spool.discard()
 
 
 def process_name() -> str:

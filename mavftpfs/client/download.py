@@ -200,24 +200,11 @@ class Downloads:
     async def _logs(self, wish: Wish) -> list[Wanted]:
         """Look what logs there are; return those that are wished for, the newest first."""
         session = self.fetcher.session
-        if wish.local.exists() and not wish.local.is_dir():
-            raise UsageError(f"{wish.local} is a file; the logs go into a directory")
-        if wish.place is None:
-            place, found, unlisted = await find_logs(session)
-        else:
-            place = wish.place
-            if (await session.files.stat(place)).kind is EntryKind.FILE:
-                raise NotADirectory(f"{name_text(place)} is a file; get it with `mavftpfs get`")
-            found, unlisted = await walk(session.files, place)
+        place, logs, unlisted = await wanted_logs(session, wish, wish.local)
         self.outcome.place = session.on_vehicle(place)
         for path, error in unlisted:
             self.fail(path, error)
-        logs = [
-            _wanted(join(place, below), wish.local / os.fsdecode(below), below, stat, keep_old=True)
-            for below, stat in found
-            if stat.kind is EntryKind.FILE
-        ]
-        return _apart(select(newest_first(logs), newest=wish.newest, since=wish.since))
+        return logs
 
     def _to_be_proven(self, log: Wanted, memory: Memory) -> bool:
         """Return whether a log that is here is compared: all are to be, or its checksum could not be had."""
@@ -363,6 +350,36 @@ def _apart(wanted: Sequence[Wanted]) -> list[Wanted]:
 
 
 # -- logs -----------------------------------------------------------------------------------------
+
+
+def _require_no_file(local: Path) -> None:
+    if local.exists() and not local.is_dir():
+        raise UsageError(f"{local} is a file; the logs go into a directory")
+
+
+async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes, list[Wanted], Unlisted]:
+    """Return where the logs are, those that are wished for, the newest first, and what could not be listed.
+
+    local: the directory into which they are to go.
+
+    Raises:
+        NotFound: there is no directory of logs. NotADirectory, UsageError: a file is where a directory is to
+        be. Else as `walk`.
+    """
+    _require_no_file(local)
+    if wish.place is None:
+        place, found, unlisted = await find_logs(session)
+    else:
+        place = wish.place
+        if (await session.files.stat(place)).kind is EntryKind.FILE:
+            raise NotADirectory(f"{name_text(place)} is a file; get it with `mavftpfs get`")
+        found, unlisted = await walk(session.files, place)
+    logs = [
+        _wanted(join(place, below), local / os.fsdecode(below), below, stat, keep_old=True)
+        for below, stat in found
+        if stat.kind is EntryKind.FILE
+    ]
+    return place, _apart(select(newest_first(logs), newest=wish.newest, since=wish.since)), unlisted
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:

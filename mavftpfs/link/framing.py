@@ -37,11 +37,13 @@ from mavftpfs.link.messages import (
     MAV_MODE_FLAG_SAFETY_ARMED,
     Address,
     AutopilotVersion,
+    CommandAck,
     CommandLong,
     FtpRun,
     Heartbeat,
     Message,
     Other,
+    StatusText,
     StorageInformation,
     SystemTime,
 )
@@ -61,7 +63,7 @@ HIGHEST_ID = 0xFFFF
 """No public dialect goes beyond; keeps garbage from claiming 280 bytes."""
 _UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
 _MAGIC = re.compile(b"[\xfd\xfe]")
-_READABLE = frozenset((0, 2, 76, 110, 148, 261))  # the ids of messages whose fields matter
+_READABLE = frozenset((0, 2, 76, 77, 110, 148, 253, 261))  # the ids of messages whose fields matter
 _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
 
 
@@ -292,6 +294,8 @@ class Framer:
                     params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
                     target = Address(m.target_system, m.target_component)
                     message = CommandLong(source, target, m.command, params)
+                case 77:
+                    message = CommandAck(source, m.command, m.result)
                 case 110:
                     target = Address(m.target_system, m.target_component)
                     message = FtpRun(source, target, [bytes(m.payload)])
@@ -299,6 +303,8 @@ class Framer:
                     git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
                     version = (m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)
                     message = AutopilotVersion(source, *version)
+                case 253:
+                    message = StatusText(source, str(m.text).partition("\0")[0])
                 case 261:
                     size = (m.total_capacity, m.used_capacity, m.available_capacity)
                     message = StorageInformation(source, m.storage_id, m.storage_count, m.status, *size)

@@ -102,6 +102,39 @@ class CommandLong:
     params: tuple[float, ...]
 
 
+MAV_CMD_COMPONENT_ARM_DISARM = 400
+_ACCEPTED, _IN_PROGRESS = 0, 5
+_DENIALS = ("Arm: ", "Arming denied")
+"""How the texts begin by which ArduPilot and PX4 refuse to be armed. "PreArm: " comes every 30 s unasked."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAck:
+    """COMMAND_ACK; result: MAV_RESULT."""
+
+    source: Address
+    command: int
+    result: int
+
+    @property
+    def refuses_to_arm(self) -> bool:
+        """Whether somebody wanted to arm or disarm the vehicle, and it does not."""
+        return self.command == MAV_CMD_COMPONENT_ARM_DISARM and self.result not in (_ACCEPTED, _IN_PROGRESS)
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """STATUSTEXT, or the first part of a long one."""
+
+    source: Address
+    text: str
+
+    @property
+    def refuses_to_arm(self) -> bool:
+        """Whether it says that the vehicle is not armed though somebody wanted it."""
+        return self.text.startswith(_DENIALS)
+
+
 @dataclass(frozen=True, slots=True)
 class Other:
     """Any other valid message."""
@@ -111,5 +144,13 @@ class Other:
 
 
 Message: TypeAlias = (
-    FtpRun | Heartbeat | AutopilotVersion | StorageInformation | SystemTime | CommandLong | Other
+    FtpRun
+    | Heartbeat
+    | AutopilotVersion
+    | StorageInformation
+    | SystemTime
+    | CommandLong
+    | CommandAck
+    | StatusText
+    | Other
 )

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from math import inf
 from typing import Any, Literal
 
@@ -123,7 +124,7 @@ class Connection:
         return VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
-        """Have `listener` called with "reboot", "armed", "disarmed" or "back"."""
+        """Have `listener` called with "reboot", "armed", "disarmed", "arming refused" or "back"."""
         self.news.append(listener)
 
     def status(self) -> dict[str, dict[str, Any]]:
@@ -382,6 +383,7 @@ def _build(
     vehicle.on_foreign = connection._on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat
     vehicle.on_armed = connection._on_armed
+    vehicle.on_refusal = partial(connection._tell, "arming refused")
     vehicle.on_double = connection._move_away
     vehicle.identity.on_doubt = connection._on_doubt
     return connection

@@ -23,9 +23,11 @@ from mavftpfs.link.messages import (
     MAV_PROTOCOL_CAPABILITY_FTP,
     Address,
     AutopilotVersion,
+    CommandAck,
     FtpRun,
     Heartbeat,
     Message,
+    StatusText,
     StorageInformation,
     SystemTime,
 )
@@ -186,7 +188,7 @@ class Vehicle:
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
     own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
-    another client's, and whether none was heard for a while.
+    another client's, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
@@ -201,6 +203,7 @@ class Vehicle:
     on_foreign: Callable[[bytes, bool], None] = lambda payload, newcomer: None
     on_heartbeat: Callable[[], None] = lambda: None
     on_armed: Callable[[bool], None] = lambda armed: None
+    on_refusal: Callable[[], None] = lambda: None
     on_double: Callable[[], None] = lambda: None
     address: Address | None = None
     heartbeat: Heartbeat | None = None
@@ -314,6 +317,8 @@ class Vehicle:
                     self.storage = message
             case SystemTime() if message.source == self.address:
                 self._on_boot_time(message.time_boot_ms, now)
+            case CommandAck() | StatusText() if message.refuses_to_arm:
+                self.on_refusal()
 
     def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:
         """Learn from one, in this order: who is about, which of them is the vehicle, whether that is armed,

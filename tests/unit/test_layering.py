@@ -60,6 +60,7 @@ PURE_MODULES = {
     "cache.readahead",
     "cache.reserved",
     "cache.draft",
+    "client.flights",
     "client.options",
     "hub.outbox",
     "hub.routing",

@@ -1,0 +1,99 @@
+"""`mavftpfs sync --watch`: what it prints, and the command that it runs for each log. Layer: cli."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import trio
+
+from mavftpfs.cli import drawing
+from mavftpfs.client.download import Wish
+from mavftpfs.client.files import Target
+from mavftpfs.client.progress import Progress
+from mavftpfs.client.watch import Watch, WatchWish
+from mavftpfs.shared.errors import ExitCode, UsageError
+from mavftpfs.shared.readable import readable, readable_time
+
+EXEC_LIMIT = 600.0
+"""Seconds for the command of --exec."""
+_KILL_AFTER = 5.0
+"""Seconds between SIGTERM and SIGKILL."""
+
+
+Work = Callable[[Target], Coroutine[Any, Any, None]]
+
+
+def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> int:
+    """Bring logs until SIGINT or SIGTERM; run: runs what is done with SOURCE.
+
+    Raises:
+        UsageError: LOCAL or the options are wrong.
+    """
+    if args.json:
+        raise UsageError("--watch prints lines; leave out --json")
+    hand_on = None if args.command is None else partial(run_command, args.command, limit=EXEC_LIMIT)
+    wanted = WatchWish(wish, args.verify, args.by_sysid, args.again)
+    bar = Progress()
+
+    async def work(target: Target) -> None:
+        await Watch(wanted, say, hand_on, bar).run(target)
+
+    try:
+        with drawing.shown(bar):
+            say(f"waiting for vehicles on {args.source}; Ctrl-C ends it")
+            run(work)
+    except KeyboardInterrupt:
+        say("ended; the next run goes on")
+    return ExitCode.OK
+
+
+def say(line: str) -> None:
+    """Print a line; with the time where nobody else adds it."""
+    when = f"{time.strftime('%H:%M:%S')} " if sys.stdout.isatty() else ""
+    print(f"{when}{readable(line)}", flush=True)
+
+
+async def run_command(command: str, file: Path, *, limit: float) -> str:
+    """Run a command of the shell for a file, which is its last argument; return why it did not work, or "".
+
+    limit: seconds after which it is ended, with all that it started.
+    """
+    words = ["/bin/sh", "-c", f'{command} "$@"', "sh", os.fspath(file)]
+    try:
+        process = await trio.lowlevel.open_process(words, stdin=subprocess.DEVNULL, start_new_session=True)
+    except OSError as exc:
+        return f"--exec cannot be run: {exc.strerror}"
+    try:
+        with trio.move_on_after(limit):
+            code = await process.wait()
+            return "" if code == 0 else f"--exec ended with exit code {code}"
+        return f"--exec took longer than {readable_time(limit)} and was ended"
+    finally:
+        with trio.CancelScope(shield=True):
+            await _end(process)
+
+
+async def _end(process: trio.Process) -> None:
+    """End a command and what it started."""
+    if process.returncode is None:
+        _signal(process, signal.SIGTERM)
+        with trio.move_on_after(_KILL_AFTER):
+            await process.wait()
+    if process.returncode is None:
+        _signal(process, signal.SIGKILL)
+        await process.wait()
+
+
+def _signal(process: trio.Process, number: signal.Signals) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, number)

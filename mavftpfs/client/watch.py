@@ -1,0 +1,399 @@
+"""Bringing logs home by themselves: connects, looks, fetches and lets go as `flights` decides. Layer: client.
+
+One task hears of the vehicles, another does what is to be done, one thing at a time, and a third hands on
+what came. A transfer lets go by leaving the connection, which closes the server's session.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+
+import trio
+
+from mavftpfs.client.brought import HEAD, Brought, Memory
+from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
+from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
+from mavftpfs.client.download import Wish, named, wanted_logs
+from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
+from mavftpfs.client.files import Session, Target, reading
+from mavftpfs.client.flights import Fetch, Log, Look, Policy, Wait
+from mavftpfs.client.options import Options
+from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import Verify
+from mavftpfs.link.base import Link
+from mavftpfs.link.uri import LinkSpec
+from mavftpfs.protocol.payload import crc32
+from mavftpfs.session.connection import connected
+from mavftpfs.shared.errors import LinkError, MavftpfsError, NotFound
+from mavftpfs.shared.readable import readable_size
+
+REOPEN = 5.0
+"""Seconds until a link that cannot be opened is tried again."""
+SPARE = 1 << 20
+"""Bytes that are left free on the local disk."""
+
+HandOn = Callable[[Path], Awaitable[str]]
+"""Does something with a log that came; returns why that did not work, or ""."""
+
+
+@dataclass(frozen=True, slots=True)
+class WatchWish:
+    """What is to be brought. logs: as `sync` has it; by_system: directories are named by system ids; again:
+    also what was brought before and is here no more."""
+
+    logs: Wish
+    verify: Verify = "auto"
+    by_system: bool = False
+    again: bool = False
+
+
+class Watch:
+    """Brings the logs of whoever comes, into a directory for each. say: hears of it, in lines for people.
+
+    Raises:
+        UsageError: of `begin`: the directory cannot be used.
+    """
+
+    def __init__(
+        self,
+        wish: WatchWish,
+        say: Callable[[str], None],
+        hand_on: HandOn | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self._wish = wish
+        self._local = wish.logs.local
+        self._say = say
+        self._hand_on = hand_on
+        self._progress = progress or Progress()
+        self._policy = Policy(trio.current_time())
+        self._changed = trio.Event()
+        self._leave: LinkError | bool = False
+        self._wanted_system = 0
+        self._working_on: tuple[int, trio.CancelScope] | None = None
+        self._logs: dict[bytes, Wanted] = {}
+        self._same_heads: set[tuple[str, str]] = set()
+        self._done_here: set[tuple[str, str]] = set()
+        self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
+        self._complaints: dict[str, str] = {}
+        self._came = 0
+        with local_disk(self._local):
+            self._local.mkdir(parents=True, exist_ok=True)
+            self._memory = Memory(self._local)
+            self._memory.begin()
+
+    # --- who is heard (Hearing)
+
+    def heard(self, system: int, *, armed: bool) -> None:
+        """See contact.Hearing."""
+        news = self._policy.heard(system, armed, trio.current_time())
+        if not news:
+            return
+        if news in ("here", "back"):
+            self._same_heads.clear()
+            news += f", {'armed' if armed else 'disarmed'}"
+        self._tell_of(system, f"is {news}")
+
+    def refused(self, system: int) -> None:
+        """See contact.Hearing."""
+        now = trio.current_time()
+        was_free = self._policy.may_transfer(system, now)
+        self._policy.refused(system, now)
+        if was_free:
+            self._tell_of(system, "refused to be armed: nothing is transferred for a minute")
+
+    def restarted(self, system: int) -> None:
+        """See contact.Hearing."""
+        self._same_heads.clear()
+        self._policy.restarted(system, trio.current_time())
+        self._tell_of(system, "restarted")
+
+    def replaced(self, system: int) -> None:
+        """See contact.Hearing."""
+        self._policy.replaced(system)
+        self._leave = True
+        self._tell_of(system, "is another one now")
+
+    def ended(self, error: LinkError) -> None:
+        """See contact.Hearing."""
+        self._leave = error
+        self._wake()
+
+    def time_passed(self) -> None:
+        """See contact.Hearing."""
+        for system in self._policy.newly_lost(trio.current_time()):
+            self._tell_of(system, "is lost")
+
+    def _tell_of(self, system: int, news: str) -> None:
+        self._wake()
+        stopped = self._working_on is not None and self._working_on[1].cancel_called
+        self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
+
+    def _wake(self) -> None:
+        """Look at what is to be done anew; end what must not go on."""
+        self._changed.set()
+        if self._working_on is not None:
+            system, scope = self._working_on
+            if self._leave or not self._policy.may_transfer(system, trio.current_time()):
+                scope.cancel()
+
+    # --- what is done
+
+    async def run(self, target: Target) -> None:
+        """Bring logs, by a mount that is up or over a link of our own, until cancelled.
+
+        Raises:
+            UsageError: SOURCE or the options are wrong.
+        """
+        async with plain_nursery() as nursery:
+            nursery.start_soon(self._hand_on_all)
+            while True:
+                try:
+                    mounted = await target.mounted()
+                    if mounted is not None:
+                        self._settled("link")
+                        await self.serve(MountContact(mounted))
+                        continue
+                    assert target.spec is not None
+                    async with opened(target.spec, connect_options(target.options)) as link:
+                        self._settled("link")
+                        await self.run_on(link, target.spec, target.options, target.sinks)
+                except LinkError as exc:
+                    self._complain("link", str(exc))
+                await trio.sleep(REOPEN)
+
+    async def run_on(self, link: Link, spec: LinkSpec, options: Options, sinks: Sinks = NO_SINKS) -> None:
+        """Serve whoever is heard on an open link.
+
+        Raises:
+            LinkClosed: it was closed for good.
+        """
+        while True:
+            system = options.target_system or self._wanted_system
+            settings = replace(connect_options(options), target_system=system)
+            async with connected(link, settings, trace=sinks.payload) as connection:
+                connection.driver.framer.on_frame = sinks.frame
+                await self.serve(LinkContact(connection, spec, options))
+
+    async def serve(self, contact: Contact) -> None:
+        """Do what is to be done with a vehicle; return when the contact has to be left: its session is to be
+        closed, or another vehicle is to be served.
+
+        Raises:
+            LinkError: the contact broke.
+        """
+        self._leave = False
+        async with plain_nursery() as nursery, AsyncExitStack() as stack:
+            nursery.start_soon(contact.listen, self)
+            session: Session | None = None
+            while not self._leave:
+                step = self._policy.next(trio.current_time())
+                if isinstance(step, Wait):
+                    await self._wait(step)
+                elif contact.system is None:
+                    await trio.sleep(TICK)
+                elif step.system != contact.system:
+                    self._wanted_system = step.system
+                    await trio.sleep(TICK)
+                    break
+                else:
+                    session = session or await contact.enter(stack)
+                    if not await self._work(step, contact, session):
+                        break
+        if isinstance(self._leave, LinkError):
+            raise self._leave
+
+    async def _wait(self, step: Wait) -> None:
+        self._changed = trio.Event()
+        with trio.move_on_at(step.until):
+            await self._changed.wait()
+        if self._policy.nothing_new(trio.current_time()):
+            self._say(f"nothing new; {self._came} logs came so far")
+
+    async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> bool:
+        """Do it; return whether the vehicle may be asked for more."""
+        with trio.CancelScope() as scope:
+            self._working_on = step.system, scope
+            try:
+                if not self._local_is_ready(step):
+                    self._policy.local_trouble(trio.current_time())
+                elif isinstance(step, Look):
+                    await self._look(step.system, contact, session)
+                else:
+                    await self._fetch(step.system, step.log, contact, session)
+            finally:
+                self._working_on = None
+        return not scope.cancelled_caught and self._policy.may_transfer(step.system, trio.current_time())
+
+    async def _look(self, system: int, contact: Contact, session: Session) -> None:
+        """List the logs, and tell the policy which are new."""
+        name = await contact.identity() or f"system-{system}"
+        local = self._local / (str(system) if self._wish.by_system else name)
+        self._complain(f"name of {system}", f"vehicle {system} is {name}; its logs go into {local}")
+        session.files.forget_caches()
+        self._logs = {}
+        failed = False
+        try:
+            with local_disk(self._local):
+                self._memory = Memory(self._local)
+            _, logs, unlisted = await wanted_logs(session, self._wish.logs, local)
+            new = [log for log in logs if not await self._is_known(name, log, session)]
+        except NotFound as exc:
+            self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
+            return self._policy.looked(system, (), trio.current_time())
+        except MavftpfsError as exc:
+            self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
+            return self._policy.failed(system, None, trio.current_time())
+        for path, error in unlisted:
+            failed = True
+            self._complain(f"logs of {system}", f"vehicle {system}: {named(path, error)}")
+        if not failed:
+            self._settled(f"logs of {system}")
+        self._logs = {log.remote: log for log in new}
+        self._policy.looked(system, [Log(log.remote, log.size) for log in new], trio.current_time())
+        if failed:
+            self._policy.failed(system, None, trio.current_time())
+
+    async def _is_known(self, name: str, log: Wanted, session: Session) -> bool:
+        """Return whether a log was brought before. What has no time is told apart by how it begins, which is
+        asked for once until the vehicle was away."""
+        key = name, os.fsdecode(session.on_vehicle(log.remote))
+        known = self._memory.of(*key)
+        if known is None or known.size != log.size or not known.proven:
+            return False
+        if self._wish.again and key not in self._done_here and not log.here:
+            return False
+        if log.mtime is not None and known.mtime is not None:
+            return log.mtime == known.mtime
+        if known.head is None or key in self._same_heads:
+            return True
+        async with reading(session.files, log.remote) as file:
+            same = crc32(await file.read(0, min(HEAD, log.size))) == known.head
+        if same:
+            self._same_heads.add(key)
+        return same
+
+    async def _fetch(self, system: int, log: Log, contact: Contact, session: Session) -> None:
+        """Fetch a log, and tell the policy how it went."""
+        wanted = replace(self._logs[log.path], size=log.size)
+        key = await contact.identity() or f"system-{system}", os.fsdecode(session.on_vehicle(log.path))
+        if not wanted.here:
+            begun = f", from {readable_size(wanted.begun)} on" if wanted.begun else ""
+            self._say(f"vehicle {system}: {wanted.name} begins, {readable_size(wanted.size)}{begun}")
+        self._progress.plan(1, wanted.size)
+        try:
+            fetched = await Fetcher(session, self._progress, self._wish.verify).fetch(wanted)
+            with local_disk(wanted.local):
+                self._arrived(system, log, fetched, key)
+        except NotFound:
+            self._policy.fetched(system, log)
+        except StillGrowing as exc:
+            if self._policy.grows(system, log, trio.current_time()):
+                came = f"its first {readable_size(exc.came)} are here as {wanted.part.name}"
+                self._say(f"vehicle {system}: {wanted.name} still grows after the flight; {came}")
+        except LocalDiskFull as exc:
+            self._complain("local", f"{exc}; waiting for room")
+            self._policy.local_trouble(trio.current_time())
+        except MavftpfsError as exc:
+            self._complain(wanted.name, f"vehicle {system}: {named(wanted.name, exc)}; it is tried again")
+            self._policy.failed(system, log, trio.current_time())
+        else:
+            self._settled("local")
+            self._settled(wanted.name)
+        finally:
+            self._progress.end(wanted.size)
+
+    def _arrived(self, system: int, log: Log, fetched: Fetched, key: tuple[str, str]) -> None:
+        wanted, proof = fetched.wanted, fetched.proof
+        proven = not (proof.lacking and proof.later)
+        with wanted.local.open("rb") as file:
+            head = crc32(file.read(HEAD))
+        name, path = key
+        place = str(wanted.local.relative_to(self._local))
+        brought = Brought(path, place, fetched.size, wanted.mtime, name, head, proven)
+        self._memory.note(replace(brought, handed_on=not proven or self._hand_on is None))
+        if not proven:
+            self._policy.failed(system, log, trio.current_time())
+            self._say(f"vehicle {system}: {wanted.name} is here, not proven: {proof.lacking}")
+            return
+        self._policy.fetched(system, log)
+        self._done_here.add(key)
+        self._came += 1
+        self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}")
+        if self._hand_on is not None:
+            self._to_hand_on.send_nowait(brought)
+
+    # --- the local directory
+
+    def _local_is_ready(self, step: Look | Fetch) -> bool:
+        """Return whether the directory is there and has room; where not, it is said once."""
+        if not self._memory.is_there():
+            self._complain("local", f"{self._local} is not there any more; waiting for it")
+            return False
+        if isinstance(step, Fetch) and step.log.path in self._logs:
+            wanted = self._logs[step.log.path]
+            missing = 0 if wanted.here else wanted.size - wanted.begun
+            free = free_space(self._local)
+            if free - SPARE < missing:
+                needed = f"{readable_size(missing)} are needed, {readable_size(free)} are free"
+                self._complain("local", f"{self._local} is full: {needed}; waiting for room")
+                return False
+        self._settled("local")
+        return True
+
+    # --- what is handed on
+
+    async def _hand_on_all(self) -> None:
+        """Hand on what came, one after the other; first what was not in an earlier run."""
+        if self._hand_on is None:
+            return
+        for log in self._memory.logs():
+            if log.proven and not log.handed_on:
+                await self._hand_on_one(log, self._hand_on)
+        async for log in self._handed_over:
+            await self._hand_on_one(log, self._hand_on)
+
+    async def _hand_on_one(self, log: Brought, hand_on: HandOn) -> None:
+        path = self._local / log.file
+        if not is_file(path):  # it was taken away
+            return
+        problem = await hand_on(path)
+        if problem:
+            self._say(f"{log.file}: {problem}; it is tried again at the next start")
+            return
+        try:
+            with local_disk(path):
+                self._memory.note(replace(log, handed_on=True))
+        except MavftpfsError as exc:
+            self._say(f"{log.file} was handed on, which could not be noted: {exc}")
+
+    # --- what is said once
+
+    def _complain(self, about: str, line: str) -> None:
+        """Say it, unless that was the last that was said of it."""
+        if self._complaints.get(about) != line:
+            self._complaints[about] = line
+            self._say(line)
+
+    def _settled(self, about: str) -> None:
+        """What was said of it is over."""
+        self._complaints.pop(about, None)
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a file is there."""
+    return path.is_file()
+
+
+def free_space(directory: Path) -> float:
+    """Return the bytes that are free on a local disk, infinite if it does not tell."""
+    try:
+        facts = os.statvfs(directory)
+    except OSError:
+        return inf
+    return facts.f_bavail * facts.f_frsize

@@ -1,0 +1,452 @@
+"""client.watch and client.flights: days of a companion computer, with simulated vehicles, on virtual time."""
+
+from __future__ import annotations
+
+import gc
+import os
+import random
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+
+import pytest
+import trio
+
+from mavftpfs.client.brought import NAME, Memory
+from mavftpfs.client.download import Wish
+from mavftpfs.client.options import Options
+from mavftpfs.client.watch import Watch, WatchWish
+from mavftpfs.link.messages import Address
+from mavftpfs.link.uri import parse_source
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.memory import MemoryLink
+from tests.support.worlds import World, content, wall
+
+PLACES = {"px4": b"/fs/microsd/log", "ardupilot": b"/APM/LOGS", "mavsdk": b"/logs"}
+RADIO = LinkSettings(rate=20_000, delay=0.02)
+SPEC = parse_source("udpin:127.0.0.1:14550")
+MAY = 1_714_521_600
+
+
+class Day:
+    """A vehicle, the computer that is with it, and what that does."""
+
+    def __init__(self, local: Path, profile: str = "px4", link: LinkSettings = RADIO) -> None:
+        self.world = World(profile, link)
+        self.place = PLACES[profile]
+        self.world.tree.add_directory(self.place)
+        self.local = local
+        self.said: list[str] = []
+        self.handed: list[str] = []
+        self.problem = ""
+        self.count = 0
+
+    @property
+    def vehicle(self) -> SimVehicle:
+        return self.world.link.vehicle
+
+    @property
+    def requests(self) -> int:
+        """All FTP requests that the vehicle heard."""
+        return self.vehicle.server.requests.total()
+
+    @property
+    def home(self) -> Path:
+        """Where the logs of the first vehicle are."""
+        (found,) = (path for path in self.local.iterdir() if path.is_dir())
+        return found
+
+    def logs(self) -> dict[str, bytes]:
+        """Return what is here, by names below LOCAL without the vehicle's."""
+        files = (path for path in self.local.rglob("*") if path.is_file() and path.name != NAME)
+        return {str(path.relative_to(self.local)).partition("/")[2]: path.read_bytes() for path in files}
+
+    @asynccontextmanager
+    async def watched(self, *, again: bool = False, by_system: bool = False) -> AsyncIterator[None]:
+        """Have the watch run during the body; a second time is another process."""
+        hand_on = self._hand_on
+        watch = Watch(
+            WatchWish(Wish(self.local), by_system=by_system, again=again), self.said.append, hand_on
+        )
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(watch._hand_on_all)
+            nursery.start_soon(watch.run_on, self.world.link, SPEC, Options())
+            yield
+            nursery.cancel_scope.cancel()
+
+    async def _hand_on(self, file: Path) -> str:
+        await trio.sleep(1.0)
+        self.handed.append(file.name)
+        return self.problem
+
+    def put(self, name: str, data: bytes, mtime: int | None = None) -> None:
+        self.world.tree.add(self.place + b"/" + name.encode(), data, mtime)
+
+    def arm(self) -> None:
+        self.vehicle.arm()
+        self.world.link.kick()
+
+    def disarm(self) -> None:
+        self.vehicle.disarm()
+        self.world.link.kick()
+
+    async def fly(self, name: str, data: bytes, *, logs_on: float = 0.0) -> None:
+        """Fly for half a minute, and log meanwhile; logs_on: seconds that it does after disarming."""
+        self.arm()
+        for second in range(1, 31):
+            self.put(name, data[: len(data) * second // 60])
+            await trio.sleep(1.0)
+        if not logs_on:
+            self.put(name, data)
+        self.disarm()
+        if logs_on:
+            for second in range(1, 31):
+                await trio.sleep(logs_on / 30)
+                self.put(name, data[: len(data) * (30 + second) // 60])
+
+    def saying(self, text: str) -> int:
+        """Return how often something was said."""
+        return sum(text in line for line in self.said)
+
+    async def until_handed(self, count: int) -> None:
+        """Wait until so many logs were handed on."""
+        with trio.fail_after(600.0):
+            while len(self.handed) < count:  # noqa: ASYNC110 (by a plain call)
+                await trio.sleep(0.1)
+
+    async def until(self, text: str, times: int = 1, limit: float = 600.0) -> None:
+        """Wait until it was said so often."""
+        with trio.move_on_after(limit):
+            while self.saying(text) < times:  # noqa: ASYNC110 (it is said by a plain call)
+                await trio.sleep(0.1)
+            return
+        raise AssertionError(f"not said {times} times: {text}\n" + "\n".join(self.said))
+
+
+@pytest.fixture
+def day(tmp_path: Path) -> Day:
+    return Day(tmp_path / "logs")
+
+
+# -- flights --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profile", PLACES)
+async def test_each_log_of_three_flights_comes_once_whole_and_proven(tmp_path: Path, profile: str) -> None:
+    day, flights = Day(tmp_path / "logs", profile), {}
+    async with day.watched():
+        await trio.sleep(5.0)
+        for number in range(1, 4):
+            flights[f"log{number:03}.ulg"] = content(20_000 + number, number)
+            await day.fly(f"log{number:03}.ulg", flights[f"log{number:03}.ulg"])
+            await day.until("is here, verified by size and CRC32", number)
+            await trio.sleep(300.0)
+    assert day.logs() == flights
+    assert day.handed == list(flights)
+    assert day.saying("begins") == day.saying("is here, verified") == 3
+    assert (day.saying("is armed"), day.saying("is disarmed")) == (3, 3)
+
+
+async def test_what_is_there_at_the_start_counts_as_new_and_nothing_is_asked_twice(day: Day) -> None:
+    day.put("a/1.ulg", content(5000))
+    async with day.watched():
+        await day.until("is here, verified")
+        await trio.sleep(30.0)
+        asked = day.requests
+        await trio.sleep(3600.0)
+        assert day.requests == asked
+    assert day.vehicle.server.open_sessions == 0
+    assert day.logs() == {"a/1.ulg": content(5000)}
+
+
+async def test_an_armed_vehicle_is_left_alone(day: Day) -> None:
+    day.put("1.ulg", content(5000))
+    day.vehicle.arm()
+    async with day.watched():
+        await trio.sleep(600.0)
+    assert day.requests == 0
+    assert day.said == ["vehicle 1 is here, armed"]
+
+
+@pytest.mark.parametrize("how", ["armed", "refused", "denied"])
+async def test_a_transfer_lets_go_within_a_second(day: Day, how: str) -> None:
+    day.put("1.ulg", content(400_000))
+    async with day.watched():
+        await day.until("begins")
+        await trio.sleep(3.0)
+        assert day.vehicle.server.open_sessions == 1
+        match how:
+            case "armed":
+                day.arm()
+            case "denied":
+                day.vehicle.say(3, "Arming denied: high throttle")
+            case "refused":
+                day.vehicle._ready.append(day.vehicle.framer.encode("command_ack", 400, 4, 0, 0, 255, 190))
+        day.world.link.kick()
+        await trio.sleep(1.0)
+        asked = day.requests
+        assert day.vehicle.server.open_sessions == 0
+        assert day.saying("the transfer waits") == 1
+        await trio.sleep(50.0)
+        assert day.requests == asked
+        if how == "armed":
+            await trio.sleep(600.0)
+            assert day.requests == asked
+            day.disarm()
+        await day.until("is here, verified")
+    assert day.logs() == {"1.ulg": content(400_000)}
+    assert day.saying("begins, 400.0 kB, from ") == 1
+
+
+async def test_a_warning_before_arming_is_no_refusal(day: Day) -> None:
+    day.put("1.ulg", content(400_000))
+    async with day.watched():
+        await day.until("begins")
+        day.vehicle.say(4, "PreArm: Compass not calibrated")
+        day.world.link.kick()
+        await day.until("is here, verified", limit=60.0)
+    assert day.saying("waits") == 0
+
+
+async def test_a_vehicle_that_is_switched_off_is_gone_on_with(day: Day) -> None:
+    day.put("1.ulg", content(400_000))
+    async with day.watched():
+        await day.until("begins")
+        await trio.sleep(5.0)
+        day.vehicle.reboot(trio.current_time(), downtime=1200.0)
+        await day.until("is lost")
+        await trio.sleep(1200.0)
+        await day.until("is here, verified")
+    assert day.saying("is back, disarmed") == 1
+    assert day.saying("begins, 400.0 kB, from ") == 1
+    assert day.logs() == {"1.ulg": content(400_000)}
+
+
+async def test_a_log_that_goes_on_after_disarming_comes_once(day: Day) -> None:
+    async with day.watched():
+        await trio.sleep(5.0)
+        await day.fly("1.ulg", content(30_000), logs_on=15.0)
+        await day.until("is here, verified")
+        await trio.sleep(600.0)
+    assert day.logs() == {"1.ulg": content(30_000)}
+    assert (day.saying("begins"), day.handed) == (1, ["1.ulg"])
+
+
+async def test_a_log_that_never_stops_is_fetched_as_far_as_it_is(day: Day) -> None:
+    data = content(2_000_000)
+    async with day.watched(), trio.open_nursery() as nursery:
+
+        async def log_on() -> None:
+            for second in range(10_000):
+                day.put("1.ulg", data[: 100 * second])
+                await trio.sleep(1.0)
+
+        nursery.start_soon(log_on)
+        await day.until("still grows after the flight")
+        asked = day.requests
+        await trio.sleep(1500.0)
+        assert day.saying("still grows") == 1
+        assert day.requests - asked < 150  # it is looked at more and more seldom
+        (part,) = day.logs().items()
+        assert part[0] == "1.ulg.part"
+        assert len(part[1]) > 5000
+        assert data.startswith(part[1])
+        assert day.handed == []
+        nursery.cancel_scope.cancel()
+    size = len(day.world.tree.data(day.place + b"/1.ulg"))
+    async with day.watched():  # it was switched off, and on
+        await day.until("is here, verified")
+    assert day.logs() == {"1.ulg": data[:size]}
+
+
+# -- what is the same -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+@pytest.mark.parametrize("size", [5000, 6000])
+async def test_a_formatted_card_has_log001_again(tmp_path: Path, profile: str, size: int) -> None:
+    day = Day(tmp_path / "logs", profile)
+    day.put("log001.ulg", content(5000, 1), MAY)
+    async with day.watched():
+        await day.until("is here, verified")
+        await day.until_handed(1)
+    day.world.tree.remove(day.place + b"/log001.ulg")
+    day.put("log001.ulg", content(size, 2), MAY + 9)
+    async with day.watched():
+        await day.until_handed(2)
+    assert day.logs() == {"log001.ulg": content(size, 2), "log001.ulg.~1~": content(5000, 1)}
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+@pytest.mark.parametrize("again", [False, True])
+async def test_a_log_that_was_moved_away_stays_away(tmp_path: Path, profile: str, again: bool) -> None:
+    day = Day(tmp_path / "logs", profile)
+    day.put("1.ulg", content(5000))
+    async with day.watched():
+        await day.until("is here, verified")
+    (day.home / "1.ulg").unlink()
+    async with day.watched(again=again):
+        await trio.sleep(100.0)
+        day.arm()
+        await trio.sleep(10.0)
+        day.disarm()
+        await trio.sleep(100.0)
+    assert day.saying("is here, verified") == 1 + again
+    assert (day.logs() != {}) is again
+
+
+async def test_a_log_that_grew_after_it_was_done_is_gone_on_with(day: Day) -> None:
+    day.put("1.ulg", content(9000)[:5000])
+    async with day.watched():
+        await day.until("is here, verified")
+        await day.fly("1.ulg", content(9000))
+        await day.until("is here, verified", 2)
+    assert day.logs() == {"1.ulg": content(9000)}
+    assert day.saying("from 5.0 kB on") == 1
+
+
+async def test_another_airframe_in_the_place_of_the_first_has_another_directory(day: Day) -> None:
+    day.put("log001.ulg", content(5000, 1))
+    async with day.watched():
+        await day.until("is here, verified")
+        tree = MemoryTree(clock=wall)
+        tree.add(day.place + b"/log001.ulg", content(5000, 2))
+        day.world.link.vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(99))
+        await day.until("is here, verified", 2)
+    found = {path.read_bytes() for path in day.local.rglob("log001.ulg")}
+    assert found == {content(5000, 1), content(5000, 2)}
+
+
+class Two(SimVehicle):
+    """Two vehicles on one link, of which the first is this."""
+
+    def __init__(self, first: SimVehicle, second: SimVehicle) -> None:
+        self.__dict__.update(first.__dict__)
+        self.first, self.second = first, second
+
+    def receive(self, data: bytes, now: float) -> None:
+        for one in (self.first, self.second):
+            one.receive(data, now)
+
+    def outgoing(self, now: float) -> list[bytes]:
+        return self.first.outgoing(now) + self.second.outgoing(now)
+
+    def next_deadline(self) -> float:
+        return min(self.first.next_deadline(), self.second.next_deadline())
+
+
+@pytest.mark.parametrize("by_system", [False, True])
+async def test_two_vehicles_with_the_same_names(day: Day, by_system: bool) -> None:
+    tree = MemoryTree(clock=wall)
+    rng = random.Random(99)
+    second = SimVehicle(tree, PROFILES["ardupilot"], rng=rng, address=Address(2, 1))
+    first = day.vehicle
+    day.world.link = MemoryLink(Two(first, second), day.world.model)
+    day.put("log001.ulg", content(100_000, 1))
+    tree.add(b"/APM/LOGS/log001.ulg", content(100_000, 2))
+    async with day.watched(by_system=by_system):
+        await day.until("is here, verified", 2)
+        second.arm()
+        await trio.sleep(10.0)
+        tree.add(b"/APM/LOGS/log002.ulg", content(3000, 3))
+        second.disarm()
+        await day.until("vehicle 2: log002.ulg is here, verified")
+    folders = {
+        path.name: sorted(file.name for file in path.iterdir())
+        for path in day.local.iterdir()
+        if path.is_dir()
+    }
+    assert sorted(folders.values()) == [["log001.ulg"], ["log001.ulg", "log002.ulg"]]
+    assert (set(folders) == {"1", "2"}) is by_system
+    assert {path.read_bytes() for path in day.local.rglob("log001.ulg")} == {
+        content(100_000, 1),
+        content(100_000, 2),
+    }
+
+
+# -- what is done with a log ----------------------------------------------------------------------
+
+
+async def test_what_could_not_be_handed_on_is_tried_at_the_next_start(day: Day) -> None:
+    day.put("1.ulg", content(5000))
+    day.problem = "--exec ended with exit code 1"
+    async with day.watched():
+        await day.until("tried again at the next start")
+        await trio.sleep(600.0)
+    assert day.handed == ["1.ulg"]
+    day.problem = ""
+    for _ in range(2):
+        async with day.watched():
+            await trio.sleep(100.0)
+    assert day.handed == ["1.ulg"] * 2
+
+
+# -- the local disk -------------------------------------------------------------------------------
+
+
+@contextmanager
+def stick(place: Path, size: str) -> Iterator[None]:
+    """Have a small disk at that place."""
+    place.mkdir(exist_ok=True)
+    assert os.system(f"mount -t tmpfs -o size={size} tmpfs {place}") == 0
+    try:
+        yield
+    finally:
+        os.system(f"umount -l {place}")
+
+
+async def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
+    with stick(tmp_path / "stick", "2m"):
+        day = Day(tmp_path / "stick")
+        (tmp_path / "stick" / "other").write_bytes(bytes(1_000_000))
+        day.put("1.ulg", content(400_000))
+        async with day.watched():
+            await day.until("waiting for room")
+            await trio.sleep(600.0)
+            assert day.saying("waiting for room") == 1
+            (tmp_path / "stick" / "other").unlink()
+            await day.until("is here, verified")
+        assert day.logs() == {"1.ulg": content(400_000)}
+
+
+async def test_a_directory_that_vanishes_is_said_and_waited_for(tmp_path: Path) -> None:
+    real, place = tmp_path / "real", tmp_path / "place"
+    real.mkdir()
+    place.symlink_to(real)
+    day = Day(place)
+    async with day.watched():
+        await trio.sleep(5.0)
+        place.unlink()
+        place.mkdir()  # where a stick is mounted there is a directory
+        day.put("1.ulg", content(5000))
+        await day.fly("2.ulg", content(3000))
+        await day.until("is not there any more; waiting for it")
+        await trio.sleep(600.0)
+        assert list(place.iterdir()) == []
+        place.rmdir()
+        place.symlink_to(real)
+        await day.until("is here, verified", 2)
+    assert day.logs() == {"1.ulg": content(5000), "2.ulg": content(3000)}
+
+
+# -- for long -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hours", [6, pytest.param(24, marks=pytest.mark.soak)])
+async def test_days_without_growth(day: Day, hours: int) -> None:
+    sizes, files = [], []
+    async with day.watched():
+        for hour in range(hours):
+            await day.fly("log.ulg", content(2000, hour))
+            await trio.sleep(3600.0 - 30.0)
+            gc.collect()
+            sizes.append(len(gc.get_objects()))
+            files.append(len(os.listdir("/proc/self/fd")))
+    assert len(day.handed) == hours
+    assert max(sizes[3:]) - sizes[1] < 1000
+    assert max(files[3:]) <= files[1]
+    assert (day.local / NAME).stat().st_size < 200 * 400
+    assert len(Memory(day.local).logs()) == 1
