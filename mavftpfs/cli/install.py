@@ -57,6 +57,8 @@ def _escaped(text: str) -> str:
     return re.sub(r"^([.'])", r"\\&\1", plain, flags=re.MULTILINE)
 
 
+UNITS = ("mavftpfs@.service", "mavftpfs-sync@.service")
+
 SYSTEMD_RUNS = Path("/run/systemd/system")
 
 
@@ -175,7 +177,8 @@ def for_user(
     config = Path(environment.get("XDG_CONFIG_HOME") or home / ".config")
     yield Piece(data / "man/man1/mavftpfs.1", man_page(parser))
     yield from _completions(parser, data, config / "fish/completions")
-    yield Piece(config / "systemd/user/mavftpfs@.service", _unit(program))
+    for unit in UNITS:
+        yield Piece(config / "systemd/user" / unit, _unit(program, unit))
 
 
 def for_everybody(parser: argparse.ArgumentParser, program: Path, root: Path) -> Iterator[Piece]:
@@ -184,7 +187,8 @@ def for_everybody(parser: argparse.ArgumentParser, program: Path, root: Path) ->
     yield Piece(data / "man/man1/mavftpfs.1", man_page(parser))
     yield Piece(data / "man/man8/mount.mavftpfs.8", _data("mount.mavftpfs.8"))
     yield from _completions(parser, data, data / "fish/vendor_completions.d")
-    yield Piece(root / "usr/local/lib/systemd/user/mavftpfs@.service", _unit(program))
+    for unit in UNITS:
+        yield Piece(root / "usr/local/lib/systemd/user" / unit, _unit(program, unit))
     yield Piece(root / "etc/udev/rules.d/70-mavftpfs.rules", _data("70-mavftpfs.rules"))
     yield Piece(root / "sbin" / HELPER, link=program.with_name(HELPER))
     caller = f'#!/bin/sh\n{MARK}\nexec {shlex.quote(str(program))} "$@"\n'  # for mount -t fuse.mavftpfs
@@ -205,10 +209,10 @@ def _data(name: str) -> str:
     return files("mavftpfs").joinpath("data", name).read_text()
 
 
-def _unit(program: Path) -> str:
-    """Return the unit; systemd reads % as a specifier, and takes quotes around blanks."""
+def _unit(program: Path, name: str) -> str:
+    """Return a unit; systemd reads % as a specifier, and takes quotes around blanks."""
     command = str(program).replace("%", "%%")
-    return _data("mavftpfs@.service").replace("@MAVFTPFS@", f'"{command}"' if " " in command else command)
+    return _data(name).replace("@MAVFTPFS@", f'"{command}"' if " " in command else command)
 
 
 def _tell_systemd(everybody: bool) -> None:
@@ -226,6 +230,7 @@ def _tell_systemd(everybody: bool) -> None:
 
 def _hints(everybody: bool) -> Iterator[str]:
     yield "systemctl --user start mavftpfs@ttyACM0 mounts /dev/ttyACM0 on ~/drone-ttyACM0"
+    yield "systemctl --user start mavftpfs-sync@udpin:0.0.0.0:14550 brings logs into ~/drone-logs"
     if everybody:
         yield "an autopilot that is plugged in is mounted there by itself"
     else:

@@ -42,7 +42,7 @@ def test_the_unit_mounts_and_unmounts(field: Field, tiny_tree: Path, tmp_path: P
     program = tmp_path / "mavftpfs"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mavftpfs "$@"\n')
     program.chmod(0o755)
-    unit = install._unit(program)
+    unit = install._unit(program, "mavftpfs@.service")
     mountpoint = tmp_path / f"drone-{device.replace('/', '-')}"
 
     def take(key: str) -> None:

@@ -28,7 +28,7 @@ from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, wait_until
 from tests.support.mounts import mavftpfs as run
 from tests.support.places import start_place
-from tests.support.vehicles import HOST, PROJECT, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, SimVehicle, free_udp_port
 
 SLOW = ("--rate", "100000", "--delay", "0.01")
 FAR = ("--delay", "0.2")
@@ -283,6 +283,45 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
         vehicle.send_signal(signal.SIGUSR2)  # the link is cut
         wait_until("get has what the mount has", lambda: part.stat().st_size >= reads() - 8192)
         vehicle.send_signal(signal.SIGUSR2)  # it can be unmounted
+
+
+# -- by itself ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "mounted"), [("px4", False), ("ardupilot", True)])
+def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, mounted: bool) -> None:
+    place = start_place(field, kind)
+    vehicle = place.vehicle
+    assert isinstance(vehicle, SimVehicle)
+    card = vehicle.root / "APM/LOGS"
+    if mounted:
+        field.mount(vehicle.source)
+    write_log(card / "1.BIN", 50_000, 1, 1)
+    handed, local, said = tmp_path / "handed", tmp_path / "logs", tmp_path / "said"
+    command = f"sh -c 'basename \"$1\" >> {handed}' sh"
+    words = argv("sync", vehicle.source, local, "--watch", "--exec", command)
+    with (
+        said.open("wb") as output,
+        subprocess.Popen(words, stdout=output, stderr=output, cwd=PROJECT) as child,
+    ):
+        wait_until("the first log was handed on", lambda: handed.read_text() == "1.BIN\n")
+        vehicle.send_signal(signal.SIGUSR1)  # armed
+        wait_until("that is noticed", lambda: "vehicle 1 is armed" in said.read_text())
+        write_log(card / "2.BIN", 60_000, 2, 2)
+        vehicle.send_signal(signal.SIGUSR1)
+        wait_until("the second, too", lambda: handed.read_text() == "1.BIN\n2.BIN\n")
+        child.send_signal(signal.SIGTERM)
+        assert child.wait(COMMAND_TIMEOUT) == 0
+    out = said.read_text()
+    assert out.splitlines()[-1] == "ended; the next run goes on"
+    assert out.count("is here, verified by size and CRC32") == 2
+    (home,) = (path for path in local.iterdir() if path.is_dir())
+    assert filecmp.cmpfiles(card, home, ["1.BIN", "2.BIN"], shallow=False) == (["1.BIN", "2.BIN"], [], [])
+
+
+def test_what_goes_with_watch_only_is_said(tmp_path: Path) -> None:
+    assert "--watch" in run("sync", "udpin:127.0.0.1:1", tmp_path, "--exec", "true", code=1)[1]
+    assert "--json" in run("sync", "udpin:127.0.0.1:1", tmp_path, "--watch", "--json", code=1)[1]
 
 
 # -- terminals ------------------------------------------------------------------------------------

@@ -54,6 +54,7 @@ def test_a_user_needs_no_root(tmp_path: Path) -> None:
     paths = [piece.path.as_posix() for piece in found]
     assert all(path.startswith("/home/me/") for path in paths)
     assert "/home/me/.config/systemd/user/mavftpfs@.service" in paths
+    assert "/home/me/.config/systemd/user/mavftpfs-sync@.service" in paths
     assert not any("udev" in path for path in paths)
     moved = {"HOME": "/home/me", "XDG_DATA_HOME": "/data", "XDG_CONFIG_HOME": "/config"}
     for piece in install.for_user(parser, Path("/usr/bin/mavftpfs"), moved):
@@ -89,14 +90,17 @@ def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Pat
 
 
 def test_the_unit_calls_this_program(pieces: dict[str, install.Piece]) -> None:
-    unit = pieces["usr/local/lib/systemd/user/mavftpfs@.service"].text
-    assert '\nExecStart="/opt/py thon/100%%/mavftpfs" /dev/%I ' in unit
-    assert "@MAVFTPFS@" not in unit
+    for name, words in (("mavftpfs@", "/dev/%I "), ("mavftpfs-sync@", "sync %I ")):
+        unit = pieces[f"usr/local/lib/systemd/user/{name}.service"].text
+        assert f'\nExecStart="/opt/py thon/100%%/mavftpfs" {words}' in unit
+        assert "@MAVFTPFS@" not in unit
 
 
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
-    assert complaints_about(tmp_path, install._unit(Path("/bin/true"))) == ""
-    wrong = install._unit(Path("/bin/true")).replace("Type=forking", "Type=spoon")
+@pytest.mark.parametrize("name", install.UNITS)
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path, name: str) -> None:
+    unit = install._unit(Path("/bin/true"), name)
+    assert complaints_about(tmp_path, unit) == ""
+    wrong = unit.replace("Restart=on-failure", "Restart=spoon")
     assert "spoon" in complaints_about(tmp_path, wrong)
 
 
