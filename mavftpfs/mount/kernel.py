@@ -14,9 +14,10 @@ import math
 import os
 import select
 import signal
+import stat
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -331,7 +332,8 @@ def kernel_mount(operations: Operations, request: MountRequest, invalidator: Inv
     words = fuse_words(request.options, request.source)
     with stderr_of() as said:
         try:
-            pyfuse3.init(operations, request.mountpoint, words)
+            with watcher_told_last():
+                pyfuse3.init(operations, request.mountpoint, words)
         except RuntimeError as exc:
             reason = said() or str(exc)
             raise MountFailed(f"cannot mount on {request.mountpoint}: {reason}") from exc
@@ -343,6 +345,40 @@ def kernel_mount(operations: Operations, request: MountRequest, invalidator: Inv
             unmount_what_is_left(request.mountpoint)
         else:
             pyfuse3.close(unmount=True)
+
+
+@contextmanager
+def watcher_told_last() -> Iterator[None]:
+    """Mount in the body. With auto_unmount, have fusermount3 hear of our end after the kernel did.
+
+    It waits for the end of a socket that libfuse opens for it, and never uses again. If the kernel has not
+    given the mount up by then, fusermount3 takes the mount for a living one and leaves it. When a process is
+    killed, Linux releases the descriptors that only it has from the highest number to the lowest, and the
+    socket's number is above that of /dev/fuse. So it gets a lower one.
+    """
+    lowest, before = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), _sockets()
+    try:
+        yield
+        opened = _sockets() - before
+    except BaseException:
+        os.close(lowest)
+        raise
+    if len(opened) == 1:
+        (socket,) = opened
+        os.dup2(socket, lowest, inheritable=False)
+        os.close(socket)
+    else:
+        os.close(lowest)
+
+
+def _sockets() -> set[int]:
+    """Return this process's descriptors that are sockets."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # that of the directory itself is closed by now
+            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                found.add(int(name))
+    return found
 
 
 def presentation(options: MountOptions) -> Presentation:

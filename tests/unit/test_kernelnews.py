@@ -1,8 +1,11 @@
-"""mount.Invalidator: the kernel is told from a thread, about inodes it knows."""
+"""What the kernel is told: by mount.Invalidator from a thread, and of our end before fusermount3 hears it."""
 
 from __future__ import annotations
 
 import errno
+import os
+import socket
+import stat
 import threading
 from collections.abc import Callable
 
@@ -11,7 +14,7 @@ import trio
 import trio.testing
 
 from mavftpfs.mount.handles import InodeTable
-from mavftpfs.mount.kernel import Invalidator
+from mavftpfs.mount.kernel import Invalidator, watcher_told_last
 
 
 class Kernel:
@@ -60,3 +63,46 @@ async def test_busy_while_a_thread_is_in_the_kernel_even_if_nobody_waits() -> No
     assert invalidator.busy
     kernel.gate.set()
     await idle(lambda: not invalidator.busy)
+
+
+def test_the_socket_by_which_fusermount3_hears_of_our_end_lies_below_the_device() -> None:
+    """Linux lets go of the highest descriptor first. Opened in the order of libfuse's."""
+    with watcher_told_last():
+        theirs, ours = socket.socketpair()
+        number = ours.detach()
+        theirs.close()
+        device = os.open(os.devnull, os.O_RDONLY)
+    try:
+        assert device < number
+        moved = [n for n in range(device) if stat.S_ISSOCK(mode_of(n)) and peer_is_gone(n)]
+        assert len(moved) == 1
+        assert mode_of(number) == 0
+        os.close(moved[0])
+    finally:
+        os.close(device)
+
+
+def mode_of(descriptor: int) -> int:
+    """Return what kind of file a descriptor is, 0 if it is not open."""
+    try:
+        return os.fstat(descriptor).st_mode
+    except OSError:
+        return 0
+
+
+def peer_is_gone(descriptor: int) -> bool:
+    """Return whether the other end of a socket was closed."""
+    with socket.socket(fileno=os.dup(descriptor)) as own:
+        try:
+            return own.recv(1, socket.MSG_DONTWAIT | socket.MSG_PEEK) == b""
+        except OSError:
+            return False
+
+
+def test_a_mount_that_failed_leaves_no_descriptor() -> None:
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(RuntimeError), watcher_told_last():
+        raise RuntimeError
+    with watcher_told_last():
+        pass
+    assert os.listdir("/proc/self/fd") == before
