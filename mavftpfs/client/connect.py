@@ -31,8 +31,9 @@ from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
 from mavftpfs.link.messages import Address
+from mavftpfs.link.rendezvous import same_link
 from mavftpfs.link.sharing import open_shared
-from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
@@ -141,13 +142,19 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 
 
 @asynccontextmanager
-async def opened(spec: LinkSpec, settings: ConnectOptions) -> AsyncIterator[Link]:
+async def opened(spec: LinkSpec, options: Options) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other programs of ours.
 
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
     """
-    wish = Wish(Address(settings.source_system, settings.source_component), name=process_name())
+    own = Address(options.source_system, options.source_component)
+    wish = Wish(own, options.forward, process_name())
+    for place in options.forward:
+        if same_link(parse_source(place), spec):
+            raise UsageError(
+                f"forward={place} is SOURCE itself; name another place, such as udpout:127.0.0.1:14551"
+            )
     async with AsyncExitStack() as stack:
         try:
             link = await stack.enter_async_context(open_shared(spec, wish))
@@ -201,7 +208,7 @@ async def attached(
     """
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
-    async with opened(spec, settings) as link, connected(link, settings, trace=sinks.payload) as connection:
+    async with opened(spec, options) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
         async with with_tree(

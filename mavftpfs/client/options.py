@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from mavftpfs.cache.options import DEFAULT_LOCAL
+from mavftpfs.link.uri import parse_endpoint
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -58,6 +59,7 @@ class Options:
     local: tuple[str, ...] = DEFAULT_LOCAL
     trace: str | None = None
     tlog: str | None = None
+    forward: tuple[str, ...] = ()
 
 
 Parser = Callable[[str], Any]
@@ -146,14 +148,21 @@ def patterns(text: str) -> tuple[str, ...]:
     return (*DEFAULT_LOCAL, *given) if added else given
 
 
+def endpoint(text: str) -> str:
+    """Parse where frames are forwarded to; return it in one spelling."""
+    return parse_endpoint(text_value(text)).description
+
+
 _SIZE_MAX = 1 << 40
 
 
 class Value(NamedTuple):
-    """An option with a value: how it is parsed, and what help says of it, with the default."""
+    """An option with a value: how it is parsed, and what help says of it, with the default. many: it may be
+    given several times, and all count."""
 
     parse: Parser
     help: str
+    many: bool = False
 
 
 Values = Mapping[str, Value]
@@ -189,6 +198,7 @@ VALUES: Values = {
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
     "trace": Value(text_value, "every request and reply as a line of JSON there"),
     "tlog": Value(text_value, "raw MAVLink log there"),
+    "forward": Value(endpoint, "pass all frames on to there and back; several count", many=True),
 }
 
 
@@ -226,8 +236,10 @@ def options_of(keywords: Mapping[str, object]) -> Options:
             if not isinstance(value, bool):
                 raise UsageError(f"option {name} is True or False, not {value!r}")
             values[FLAGS[name].field] = FLAGS[name].becomes is value
+        elif name in VALUES and VALUES[name].many and isinstance(value, list | tuple):
+            values[name] = tuple(parse_value(VALUES, name, _as_text(name, one)) for one in value)
         elif name in VALUES:
-            values[name] = parse_value(VALUES, name, _as_text(name, value))
+            values[name] = collected(VALUES, values, name, _as_text(name, value))
         else:
             raise UsageError(f"unknown option {name!r}")
     return Options(**values)
@@ -267,6 +279,16 @@ def parse_value(values: Values, name: str, text: str) -> Any:
         return values[name].parse(text)
     except (ValueError, MavftpfsError) as exc:
         raise UsageError(f"option {name}={text}: {exc}") from exc
+
+
+def collected(table: Values, values: Mapping[str, Any], name: str, text: str) -> Any:
+    """Return the value of an option, behind those that it was given already if all of them count.
+
+    Raises:
+        UsageError: as parse_value.
+    """
+    value = parse_value(table, name, text)
+    return tuple(dict.fromkeys((*values.get(name, ()), value))) if table[name].many else value
 
 
 def split_words(texts: Iterable[str]) -> Iterator[str]:

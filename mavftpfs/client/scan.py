@@ -45,7 +45,7 @@ async def scan(target: Target) -> list[Entry]:
     statuses = await mounts_on(target.spec)
     found = [_own_entry(status) for status in statuses]
     try:
-        async with opened(target.spec, connect_options(target.options)) as link:
+        async with opened(target.spec, target.options) as link:
             found += await _ask_others(
                 link, target, {Address(one["system"], one["component"]) for one in found}
             )

@@ -26,7 +26,8 @@ import trio
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
 from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts
-from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.link.rendezvous import same_link
+from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.readable import readable_time
 
@@ -279,18 +280,6 @@ def network_namespace() -> str:
     """Return what tells this process's network namespace from others that exist now."""
     facts = os.stat("/proc/self/ns/net")
     return f"{facts.st_dev}:{facts.st_ino}"
-
-
-def same_link(one: LinkSpec, other: LinkSpec) -> bool:
-    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
-    if one.kind is not other.kind:
-        return False
-    if one.kind is LinkKind.SERIAL:
-        return os.path.realpath(one.device) == os.path.realpath(other.device)
-    if one.port != other.port:
-        return False
-    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
 
 
 def has_link(status: Status, spec: LinkSpec) -> bool:

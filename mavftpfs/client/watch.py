@@ -160,7 +160,7 @@ class Watch:
                         await self.serve(MountContact(mounted))
                         continue
                     assert target.spec is not None
-                    async with opened(target.spec, connect_options(target.options)) as link:
+                    async with opened(target.spec, target.options) as link:
                         self._settled("link")
                         await self.run_on(link, target.spec, target.options, target.sinks)
                 except LinkError as exc:

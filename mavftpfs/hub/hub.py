@@ -33,9 +33,9 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door
+from mavftpfs.link.rendezvous import Door, same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
-from mavftpfs.shared.errors import LinkClosed, MavftpfsError
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
 
 log = logging.getLogger("mavftpfs.hub")
 
@@ -162,6 +162,9 @@ class Hub:
             sock.close()
             if client is not None:
                 self._leave(client)
+            elif not self._came.is_set():
+                self._ended.set()  # the client that we were started for does not stay
+                self._came.set()
 
     async def _answered(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
         """Reply to the first message of a connection; return the client if it is let in."""
@@ -266,8 +269,11 @@ class Hub:
         for text in texts:
             if text in self._endpoints:
                 continue
+            spec = parse_source(text)
+            if same_link(spec, self.spec):
+                raise UsageError(f"forward={text} is SOURCE itself")
             self._sides += 1
-            endpoint = self._endpoints[text] = _Endpoint(self._sides, text, parse_source(text))
+            endpoint = self._endpoints[text] = _Endpoint(self._sides, text, spec)
             self.router.add(endpoint.side, Kind.ENDPOINT, fixed=endpoint.spec.kind is not LinkKind.UDP_IN)
             try:
                 await nursery.start(self._serve_endpoint, endpoint, patient)

@@ -40,6 +40,18 @@ def port_name(spec: LinkSpec) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
+def same_link(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
+    if one.kind is not other.kind:
+        return False
+    if one.kind is LinkKind.SERIAL:
+        return os.path.realpath(one.device) == os.path.realpath(other.device)
+    if one.port != other.port:
+        return False
+    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
+
+
 def knock(name: str) -> socket.socket | None:
     """Return a connection to the program that has a port, None if none of ours has."""
     for path in [directory / (name + end) for directory in own_directories() for end in (HUB, ALONE)]:

@@ -9,7 +9,7 @@ IPv6 addresses stand in brackets. `#/remote/dir` at the end names the directory 
 from __future__ import annotations
 
 import errno
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from mavftpfs.shared.errors import LinkClosed, UsageError
@@ -19,6 +19,7 @@ DEFAULT_BAUD = 57600
 """Telemetry radios; USB ports ignore it."""
 DEFAULT_UDP_PORT = 14550
 DEFAULT_TCP_PORT = 5760
+LOOPBACK = "127.0.0.1"
 
 _EXAMPLES = "udpin:0.0.0.0:14550, tcp:192.168.1.10:5760 or /dev/ttyUSB0,57600"
 
@@ -89,6 +90,22 @@ def parse_source(text: str) -> LinkSpec:
         return _parse_serial(rest, source, "," if "," in rest else ":", subtree)
     host, port = _parse_host_port(rest, source, kind)
     return LinkSpec(kind, host=host, port=port, subtree=subtree)
+
+
+def parse_endpoint(text: str) -> LinkSpec:
+    """Return what an endpoint of `forward=` means: as a SOURCE, but it listens for this computer only, unless
+    an address is given.
+
+    Raises:
+        UsageError: as parse_source; or it names a directory.
+    """
+    spec = parse_source(text)
+    if spec.subtree != ROOT:
+        raise UsageError(f"{text!r} is to carry frames, so no directory belongs to it; leave out '#...'")
+    rest = text.partition(":")[2].removeprefix("//")
+    if spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN) and rest.startswith(":"):
+        return replace(spec, host=LOOPBACK)
+    return spec
 
 
 def _parse_subtree(text: str, source: str) -> bytes:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mavftpfs.client import options as client
 from mavftpfs.client.mountpoint import SUBTYPE
-from mavftpfs.client.options import Flag, Flags, Options, Value, Values, number, parse_value, text_value
+from mavftpfs.client.options import Flag, Flags, Options, Value, Values, collected, number, text_value
 from mavftpfs.shared.errors import UsageError
 
 KERNEL_WORDS = frozenset(
@@ -140,7 +140,7 @@ def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
     elif name in VALUES:
         if not equals:
             raise UsageError(f"option {name} needs a value ({name}=...)")
-        values[name] = parse_value(VALUES, name, value)
+        values[name] = collected(VALUES, values, name, value)
     elif word not in IGNORED_WORDS and not word.startswith(IGNORED_PREFIXES):
         raise UsageError(_refusal(name, word))
 

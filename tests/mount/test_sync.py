@@ -407,6 +407,25 @@ def test_scan_beside_a_mount_shows_who_else_is_there(field: Field) -> None:
             assert station[:2] == ["255/190", "ground station"]
 
 
+def test_a_port_of_a_mount_that_cannot_share_it_is_said_by_its_name(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = field.sim(field.local("card"))
+    mount = field.mount(vehicle.source)
+    second = field.local("second")
+    monkeypatch.setenv("HOME", str(field.local("home")))  # as another user, who finds no door
+    hidden = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /run && exec "$@"', "sh"]
+    for words in (
+        (vehicle.source, second),
+        ("ls", "-o", "target_system=7", vehicle.source),
+    ):
+        argv = [*hidden, sys.executable, "-m", "mavftpfs", *map(str, words)]
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=60, cwd=PROJECT, check=False)
+        assert done.returncode == 2
+        assert f"the mount on {mount.path}, of vehicle 1/1" in done.stderr
+        assert "another program" not in done.stderr
+
+
 @pytest.mark.parametrize("command", ["scan", "sync", "mount"])
 def test_who_waits_for_a_vehicle_is_told_so(command: str, tmp_path: Path) -> None:
     source = f"udpin:{HOST}:{free_udp_port()}"

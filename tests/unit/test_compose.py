@@ -36,7 +36,7 @@ OTHER: dict[str, Any] = {
 }
 """Values that are no default; numbers are made below."""
 
-ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "log_file", "trace", "tlog"}
+ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "log_file", "trace", "tlog", "forward", "all"}
 """What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
 `test_cli.test_baud_and_relative_paths`."""
 

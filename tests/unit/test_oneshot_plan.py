@@ -12,9 +12,9 @@ from mavftpfs.client import download, fetch, proof
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
 from mavftpfs.client.proof import Verify
-from mavftpfs.client.status import same_link
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.peers import describe_peer
+from mavftpfs.link.rendezvous import same_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import UsageError
 

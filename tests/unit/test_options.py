@@ -241,3 +241,13 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "local",
         "chunk",
     } <= checked
+
+
+def test_endpoints_are_collected() -> None:
+    wanted = ("udpout:127.0.0.1:14550", "tcpin:127.0.0.1:5760")
+    assert parse_options(["forward=udpout:127.0.0.1:14550,forward=tcpin::5760"]).client.forward == wanted
+    assert parse_options([f"forward={place}" for place in (*wanted, wanted[0])]).client.forward == wanted
+    assert options_of({"forward": list(wanted)}).forward == wanted
+    assert options_of({"forward": wanted[0]}).forward == wanted[:1]
+    with pytest.raises(UsageError, match="forward=nowhere"):
+        parse_options(["forward=nowhere"])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_endpoint, parse_source
 from mavftpfs.shared.errors import UsageError
 
 K = LinkKind
@@ -101,3 +101,23 @@ def test_errors_say_what_is_wrong_and_what_is_right(text: str, says: str) -> Non
     assert says in message
     assert "\n" not in message
     assert "for example" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "description"),
+    [
+        ("udpout:127.0.0.1:14550", "udpout:127.0.0.1:14550"),
+        ("udpin::14551", "udpin:127.0.0.1:14551"),
+        ("tcpin://:5760", "tcpin:127.0.0.1:5760"),
+        ("tcpin:0.0.0.0:5760", "tcpin:0.0.0.0:5760"),
+        ("serial:///dev/ttyUSB1:57600", "/dev/ttyUSB1,57600"),
+    ],
+)
+def test_an_endpoint_listens_for_this_computer_unless_it_says_otherwise(text: str, description: str) -> None:
+    assert parse_endpoint(text).description == description
+    assert parse_endpoint(description).description == description
+
+
+def test_an_endpoint_has_no_directory() -> None:
+    with pytest.raises(UsageError, match="no directory"):
+        parse_endpoint("udpout:127.0.0.1:14550#/fs")

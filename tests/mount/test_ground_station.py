@@ -1,0 +1,423 @@
+"""Ground stations beside a mount, on the same port: `forward=`, with real ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.link.frames import Frame, Splitter
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
+from tests.mount.conftest import Field
+from tests.support.flown import PARAMETERS
+from tests.support.mounts import Mount, mavftpfs, wait_until
+from tests.support.vehicles import HOST, PROJECT, Process, free_udp_port
+
+CONTENT = random.Random(1).randbytes(30_000)
+OURS = 254
+KEY = bytes(range(32))
+STATION = Address(255, 190)
+
+
+class Flown(Process):
+    """A vehicle that a ground station can fly. record: each frame on its link."""
+
+    def __init__(self, field: Field, root: Path, link: str, *options: str) -> None:
+        folder = field.local("vehicle")
+        self.record = folder / "frames"
+        words = ["--link", link, "--record", str(self.record), "--telemetry", "1000", *options]
+        argv = [sys.executable, "-m", "tests.support.flown", str(root), *words]
+        super().__init__("flown", argv, folder)
+        wait_until("the vehicle speaks", lambda: bool(self.output.read_text()))
+        self.source = self.output.read_text().split()[1]
+
+
+class Station(Process):
+    """A real ground station."""
+
+    def __init__(self, field: Field, program: str, port: int, *words: str) -> None:
+        folder = field.local("station")
+        self.record = folder / "frames"
+        argv = [sys.executable, "-m", f"tests.support.{program}", str(port), *words]
+        if program == "station":
+            argv += ["--record", str(self.record)]
+        super().__init__(program, argv, folder)
+        wait_until("the station listens", lambda: "ready" in self.output.read_text())
+
+    def results(self) -> Any:
+        """Wait for its end; return what it got."""
+        assert self.wait(200) == 0, self.text()
+        return json.loads(self.output.read_text().splitlines()[-1])
+
+
+@contextmanager
+def ended(*processes: Process) -> Iterator[None]:
+    """End processes after the body."""
+    try:
+        yield
+    finally:
+        for process in processes:
+            if process.running:
+                process.kill()
+
+
+def recorded(path: Path, mark: str) -> list[Frame]:
+    """Return the frames of a record that went one way."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    datagrams = [bytes.fromhex(line[1]) for line in lines if len(line) == 2 and line[0] == mark]
+    return [frame for datagram in datagrams for frame in Splitter(stream=False).feed(datagram)]
+
+
+def assert_passed_on(sent: list[Frame], got: list[Frame], least: int) -> None:
+    """Check that all that was sent arrived, unchanged and in order, from the first that arrived on."""
+    assert len(got) >= least
+    first = next(index for index, frame in enumerate(sent) if frame.data == got[0].data)
+    expected = [frame.data for frame in sent[first : first + len(got)]]
+    assert [frame.data for frame in got] == expected
+
+
+def flown_card(field: Field) -> Path:
+    root = field.local("card")
+    (root / "log.bin").write_bytes(CONTENT)
+    return root
+
+
+def forwarded(port: int) -> str:
+    return f"forward=udpout:{HOST}:{port}"
+
+
+def work_on(mount: Mount, root: Path, station: Process) -> int:
+    """Copy files to and from the vehicle as long as a station works; return how often."""
+    turns = 0
+    while station.running or turns == 0:
+        turns += 1
+        local = mount.folder / f"copy{turns}"
+        mount.run("cp", mount.path / "log.bin", local)
+        assert local.read_bytes() == CONTENT
+        data = CONTENT[turns : turns + 8000]
+        (mount.folder / "up").write_bytes(data)
+        mount.run("cp", mount.folder / "up", mount.path / f"up{turns}")
+        assert (root / f"up{turns}").read_bytes() == data
+        (root / "log.bin").touch()  # so that it is read anew
+    return turns
+
+
+@pytest.mark.parametrize("kind", ["pty", "udp"])
+def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field: Field, kind: str) -> None:
+    root, port = flown_card(field), free_udp_port()
+    rate = ["--rate", "5760"] if kind == "pty" else []
+    link = "pty" if kind == "pty" else f"udpout:{HOST}:{free_udp_port()}"
+    station = Station(field, "station", port, "/log.bin")
+    flown = Flown(field, root, link, *rate)
+    with ended(flown, station):
+        mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
+        work_on(mount, root, station)
+        (results,) = station.results()
+        assert results["parameters"] == PARAMETERS
+        assert results["mission_result"] == 0
+        assert len(results["mission"]) == 12
+        assert bytes.fromhex(results["file"]) in (b"", CONTENT), "the vehicle has one session for both"
+        assert mount.unmount() == 0
+        assert flown.stop() == 0
+        heard = recorded(station.record, "<")
+        sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
+        assert_passed_on(sent, heard, 300)
+        said = recorded(station.record, ">")
+        came = [frame for frame in recorded(flown.record, "<") if frame.source.system != OURS]
+        assert [frame.data for frame in said] == [frame.data for frame in came]
+        assert [frame.target.system for frame in heard].count(OURS) == 0
+
+
+def test_mavsdk_works_beside_the_mount(field: Field) -> None:
+    root, port = flown_card(field), free_udp_port()
+    station = Station(field, "mavsdk_station", port)
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    with ended(flown, station):
+        mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
+        work_on(mount, root, station)
+        results = station.results()
+        assert results["parameters"] == PARAMETERS
+        assert results["attitudes"] >= 10
+        assert mount.unmount() == 0
+
+
+def test_signed_frames_pass_unchanged(field: Field) -> None:
+    root, port = flown_card(field), free_udp_port()
+    key = field.local("key") / "key"
+    key.write_bytes(KEY)
+    key.chmod(0o600)
+    station = Station(field, "station", port, "--key", KEY.hex())
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--key", KEY.hex())
+    with ended(flown, station):
+        mount = field.mount(flown.source, forwarded(port), f"signing_key={key}", "dir_timeout=0")
+        second = field.mount(flown.source, f"signing_key={key}", "dir_timeout=0")
+        work_on(mount, root, station)
+        (results,) = station.results()
+        assert results["parameters"] == PARAMETERS
+        assert second.read_bytes(second.path / "log.bin") == CONTENT
+        assert [one.unmount() for one in (mount, second)] == [0, 0]
+        assert flown.stop() == 0
+        signed = [frame for frame in recorded(flown.record, "<") if frame.source.system == OURS]
+        links = {frame.source.component: frame.data[-13] for frame in signed}
+        assert len(links) == 2
+        assert len(set(links.values())) == 2, "each of ours has a link id of its own"
+        sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
+        assert_passed_on(sent, recorded(station.record, "<"), 200)
+
+
+# -- stations that do harm --------------------------------------------------------------------------
+
+
+class Pest:
+    """An endpoint of the mount that sends what it likes, as fast as it can, until the end of the body."""
+
+    def __init__(self, port: int, datagram: bytes) -> None:
+        self.sent = 0
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind((HOST, port))
+        self._sock.settimeout(30)
+        self._datagram = datagram
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Pest:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._sock.close()
+
+    def _run(self) -> None:
+        _, hub = self._sock.recvfrom(2048)
+        while not self._stop.is_set():
+            with suppress(OSError):
+                self._sock.sendto(self._datagram, hub)
+                self.sent += 1
+            if self.sent % 20 == 0:
+                time.sleep(0.001)  # about 20,000 a second
+
+
+def harms_nothing(field: Field, mount: Mount, root: Path) -> None:
+    """Check that files go both ways."""
+    for turn in range(3):
+        local = mount.folder / f"copy{turn}"
+        mount.run("cp", mount.path / "log.bin", local)
+        assert local.read_bytes() == CONTENT
+        mount.run("cp", local, mount.path / f"up{turn}")
+        assert (root / f"up{turn}").read_bytes() == CONTENT
+        (root / "log.bin").touch()
+
+
+@pytest.mark.parametrize("kind", ["frames", "rubbish", "vehicle", "beats"])
+def test_an_endpoint_that_floods_harms_nobody(field: Field, kind: str) -> None:
+    root, port, other = flown_card(field), free_udp_port(), free_udp_port()
+    station = Framer(STATION, stream=False)
+    datagram = {
+        "frames": station.encode("attitude", 1, 0.1, 0.2, 0.3, 0, 0, 0),
+        "rubbish": random.Random(2).randbytes(900),
+        "vehicle": Framer(Address(1, 1), stream=False).encode_ftp(Address(OURS, 191), bytes([5] * 251)),
+        "beats": station.encode_heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID),
+    }[kind]
+    work = Station(field, "station", other)
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    with ended(flown, work), Pest(port, datagram) as pest:
+        mount = field.mount(flown.source, forwarded(port), forwarded(other), "dir_timeout=0")
+        harms_nothing(field, mount, root)
+        assert work.results()[0]["parameters"] == PARAMETERS
+        assert pest.sent > 1000
+
+
+def test_a_vehicle_that_floods_does_not_slow_the_other(field: Field) -> None:
+    port = free_udp_port()
+    root = flown_card(field)
+    flown = Flown(field, root, f"udpout:{HOST}:{port}", "--system", "1", "--loss", "0.03")
+    stop = threading.Event()
+    sent = 0
+
+    def flood() -> None:
+        nonlocal sent
+        framer = Framer(Address(9, 1), stream=False)
+        frame = framer.encode("attitude", 1, 0.1, 0.2, 0.3, 0, 0, 0)
+        beat = framer.encode_heartbeat(2, 12)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            while not stop.is_set():
+                sock.sendto(beat if sent % 1000 == 0 else frame, (HOST, port))
+                sent += 1
+                if sent % 20 == 0:
+                    time.sleep(0.001)
+
+    thread = threading.Thread(target=flood)
+    with ended(flown):
+        mount = field.mount(f"udpin:{HOST}:{port}", "target_system=1", "dir_timeout=0")
+        mavftpfs("hub")  # a plain mount hears all of it; the hub leaves it out
+        second = field.mount(f"udpin:{HOST}:{port}", "target_system=1", "dir_timeout=0")
+        thread.start()
+        try:
+            harms_nothing(field, mount, root)
+            assert second.read_bytes(second.path / "log.bin") == CONTENT
+        finally:
+            stop.set()
+            thread.join()
+        assert sent > 1000
+
+
+def test_dead_endpoints_and_loops_harm_nobody(field: Field) -> None:
+    root, port = flown_card(field), free_udp_port()
+    flown = Flown(field, root, f"udpout:{HOST}:{port}")
+    dead = [forwarded(free_udp_port()), f"forward=tcp:{HOST}:{free_udp_port()}", forwarded(port)]
+    with ended(flown):
+        mount = field.mount(f"udpin:{HOST}:{port}", *dead, "dir_timeout=0")
+        mount.allowed_log = (r"says that it is 1/1, too",)
+        harms_nothing(field, mount, root)
+
+
+def test_two_stations_with_one_id_both_work(field: Field) -> None:
+    root, ports = flown_card(field), [free_udp_port(), free_udp_port()]
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    stations = [Station(field, "station", port) for port in ports]
+    with ended(flown, *stations):
+        mount = field.mount(flown.source, *map(forwarded, ports), "dir_timeout=0")
+        harms_nothing(field, mount, root)
+        for station in stations:
+            assert station.results()[0]["parameters"] == PARAMETERS
+
+
+# -- the end of the mount ---------------------------------------------------------------------------
+
+
+class Listener:
+    """A ground station that only listens and sends heartbeats; notes when the vehicle's heartbeats came."""
+
+    def __init__(self, port: int) -> None:
+        self.beats: list[float] = []
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind((HOST, port))
+        self._sock.settimeout(0.5)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Listener:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._sock.close()
+
+    def _run(self) -> None:
+        framer = Framer(STATION, stream=False)
+        told = 0.0
+        while not self._stop.is_set():
+            with suppress(TimeoutError):
+                data, hub = self._sock.recvfrom(65536)
+                frames = Splitter(stream=False).feed(data)
+                self.beats += [
+                    time.monotonic() for frame in frames if frame.id == 0 and frame.source.system == 1
+                ]
+                if time.monotonic() - told > 0.5:
+                    told = time.monotonic()
+                    self._sock.sendto(framer.encode_heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID), hub)
+
+
+def hub_facts(source: str) -> dict[str, Any] | None:
+    found: list[dict[str, Any]] = json.loads(mavftpfs("hub", "--json", source)[0])
+    return found[0] if found else None
+
+
+@pytest.mark.parametrize("way", ["umount", "kill"])
+def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) -> None:
+    root, port = flown_card(field), free_udp_port()
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--armed")
+    with ended(flown):
+        with Listener(port) as listener:
+            mount = field.mount(flown.source, forwarded(port))
+            wait_until("the station hears the vehicle", lambda: len(listener.beats) > 2)
+            if way == "umount":
+                assert mount.unmount() == 0
+            else:
+                mount.kill()
+                mavftpfs("umount", mount.path)
+            until = len(listener.beats) + 4
+            wait_until("the station hears it on", lambda: len(listener.beats) >= until)
+            facts = hub_facts(flown.source)
+            assert facts is not None
+            assert facts["armed"] == [1]
+            said, _ = mavftpfs("hub", "--stop", flown.source, code=1)
+            assert "ARMED" in said
+            assert f"udpout:{HOST}:{port}" in said
+            again = field.mount(flown.source)
+            assert again.read_bytes(again.path / "log.bin") == CONTENT
+            assert again.unmount() == 0
+            gaps = [after - before for before, after in zip(listener.beats, listener.beats[1:], strict=False)]
+            assert len(gaps) >= 6
+            assert sorted(gaps)[len(gaps) // 2] < 2, gaps
+            mavftpfs("hub", "--stop", "--force", flown.source)
+        wait_until("the hub is gone", lambda: hub_facts(flown.source) is None)
+
+
+def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
+    root, port = flown_card(field), free_udp_port()
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    with ended(flown), Listener(port) as listener:
+        mount = field.mount(flown.source, forwarded(port))
+        wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
+        assert mount.unmount() == 0
+        wait_until("the hub ended", lambda: hub_facts(flown.source) is None)
+
+
+def test_a_killed_hub_comes_back_with_its_endpoints(field: Field) -> None:
+    root, port = flown_card(field), free_udp_port()
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    with ended(flown), Listener(port) as listener:
+        mount = field.mount(flown.source, forwarded(port))
+        mount.allowed_log = (r"the hub of .* is gone",)
+        wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
+        facts = hub_facts(flown.source)
+        assert facts is not None
+        os.kill(facts["pid"], signal.SIGKILL)
+        until = len(listener.beats) + 3
+        wait_until("the station hears it again", lambda: len(listener.beats) >= until)
+        assert mount.read_bytes(mount.path / "log.bin") == CONTENT
+
+
+# -- what cannot be ---------------------------------------------------------------------------------
+
+
+def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
+    root = flown_card(field)
+    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    place = field.local("place")
+    taken = free_udp_port()
+    with ended(flown), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HOST, taken))
+        for option, code, said in (
+            (f"forward={flown.source}", 1, "is SOURCE itself"),
+            (f"forward=udpin:{HOST}:{taken}", 2, "is in use by another program"),
+            ("forward=serial:///dev/nowhere:57600", 2, "there is no /dev/nowhere"),
+            ("forward=nonsense", 1, "forward=nonsense"),
+            (f"forward=udpout:{HOST}:{taken}#/dir", 1, "no directory"),
+        ):
+            argv = [sys.executable, "-m", "mavftpfs", flown.source, str(place), "-o", option]
+            done = subprocess.run(argv, capture_output=True, text=True, timeout=60, cwd=PROJECT, check=False)
+            assert done.returncode == code, (option, done.stderr)
+            (line,) = done.stderr.splitlines()
+            assert said in line
+        mount = field.mount(flown.source, f"forward=udpin::{free_udp_port()}")
+        assert "udpin:127.0.0.1:" in mavftpfs("hub", flown.source)[0]
+        assert mount.read_bytes(mount.path / "log.bin") == CONTENT

@@ -1,0 +1,153 @@
+"""pymavlink as a ground station, in a process of its own: parameters, a mission, its own FTP client.
+
+    python -m tests.support.station PORT REMOTE --record FILE [--rounds N] [--key HEX]
+
+Listens on the loopback. It works for so many rounds and prints a line of JSON on what it got; --record: each
+frame that came in or went out, as `tests.support.flown` writes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from pymavlink.mavftp import MAVFTP
+
+from mavftpfs.link.frames import Splitter
+
+VEHICLE = (1, 1)
+PATIENCE = 60.0
+ITEMS = 12
+
+
+class RecordedStation(mavutil.mavudp):  # type: ignore[misc]
+    """Writes down what it gets and sends."""
+
+    def __init__(self, port: int, record: Path) -> None:
+        super().__init__(f"127.0.0.1:{port}", input=True, source_system=255, source_component=190)
+        self.record = record.open("w", encoding="ascii")
+        self.lock = threading.Lock()
+        self.splitter = Splitter(stream=False)
+
+    def recv(self, n: int | None = None) -> bytes:
+        data: bytes = super().recv(n)
+        if data:
+            self.note("<", data)
+        return data
+
+    def write(self, buf: bytes) -> None:
+        self.note(">", bytes(buf))
+        super().write(buf)
+
+    def note(self, mark: str, data: bytes) -> None:
+        with self.lock:
+            for frame in Splitter(stream=False).feed(data):
+                print(mark, frame.data.hex(), file=self.record, flush=True)
+
+
+def beat(station: RecordedStation, stop: threading.Event) -> None:
+    """Send heartbeats until told to stop."""
+    own = dialect.MAVLink(None, 255, 191)  # a component of its own: pymavlink's counter is not thread-safe
+    while not stop.wait(0.5):
+        station.write(own.heartbeat_encode(6, 8, 0, 0, 0).pack(own))
+
+
+def parameters(station: RecordedStation) -> dict[str, float]:
+    """Download all parameters, and ask again for what is missing, as ground stations do."""
+    station.mav.param_request_list_send(*VEHICLE)
+    found: dict[int, tuple[str, float]] = {}
+    count, deadline = 1, time.monotonic() + PATIENCE
+    while len(found) < count and time.monotonic() < deadline:
+        message = station.recv_match(type="PARAM_VALUE", blocking=True, timeout=2)
+        if message is None:
+            for number in [number for number in range(count) if number not in found][:10]:
+                station.mav.param_request_read_send(*VEHICLE, b"", number)
+            continue
+        count = message.param_count
+        found[message.param_index] = (message.param_id, message.param_value)
+    return dict(found.values())
+
+
+def upload_mission(station: RecordedStation) -> int:
+    """Put a mission on the vehicle; return what it says."""
+    station.mav.mission_count_send(*VEHICLE, ITEMS)
+    while True:
+        kinds = ["MISSION_REQUEST_INT", "MISSION_ACK"]
+        message = station.recv_match(type=kinds, blocking=True, timeout=PATIENCE)
+        assert message is not None, "the vehicle asks for no item"
+        if message.get_type() == "MISSION_ACK":
+            return int(message.type)
+        place = (473977418 + message.seq, 85455938, 50.0)
+        station.mav.mission_item_int_send(*VEHICLE, message.seq, 3, 16, 0, 1, 0, 0, 0, 0, *place)
+
+
+def download_mission(station: RecordedStation) -> list[int]:
+    """Return the latitudes of the mission on the vehicle."""
+    station.mav.mission_request_list_send(*VEHICLE)
+    message = station.recv_match(type="MISSION_COUNT", blocking=True, timeout=PATIENCE)
+    assert message is not None, "no mission"
+    found = []
+    for number in range(message.count):
+        station.mav.mission_request_int_send(*VEHICLE, number)
+        item = station.recv_match(type="MISSION_ITEM_INT", blocking=True, timeout=PATIENCE)
+        assert item is not None
+        assert item.seq == number
+        found.append(item.x)
+    return found
+
+
+def fetch(station: RecordedStation, remote: str) -> str:
+    """Fetch a file by pymavlink's own client; return it in hex."""
+    with tempfile.TemporaryDirectory() as folder:
+        local = Path(folder) / "file"
+        ftp = MAVFTP(station, *VEHICLE)
+        ftp.cmd_get([remote, str(local)])
+        ftp.process_ftp_reply("OpenFileRO", timeout=PATIENCE)
+        return local.read_bytes().hex() if local.exists() else ""
+
+
+def main() -> int:
+    """Work as the arguments say."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("port", type=int)
+    parser.add_argument("remote", nargs="?")
+    parser.add_argument("--record", type=Path, required=True)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--key", type=bytes.fromhex)
+    args = parser.parse_args()
+    station = RecordedStation(args.port, args.record)
+    if args.key is not None:
+        station.setup_signing(args.key, sign_outgoing=True)
+    print("ready", flush=True)
+    assert station.wait_heartbeat(timeout=PATIENCE) is not None
+    stop = threading.Event()
+    beating = threading.Thread(target=beat, args=(station, stop))
+    if args.key is None:
+        beating.start()
+    results: list[dict[str, Any]] = []
+    for _ in range(args.rounds):
+        began = time.monotonic()
+        facts: dict[str, Any] = {"parameters": parameters(station)}
+        facts["seconds"] = time.monotonic() - began
+        facts["mission_result"] = upload_mission(station)
+        facts["mission"] = download_mission(station)
+        if args.remote:
+            facts["file"] = fetch(station, args.remote)
+        results.append(facts)
+    stop.set()
+    if args.key is None:
+        beating.join()
+    print(json.dumps(results), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
