@@ -53,7 +53,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
         except (FileChanged, LocalProtocolError) as error:
             if node.base is not base:
                 continue  # we changed it there ourselves meanwhile
-            if isinstance(error, FileChanged) and node.draft is not None and not node.changing:
+            if isinstance(error, FileChanged) and node.draft and not context.is_changing(node.path):
                 context.on_replaced(node, node.draft)
             raise
 

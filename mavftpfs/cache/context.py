@@ -13,6 +13,7 @@ from mavftpfs.cache.nodes import Node, Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.versions import became_another
@@ -40,6 +41,7 @@ class Context:
     paths: PathLocks
     spool: Spool
     nodes: Nodes = field(default_factory=Nodes)
+    unfinished: Replacements = field(default_factory=Replacements)
     times: Times = field(default_factory=Times)
     blocked: bool = False
     retry_later: Callable[[], None] = lambda: None
@@ -77,7 +79,7 @@ class Context:
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""
         node = self.nodes.get(path)
-        return path in self.own.torn or (node is not None and node.changing)
+        return self.unfinished.is_open(path) or (node is not None and node.changing)
 
     def on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed: notice which files others replaced since they were opened or delivered
@@ -88,7 +90,7 @@ class Context:
             draft = node.draft
             if entry is None or draft is None or draft.base is None or directory.listed_at <= node.known_at:
                 continue
-            if node.changing or draft.state not in (State.CLEAN, State.DIRTY):
+            if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue
             if became_another(draft.base.size, draft.base.mtime, entry):
                 self.on_replaced(node, draft)

@@ -104,7 +104,7 @@ class Deliverer:
                         return
                     with trio.CancelScope() as node.delivery:  # who cancels it has it begin again
                         try:
-                            if node.path not in context.own.torn:  # else its name lacks a file until then
+                            if not context.unfinished.lacks_file(node.path):  # else it gets its file first
                                 context.require_disarmed()
                             await self._try(node, draft)
                             node.error, node.start_after = None, float("-inf")
@@ -134,7 +134,7 @@ class Deliverer:
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.unacked < START_AT or not may_pass(node):
             return
-        if draft.state is State.TORN or node.path in context.own.torn or not draft.whole:
+        if context.unfinished.is_open(node.path) or not draft.whole:
             node.start_after = float("inf")
             return
         try:
@@ -185,7 +185,7 @@ class Deliverer:
                 return None
             there: bool | None = False
             try:
-                if draft.state is State.TORN:
+                if context.unfinished.is_open(node.path):
                     await self._mend(node, draft)
                     if not node.undelivered:
                         return True
@@ -225,7 +225,7 @@ class Deliverer:
         while True:
             in_place = store.traits.rename_works is False
             try:
-                if draft.state is State.TORN or node.path in self._context.own.torn:
+                if self._context.unfinished.is_open(node.path):
                     await self._mend(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
@@ -250,19 +250,17 @@ class Deliverer:
         Raises:
             As Directories.ask and Verifier.check.
         """
+        context = self._context
         await self._cleaner.mend(node)
-        there = await self._context.directories.current(node.path)
-        self._context.own.torn.pop(node.path, None)
-        if draft.state is not State.TORN:
-            return
+        there = await context.directories.current(node.path)
+        record = context.unfinished.get(node.path)
         if there is None:
             draft.base = None
-        else:
+        elif record is not None and record.placed is None and draft.whole:
             with suppress(VerificationFailed):
                 crc32 = await self.verifier.check(node.path, draft, doubted=True)
                 self._on_delivered(node, draft, crc32)
-                return
-        draft.on(Event.REFUSED)
+        context.unfinished.end(node.path)
 
     # --- sending
 
@@ -392,6 +390,7 @@ class Deliverer:
             As Names.rename and replace, and as _confirm.
         """
         own, store, path = self._context.own, self._context.store, node.path
+        unfinished = self._context.unfinished
         node.attempt = None
         try:
             await attempt.upload.end()
@@ -406,7 +405,8 @@ class Deliverer:
             draft.give_up()  # unless it commits already
             if draft.state is State.COMMITTING:
                 unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-                if unknown or path in own.torn:
+                if unknown or unfinished.is_open(path):
+                    unfinished.on_unknown(path)
                     draft.interrupted()
                 else:
                     draft.on(Event.REFUSED)
@@ -423,7 +423,7 @@ class Deliverer:
         have taken it away, and some server may ACK a rename and do something else.
 
         Raises:
-            VerificationFailed: it is not there. Else as Verifier.check. The draft is torn then.
+            VerificationFailed: it is not there. Else as Verifier.check. The replacement is unfinished then.
         """
         store, path = self._context.store, node.path
         doubted, unproven = store.in_doubt(attempt.begun_at), store.traits.rename_works is None
@@ -433,6 +433,8 @@ class Deliverer:
             elif attempt.upload.resent and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
+            old = self._context.unfinished.on_unknown(path).aside
+            self._context.own.live.discard(old or b"")  # if the name has no file the old one is given back
             draft.interrupted(ours=True)
             if unproven and isinstance(error, VerificationFailed):
                 await self._names.find_out(path)

@@ -30,16 +30,16 @@ class State(Enum):
     """How far the vehicle has a draft.
 
     CLEAN: it has all of it. DIRTY: it does not, and nothing is under way. SENDING: a new file is written
-    under a reserved name. COMMITTING: that file is verified and being renamed into place. TORN: the renames
-    were interrupted, so nobody knows whether it was delivered (`OwnNames.torn`: which names may lack their
-    file). STALE: the base is another file now.
+    under a reserved name. COMMITTING: that file is verified and being renamed into place. STALE: the base is
+    another file now.
+
+    If the renames were interrupted it is DIRTY, and may be on the vehicle all the same: `replacements` knows.
     """
 
     CLEAN = "clean"
     DIRTY = "dirty"
     SENDING = "sending"
     COMMITTING = "committing"
-    TORN = "torn"
     STALE = "stale"
 
 
@@ -49,7 +49,7 @@ class Event(Enum):
     CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
     BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
     is verified, and the first rename is about to be asked for. PLACED: it has its name. REFUSED: it has not,
-    and all is where it was. INTERRUPTED: nobody knows how far that came. REPLACED: others replaced the base.
+    or nobody knows. REPLACED: others replaced the base.
     """
 
     CHANGED = "changed"
@@ -59,7 +59,6 @@ class Event(Enum):
     COMMITS = "commits"
     PLACED = "placed"
     REFUSED = "refused"
-    INTERRUPTED = "interrupted"
     REPLACED = "replaced"
 
 
@@ -73,6 +72,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
         Event.CHANGED: State.DIRTY,
         Event.EMPTIED: State.DIRTY,
         Event.BEGUN: State.SENDING,
+        Event.PLACED: State.CLEAN,
         Event.REPLACED: State.STALE,
     },
     State.SENDING: {
@@ -82,13 +82,6 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
         Event.COMMITS: State.COMMITTING,
     },
     State.COMMITTING: {
-        Event.PLACED: State.CLEAN,
-        Event.REFUSED: State.DIRTY,
-        Event.INTERRUPTED: State.TORN,
-    },
-    State.TORN: {
-        Event.CHANGED: State.DIRTY,
-        Event.EMPTIED: State.DIRTY,
         Event.PLACED: State.CLEAN,
         Event.REFUSED: State.DIRTY,
     },
@@ -284,7 +277,7 @@ class Draft:
     def interrupted(self, *, ours: bool = False) -> None:
         """Nobody knows which file has the name now; all of the draft is known here, so none matters. ours:
         what has the name is what was sent, or what became of it."""
-        self.on(Event.INTERRUPTED)
+        self.on(Event.REFUSED)
         self.base_limit = 0
         if ours:
             self.base = Base(self.size)
@@ -326,7 +319,7 @@ class Draft:
         assert self.base_limit <= self.size
         assert (self.sending is not None) == (self.state is State.SENDING)
         assert self.base is not None or self.base_limit == 0
-        if self.state in (State.SENDING, State.COMMITTING, State.TORN):
+        if self.state in (State.SENDING, State.COMMITTING):
             assert self.whole
 
     # --- inside

@@ -10,8 +10,8 @@ A new file is renamed to a name that is free, and never over anything. A file th
 rename where the server does that in one step; else (FAT refuses it, NuttX removes the target first) the old
 file is moved aside, and removed when the new one has its name. `repair` says how an interruption is mended.
 Between these two requests the name lacks its file, so the second one is sent even if the vehicle was armed
-meanwhile. If it cannot be sent (the link is lost), the name is *torn*: programs go on seeing it, and the next
-listing, of which the first comes when the link is back, gives it its file again.
+meanwhile. If it cannot be sent (the link is lost), the replacement is unfinished (`replacements`): programs
+go on seeing the name, and the next listing gives it its file; the first one comes when the link is back.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.replacements import Replacement
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
 from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.protocol.payload import NakCode
@@ -233,14 +234,19 @@ class Names:
         await self._forget_old(path)
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
-        needed = own.live | set(own.torn.values()) - {own.torn.get(path)}
+        ended = self._context.unfinished.end(path)
+        needed = own.live | self._context.unfinished.asides()
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
             if reserved is None or reserved.owner != own.owner or left in needed:
                 continue
             if reserved.target in (name, None):
-                await self.remove_if_there(left)
-        own.torn.pop(path, None)
+                try:
+                    await self.remove_if_there(left)
+                except BaseException:
+                    if ended is not None:
+                        self._context.unfinished.put(path, ended)
+                    raise
 
     # --- giving a verified file its name
 
@@ -257,7 +263,7 @@ class Names:
 
         Raises:
             NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
-            again then, unless the name is torn.
+            again then, unless the replacement is unfinished.
         """
         traits = self._context.store.traits
         if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
@@ -287,7 +293,7 @@ class Names:
             await self.rename(source, target, completes=moved, compared=compared)
         except (OutcomeUnknown, trio.Cancelled):
             if moved is not False:
-                self._note_torn(target, aside)
+                self._note_unfinished(target, aside, placed=None if moved else False)
             raise
         except MavftpfsError:
             if moved:
@@ -297,7 +303,7 @@ class Names:
             if moved and not keep_old:
                 await self._discard_old(target, aside)
         finally:
-            if own.old.get(target, (b"", 0.0))[0] != aside:
+            if self._context.unfinished.owner_of(aside) is None or self._context.unfinished.is_open(target):
                 own.live.discard(aside)
         if not (moved and keep_old):
             return None
@@ -313,27 +319,30 @@ class Names:
         if not context.store.in_doubt():
             await self.discard(aside)
             context.own.live.discard(aside)
-        context.own.old[target] = (aside, context.clock() + KEEP_OLD)
+        context.unfinished.put(target, Replacement(aside, placed=True, until=context.clock() + KEEP_OLD))
         context.retry_later()
 
     async def _forget_old(self, path: bytes) -> None:
         """Remove the old file of this name that is kept, if one is: the name is about to change again."""
-        own = self._context.own
-        aside, _ = own.old.pop(path, (b"", 0.0))
-        if aside in own.live:
-            own.live.discard(aside)
-            await self.remove_if_there(aside)
+        own, unfinished = self._context.own, self._context.unfinished
+        record = unfinished.get(path)
+        if record is None or not record.placed:
+            return
+        unfinished.end(path)
+        if record.aside in own.live:
+            own.live.discard(record.aside)
+            await self.remove_if_there(record.aside)
 
-    def _note_torn(self, path: bytes, place: bytes) -> None:
-        """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""
+    def _note_unfinished(self, path: bytes, aside: bytes, *, placed: bool | None) -> None:
+        """The file of a name may lie aside for now: show it on, and have that listed."""
         context = self._context
-        entry = context.directories.entry(path) or context.directories.entry(place)
+        entry = context.directories.entry(path) or context.directories.entry(aside)
         if entry is not None:
             context.directories.put(path, entry)
-        context.own.torn[path] = place
+        context.unfinished.put(path, Replacement(aside, placed=placed))
         context.retry_later()
         context.directories.expire(split(path)[0])
-        log.warning("%r may lie under %r until the vehicle is heard again", path, place)
+        log.warning("%r may lie under %r until the vehicle is heard again", path, aside)
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
@@ -349,7 +358,7 @@ class Names:
         try:
             await self.rename(place, path, completes=True)
         except BaseException as error:
-            self._note_torn(path, place)
+            self._note_unfinished(path, place, placed=False)
             if not isinstance(error, MavftpfsError):
                 raise
             log.debug("%r did not get its file back: %s", path, error)

@@ -19,7 +19,7 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import Base, State
+from mavftpfs.cache.draft import Base
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
@@ -135,7 +135,7 @@ class Namespace:
         entry = await context.directories.current(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # what else has its name by now is not to be removed
-            there &= draft.base is not None or draft.begun or draft.state is State.TORN
+            there &= draft.base is not None or draft.begun or context.unfinished.is_open(path)
         elif entry is None:
             raise NotFound(f"{path!r} does not exist")
         elif not there:
@@ -198,6 +198,7 @@ class Namespace:
         context.files.on_renamed(old, new)
         context.nodes.rename(old, new)
         context.own.follow_rename(old, new)
+        context.unfinished.follow_rename(old, new)
         self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:

@@ -86,9 +86,9 @@ class Node:
 
     @property
     def changing(self) -> bool:
-        """Whether what has its name on the vehicle is being changed, or was perhaps."""
+        """Whether what has its name on the vehicle is being changed (see Context.is_changing)."""
         draft = self.draft
-        return draft is not None and (draft.begun or draft.state in (State.COMMITTING, State.TORN))
+        return draft is not None and (draft.begun or draft.state is State.COMMITTING)
 
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:

@@ -63,40 +63,51 @@ class Cleaner:
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
-        own = self._context.own
+        unfinished = self._context.unfinished
+        owners = {record.aside: owner for owner, record in unfinished if record.aside is not None}
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
         if directory is self._context.directories.known(path):
-            for torn in list(own.torn):
-                parent, name = split(torn)
-                if parent == path and name in directory.entries:
-                    del own.torn[torn]  # it is whole again
+            for owner, record in unfinished:
+                parent, name = split(owner)
+                if parent == path and name in directory.entries and record.lacks_file:
+                    self._on_found(owner)
         if path in self._busy or not reserved:
             return
         self._busy.add(path)
         try:
             for left, ours in leftovers(path, reserved, self._is_dead)[:MAX_LEFTOVERS]:
-                if not self._context.blocked or left in own.torn.values():
-                    await self._mend(left, ours)
+                if not self._context.blocked or left in unfinished.asides():
+                    await self._mend(left, ours, owners.get(left))
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
         finally:
             self._busy.discard(path)
 
-    async def mend_torn(self) -> None:
-        """The vehicle is heard again: give names that may lack their files what belongs to them."""
-        own = self._context.own
-        for directory in {split(place)[0] for place in own.torn.values() if place not in own.live}:
-            await self._list(directory)
+    async def finish(self, *, at_once: bool = False) -> None:
+        """Give names that may lack their files what belongs to them, and remove old files that were kept long
+        enough, or `at_once`. A listing of their directories does both.
 
-    async def remove_old(self, *, at_once: bool = False) -> None:
-        """Have the old files removed that were kept long enough: a listing shows whether the new ones are
-        there. One that was removed at once is looked for only if copies of requests came meanwhile."""
-        own, now = self._context.own, self._context.clock()
-        due = [path for path, (_, until) in own.old.items() if at_once or until <= now]
-        for path in due:
-            own.live.discard(own.old.pop(path)[0])
-        for directory in {split(path)[0] for path in due if self._context.store.in_doubt()}:
-            await self._list(directory)
+        Of an old file that was removed already only a copy of a request can have made another one.
+        """
+        context, now = self._context, self._context.clock()
+        directories = set()
+        for path, record in context.unfinished:
+            if record.lacks_file and record.aside not in context.own.live:
+                directories.add(split(path)[0])
+            elif record.aside is None and not self._is_asked_for(path):
+                context.unfinished.end(path)
+            elif record.placed and (at_once or record.until <= now):
+                context.own.live.discard(record.aside or b"")
+                if not context.store.in_doubt():
+                    context.unfinished.end(path)
+                    continue
+                directories.add(split(path)[0])
+                record.until = now
+        for directory in directories:
+            if await self._list(directory):
+                for path, record in context.unfinished:
+                    if split(path)[0] == directory and record.placed and record.until <= now:
+                        context.unfinished.end(path)
 
     async def mend(self, node: Node) -> None:
         """Do so for one file, whose lock the caller has."""
@@ -108,11 +119,27 @@ class Cleaner:
 
     # --- inside
 
-    async def _list(self, directory: bytes) -> None:
+    async def _list(self, directory: bytes) -> bool:
         try:
             await self._context.directories.ask(directory)
         except MavftpfsError as error:
             log.info("%r is mended at a later listing: %s", directory, error)
+            return False
+        return True
+
+    def _on_found(self, path: bytes) -> None:
+        """The name has a file: if a draft wants to know whether it is the new one, it compares that."""
+        unfinished = self._context.unfinished
+        record = unfinished.get(path)
+        if record is not None and record.placed is None and self._is_asked_for(path):
+            record.aside = None
+        else:
+            unfinished.end(path)
+
+    def _is_asked_for(self, path: bytes) -> bool:
+        """Return whether a draft of this path waits to be delivered."""
+        node = self._context.nodes.get(path)
+        return node is not None and node.undelivered
 
     def _is_dead(self, path: bytes, owner: bytes, entry: DirEntry) -> bool:
         if path in self._context.own.live:
@@ -126,11 +153,10 @@ class Cleaner:
                 del self._seen[next(iter(self._seen))]
         return now - seen[1] >= STALE_AFTER
 
-    async def _mend(self, left: bytes, name: Reserved) -> None:
-        """Remove what is left, or give it its name."""
+    async def _mend(self, left: bytes, name: Reserved, owner: bytes | None) -> None:
+        """Remove what is left, or give it its name. owner: the path whose replacement left it, if known."""
         context, parent = self._context, split(left)[0]
-        torn = [path for path, place in context.own.torn.items() if place == left]
-        target = torn[0] if torn else join(parent, name.target or b"recovered-o" + name.serial)
+        target = owner or join(parent, name.target or b"recovered-o" + name.serial)
         if name.kind is not Kind.OLD or await self._exists(target):
             await self._names.remove(left)
         else:
@@ -138,8 +164,9 @@ class Cleaner:
             if node is not None and node.delivery is not None and node not in self._being_delivered:
                 return  # it is being written here: a later listing shows what came of it
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
-            await self._names.rename(left, target, completes=bool(torn))
-            context.own.mended(left)
+            await self._names.rename(left, target, completes=owner is not None)
+            if owner is not None:
+                self._on_found(owner)
 
     async def _exists(self, path: bytes) -> bool:
         with suppress(NotFound, NotADirectory):

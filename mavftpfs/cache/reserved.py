@@ -23,7 +23,6 @@ from mavftpfs.shared.model import (
     MAX_WIRE_PATH,
     RENAME_ROOM,
     join,
-    rename_keys,
     renamed,
     split,
     wire_path,
@@ -107,17 +106,11 @@ class OwnNames:
     Attributes:
         owner: the mount's token.
         live: names in use, so no listing's repair touches them.
-        old: paths that were replaced -> the name under which the old file lies, or lay, and until when it is
-            to be looked for there, by the caches' clock.
-        torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies. What
-            became of a draft is another question: its state says that.
     """
 
     def __init__(self, owner: bytes, rng: Random) -> None:
         self.owner = owner
         self.live: set[bytes] = set()
-        self.old: dict[bytes, tuple[bytes, float]] = {}
-        self.torn: dict[bytes, bytes] = {}
         self._serial = rng.randrange(_SERIALS)
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
@@ -132,18 +125,8 @@ class OwnNames:
                 return path
         raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
 
-    def mended(self, place: bytes) -> None:
-        """What lay there has its name again."""
-        self.torn = {path: where for path, where in self.torn.items() if where != place}
-
     def follow_rename(self, old: bytes, new: bytes) -> None:
         """A directory has another name."""
-        rename_keys(self.torn, old, new)
-        rename_keys(self.old, old, new)
-        for path, (place, until) in self.old.items():
-            self.old[path] = (renamed(place, old, new), until)
-        for path, place in self.torn.items():
-            self.torn[path] = renamed(place, old, new)
         for path in list(self.live):
             self.live.remove(path)
             self.live.add(renamed(path, old, new))

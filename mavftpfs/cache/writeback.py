@@ -18,7 +18,7 @@ import trio
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.draft import Base, State
+from mavftpfs.cache.draft import Base
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
@@ -211,7 +211,7 @@ class Writeback:
         async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
-            if node.writers or draft is None or draft.begun or draft.state is State.TORN:
+            if node.writers or draft is None or self._context.is_changing(node.path):
                 return
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
@@ -235,8 +235,8 @@ class Writeback:
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
-        if self._context.own.old and self._context.store.why_lost() is None:
-            await self._cleaner.remove_old(at_once=True)
+        if self._context.unfinished and self._context.store.why_lost() is None:
+            await self._cleaner.finish(at_once=True)
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
@@ -270,7 +270,7 @@ class Writeback:
 
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
-        if self._nursery is not None and (self._context.own.torn or self.undelivered()):
+        if self._nursery is not None and (self._context.unfinished or self.undelivered()):
             self._nursery.start_soon(self._try_all)
 
     def status(self) -> dict[str, object]:
@@ -294,7 +294,7 @@ class Writeback:
 
     async def _try_all(self) -> None:
         """What failed, or was refused, may work now."""
-        await self._cleaner.mend_torn()
+        await self._cleaner.finish()
         for node in self._context.nodes:
             node.start_after = float("-inf")
         await self._deliver_each(self._is_left_to_us)
@@ -320,17 +320,16 @@ class Writeback:
     async def _retry(self) -> None:
         """Try again, ever more seldom, as long as that may help: a link that fails and returns between two
         looks at its heartbeats is no news to anybody."""
-        nodes, own, (pause, longest) = self._context.nodes, self._context.own, PAUSES
+        nodes, unfinished, (pause, longest) = self._context.nodes, self._context.unfinished, PAUSES
         try:
-            while own.torn or own.old or any(n.undelivered and may_pass(n) for n in nodes):
+            while unfinished or any(n.undelivered and may_pass(n) for n in nodes):
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
-                await self._cleaner.mend_torn()
-                await self._cleaner.remove_old()
+                await self._cleaner.finish()
                 await self._deliver_each(lambda node: may_pass(node) and self._is_left_to_us(node))
         finally:
             self._retrying = False
 
     def _is_left_to_us(self, node: Node) -> bool:
         """Nobody writes it any more, or its name may lack a file."""
-        return not node.writers or node.path in self._context.own.torn
+        return not node.writers or self._context.unfinished.lacks_file(node.path)

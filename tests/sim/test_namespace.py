@@ -13,6 +13,7 @@ import trio
 from mavftpfs.cache import repair
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.options import MIN_CACHE_SIZE
+from mavftpfs.cache.replacements import Replacement
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.writeback import PAUSES
@@ -388,7 +389,7 @@ async def test_removing_a_torn_file_removes_it(torn: Rig, path: bytes) -> None:
     speak(torn)
     await tree.unlink(path)
     assert tree._writing is not None
-    assert tree._writing._context.own.torn == {}
+    assert not tree._writing._context.unfinished
     await list_all(torn, tree)
     assert set(torn.files()) == {*FILES, FILE, OTHER} - {path}
 
@@ -412,20 +413,21 @@ async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(torn: Rig)
     await file.release()
 
 
-async def test_only_a_listing_that_counts_proves_a_torn_name_whole(torn: Rig) -> None:
-    """One that began before the name was torn shows it because we said so."""
+async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: Rig) -> None:
+    """One that began before the interruption shows it because we said so."""
     tree = torn.mount()
     assert tree._writing is not None
-    own = tree._writing._context.own
+    own, unfinished = tree._writing._context.own, tree._writing._context.unfinished
     torn.take(FILE)
-    own.torn[FILE] = b"/d/" + Reserved(own.owner, Kind.OLD, b"sss", b"file.txt").name
+    aside = b"/d/" + Reserved(own.owner, Kind.OLD, b"sss", b"file.txt").name
+    unfinished.put(FILE, Replacement(aside, placed=False))
     now = trio.current_time()
     shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True)
     await tree._writing._cleaner.on_swept(b"/d", shown)
-    assert list(own.torn) == [FILE]
+    assert unfinished.lacks_file(FILE)
     torn.put(FILE, OLD)
     await tree.list(b"/d")
-    assert own.torn == {}
+    assert not unfinished
 
 
 @pytest.mark.parametrize("profile", RENAMING)

@@ -66,14 +66,14 @@ def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) 
         assert draft.state is state
 
 
-def test_an_interrupted_commit_is_torn_and_no_base_counts_any_more() -> None:
+def test_after_an_interrupted_commit_no_base_counts_any_more() -> None:
     draft = draft_over(b"old")
     draft.fill(0, b"old")
     draft.write(0, b"X")
     draft.begin(in_place=False)
     draft.on(Event.COMMITS)
     draft.interrupted()
-    assert draft.state is State.TORN
+    assert draft.state is State.DIRTY
     draft.lose_base()
     draft.write(0, b"Y")
     assert draft.local_bytes(0, 3) == b"Yld"
@@ -200,7 +200,7 @@ class DraftMachine(RuleBasedStateMachine):
         if self.draft.sending is not None:
             self.draft.sending.check_point()
 
-    @rule(end=st.sampled_from(["placed", "refused", "torn and placed", "torn and refused"]))
+    @rule(end=st.sampled_from(["placed", "refused", "interrupted, and placed", "interrupted"]))
     def finish(self, end: str) -> None:
         """Everything is sent: the remote file is the model."""
         sending = self.draft.sending
@@ -214,12 +214,12 @@ class DraftMachine(RuleBasedStateMachine):
             self.answer(0, 12)
         assert self.remote == self.model
         self.draft.on(Event.COMMITS)
-        if end.startswith("torn"):
+        if end.startswith("interrupted"):
             self.draft.interrupted()
         if end.endswith("placed"):
             self.draft.delivered()
             self.base = bytes(self.model)
-        else:
+        elif end == "refused":
             self.draft.on(Event.REFUSED)
         assert (self.draft.state is State.CLEAN) == end.endswith("placed")
 

@@ -58,6 +58,7 @@ PURE_MODULES = {
     "cache.attributes",
     "cache.options",
     "cache.readahead",
+    "cache.replacements",
     "cache.reserved",
     "cache.draft",
     "client.flights",

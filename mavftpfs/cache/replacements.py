@@ -1,0 +1,97 @@
+"""Replacements of files that are not finished. Layer: cache; pure.
+
+A file is replaced by one rename, or by three requests: the old file moves aside, the new one gets the name,
+and the old one is removed. If they are interrupted, one record says what is known of the name. It is made
+where the interruption is noticed (`names`, `delivery`). The cleaner (`repair`) ends it; a draft asks it.
+
+  aside   placed   the name has
+  none    None     the new file, the old one, or nothing: a single rename was interrupted
+  set     None     the new file or nothing: the old one was moved aside
+  set     False    the old file or nothing: it was perhaps moved aside, and perhaps back
+  set     True     the new file; the old one lies aside for some seconds more
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+
+from mavftpfs.shared.model import rename_keys, renamed
+
+
+@dataclass(slots=True)
+class Replacement:
+    """What is known of one name.
+
+    aside: where the old file lies, or may lie; None if none does. placed: whether the new file has the name;
+    None if that is not known. until: when the old file is to be removed, by the caches' clock.
+    """
+
+    aside: bytes | None = None
+    placed: bool | None = None
+    until: float = inf
+
+    @property
+    def lacks_file(self) -> bool:
+        """Whether the name may have no file, and the old one waits to be moved back."""
+        return self.aside is not None and self.placed is not True
+
+
+class Replacements:
+    """The unfinished replacements of a mount, by path."""
+
+    def __init__(self) -> None:
+        self._records: dict[bytes, Replacement] = {}
+
+    def __iter__(self) -> Iterator[tuple[bytes, Replacement]]:
+        """Yield paths and records; ending some meanwhile is fine."""
+        return iter(list(self._records.items()))
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._records)
+
+    def get(self, path: bytes) -> Replacement | None:
+        """Return the record of a path."""
+        return self._records.get(path)
+
+    def put(self, path: bytes, record: Replacement) -> None:
+        """Note what is known of a path from now on."""
+        self._records[path] = record
+
+    def is_open(self, path: bytes) -> bool:
+        """Return whether what has the name is not known."""
+        record = self._records.get(path)
+        return record is not None and record.placed is not True
+
+    def lacks_file(self, path: bytes) -> bool:
+        """Return whether the name may have no file (see Replacement)."""
+        record = self._records.get(path)
+        return record is not None and record.lacks_file
+
+    def on_unknown(self, path: bytes) -> Replacement:
+        """Nobody knows whether the new file has the name; return what is known."""
+        record = self._records.setdefault(path, Replacement())
+        if record.placed:
+            record.placed, record.until = None, inf
+        return record
+
+    def end(self, path: bytes) -> Replacement | None:
+        """Nothing of it is open any more; return what was known."""
+        return self._records.pop(path, None)
+
+    def owner_of(self, aside: bytes) -> bytes | None:
+        """Return the path whose old file lies there."""
+        return next((path for path, record in self._records.items() if record.aside == aside), None)
+
+    def asides(self) -> set[bytes]:
+        """Return where files lie that may have to be moved back."""
+        return {record.aside for record in self._records.values() if record.lacks_file and record.aside}
+
+    def follow_rename(self, old: bytes, new: bytes) -> None:
+        """A directory has another name."""
+        rename_keys(self._records, old, new)
+        for record in self._records.values():
+            if record.aside is not None:
+                record.aside = renamed(record.aside, old, new)

@@ -1,0 +1,56 @@
+"""The record of a replacement that is not finished: what it says of the name."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.cache.replacements import Replacement, Replacements
+
+FILE, ASIDE = b"/d/f", b"/d/.aside"
+
+
+@pytest.mark.parametrize(
+    ("aside", "placed", "is_open", "lacks_file"),
+    [
+        (None, None, True, False),
+        (ASIDE, None, True, True),
+        (ASIDE, False, True, True),
+        (ASIDE, True, False, False),
+    ],
+)
+def test_what_is_known_of_a_name(
+    aside: bytes | None, placed: bool | None, is_open: bool, lacks_file: bool
+) -> None:
+    unfinished = Replacements()
+    assert not unfinished.is_open(FILE)
+    assert not unfinished.lacks_file(FILE)
+    unfinished.put(FILE, Replacement(aside, placed))
+    assert unfinished.is_open(FILE) == is_open
+    assert unfinished.lacks_file(FILE) == lacks_file
+    assert unfinished.asides() == ({aside} if lacks_file else set())
+
+
+@pytest.mark.parametrize(("placed", "then"), [(None, None), (False, False), (True, None)])
+def test_that_the_new_file_is_not_there_stays_known(placed: bool | None, then: bool | None) -> None:
+    unfinished = Replacements()
+    unfinished.put(FILE, Replacement(ASIDE, placed, until=7.0))
+    unfinished.on_unknown(FILE)
+    record = unfinished.end(FILE)
+    assert record is not None
+    assert (record.aside, record.placed) == (ASIDE, then)
+    assert not unfinished
+
+
+def test_a_single_rename_was_interrupted() -> None:
+    unfinished = Replacements()
+    unfinished.on_unknown(FILE)
+    assert list(unfinished) == [(FILE, Replacement())]
+    assert unfinished.owner_of(ASIDE) is None
+
+
+def test_records_follow_the_directory() -> None:
+    unfinished = Replacements()
+    unfinished.put(FILE, Replacement(ASIDE, placed=False))
+    unfinished.follow_rename(b"/d", b"/e")
+    assert unfinished.get(FILE) is None
+    assert unfinished.owner_of(b"/e/.aside") == b"/e/f"
