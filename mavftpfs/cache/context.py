@@ -27,8 +27,8 @@ class Context:
 
     clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. times: mtimes that the vehicle
     cannot be told. blocked: nothing may be changed, because the vehicle is armed (only
-    Writeback.armed_changed sets it). retry_later(): something was not delivered, or a name may lack its file
-    (Writeback sets it).
+    Writeback.armed_changed sets it). retry_later(): something was not delivered, or a replacement is
+    unfinished: try again by and by.
     """
 
     store: VehicleStore
@@ -40,11 +40,11 @@ class Context:
     own: OwnNames
     paths: PathLocks
     spool: Spool
+    retry_later: Callable[[], None]
     nodes: Nodes = field(default_factory=Nodes)
     unfinished: Replacements = field(default_factory=Replacements)
     times: Times = field(default_factory=Times)
     blocked: bool = False
-    retry_later: Callable[[], None] = lambda: None
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""

@@ -307,8 +307,7 @@ class Deliverer:
             context.own.live.add(path)
         begun_at = context.clock()
         try:
-            sending = draft.begin(in_place=in_place)
-            sending.progress = self._throttle.on_acked
+            sending = draft.begin(in_place=in_place, progress=self._throttle.on_acked)
             upload = await context.store.open_upload(path, sending)
         except BaseException:
             draft.give_up()

@@ -14,6 +14,7 @@ own name. What is appended while that file is sent joins it; during a close writ
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
@@ -260,13 +261,13 @@ class Draft:
 
     # --- what delivery does
 
-    def begin(self, *, in_place: bool) -> Sending:
+    def begin(self, *, in_place: bool, progress: Callable[[int], None] | None = None) -> Sending:
         """Start to send a whole draft to an empty file. in_place: to the file's own name, so that from now on
-        nothing counts of what is there."""
+        nothing counts of what is there. progress: see Sending."""
         self.on(Event.BEGUN)
         if in_place:
             self.begun, self.base_limit = True, 0
-        self.sending = Sending(self.local_bytes, self.size)
+        self.sending = Sending(self.local_bytes, self.size, progress)
         return self.sending
 
     def give_up(self) -> None:

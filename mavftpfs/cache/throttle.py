@@ -33,25 +33,37 @@ STALL = 5.0
 """After so many seconds in which nothing was ACKed a writer asks why."""
 
 
+class WriteLimit:
+    """How many bytes may be un-ACKed over all uploads, and held in memory: as many as ten seconds bring.
+
+    Attributes:
+        meter: how fast bytes are ACKed.
+    """
+
+    def __init__(self, fixed: int | None) -> None:
+        """`fixed`: that many bytes, whatever the rate."""
+        self.meter = RateMeter()
+        self._fixed = fixed
+
+    def bytes(self) -> int:
+        """Return the limit as of now."""
+        if self._fixed is not None:
+            return self._fixed
+        rate = self.meter.rate
+        return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
+
+
 class Throttle:
-    """Knows how fast bytes are ACKed, and which wait.
+    """Has writers wait while too many bytes are not ACKed.
 
     Attributes:
         waiting: the writers who wait for room; who changes what may be un-ACKed has them look again.
     """
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(self, context: Context, limit: WriteLimit) -> None:
         self.waiting = trio.lowlevel.ParkingLot()
-        self.meter = RateMeter()
-
-    def limit(self) -> int:
-        """Bytes that may be un-ACKed over all uploads, and held in memory."""
-        fixed = self._context.options.dirty_max
-        if fixed is not None:
-            return fixed
-        rate = self.meter.rate
-        return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
+        self._context = context
+        self._limit = limit
 
     def require_sendable(self, draft: Draft, size: int) -> None:
         """Check that a file of `size` bytes, of which the vehicle has a part, can be sent again.
@@ -65,7 +77,7 @@ class Throttle:
         if limit is None:
             limit = MOST_REWRITE
             read = context.files.cache.meter.rate
-            write = self.meter.rate or read or context.options.link_rate
+            write = self._limit.meter.rate or read or context.options.link_rate
             read = read or write
             if write and read:
                 missing = sum([stop - start for start, stop in draft.missing_base()])
@@ -84,7 +96,7 @@ class Throttle:
         if node.start_after == float("inf"):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
-        return draft.unacked > self.limit() // max(streams, 1)
+        return draft.unacked > self._limit.bytes() // max(streams, 1)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
@@ -95,13 +107,13 @@ class Throttle:
 
     def on_acked(self, count: int) -> None:
         """Bytes arrived."""
-        self.meter.on_bytes(count, self._context.clock())
+        self._limit.meter.on_bytes(count, self._context.clock())
         self.waiting.unpark_all()
 
     def transfers(self) -> list[dict[str, object]]:
         """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
         waiting = [node for node in self._context.nodes if node.undelivered]
-        rate, before, found = self.meter.rate, 0, []
+        rate, before, found = self._limit.meter.rate, 0, []
         for node in sorted(waiting, key=lambda node: node.attempt is None):
             assert node.draft is not None
             before += node.draft.unacked

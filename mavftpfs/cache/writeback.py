@@ -30,7 +30,7 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
-from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.throttle import Throttle, WriteLimit
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
 from mavftpfs.shared.model import EntryKind, require_listable
@@ -73,6 +73,7 @@ class Writeback:
         """
         owner = new_owner(rng) if spool_directory is None else spool_directory.owner
         dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
+        self._limit = limit = WriteLimit(options.dirty_max)
         self.context = self._context = context = Context(
             store=store,
             directories=directories,
@@ -85,14 +86,14 @@ class Writeback:
             spool=Spool(
                 spool_max=options.spool_max,
                 directory=None if spool_directory is None else spool_directory.path,
+                memory_max=limit.bytes,
             ),
+            retry_later=self._retry_later,
         )
-        self._throttle = throttle = Throttle(context)
-        context.spool.memory_max = throttle.limit
+        self._throttle = throttle = Throttle(context, limit)
         self._names = names = Names(context)
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
-        context.retry_later = self._retry_later
         self._nursery = nursery
         self._retrying = False
         self.namespace = Namespace(context, names, deliverer)
@@ -281,8 +282,8 @@ class Writeback:
         return {
             "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
             "bytes_held_on_disk": self._context.spool.on_disk,
-            "dirty_max": self._throttle.limit(),
-            "write_rate": self._throttle.meter.rate,
+            "dirty_max": self._limit.bytes(),
+            "write_rate": self._limit.meter.rate,
             "files_undelivered": len(self.undelivered()),
             "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),

@@ -112,12 +112,14 @@ class Doubt:
     """Whether, and since when, what was ACKed is not believed without a look.
 
     Attributes:
-        on_raised: called each time that what was read is in doubt, with the reason, for people.
         late: which names rest.
     """
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.on_raised: Callable[[str], None] = lambda reason: None
+    def __init__(
+        self, clock: Callable[[], float], on_raised: Callable[[str], None] = lambda reason: None
+    ) -> None:
+        """`on_raised` is called each time that what was read is in doubt, with the reason, for people."""
+        self._on_raised = on_raised
         self.late = LateCopies()
         self._clock = clock
         self._at = self._reads_at = -inf
@@ -127,7 +129,7 @@ class Doubt:
         self._at = self._clock()
         if reads:
             self._reads_at = self._at
-            self.on_raised(reason)
+            self._on_raised(reason)
 
     def is_active(self, since: float = inf) -> bool:
         """Return whether something was noticed in the last ten minutes, or after that time."""

@@ -204,7 +204,7 @@ class Scheduler:
     ) -> None:
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
-        self.doubt = Doubt(clock)
+        self.doubt = Doubt(clock, self._on_reads_doubted)
         self.server = ServerSession(driver, self.doubt, clock, op_deadline)
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
@@ -214,7 +214,6 @@ class Scheduler:
         self._used_at = clock()
         self._touched_at = -inf
         driver.engine.on_unexplained = self._on_unexplained
-        self.doubt.on_raised = self._on_reads_doubted
 
     # --- who wants the session
 

@@ -33,16 +33,18 @@ class Sending:
         reached: one past the highest byte that was ACKed; after a rollback, that is proven.
         furthest: what `reached` was at most before the last rollback.
         growing: more may be written behind the last byte; what fills no request there waits for it.
-        progress: told how many bytes were ACKed.
     """
 
-    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
+    def __init__(
+        self, read: Callable[[int, int], bytes], size: int, progress: Callable[[int], None] | None = None
+    ) -> None:
+        """`progress` is told how many bytes were ACKed, each time that some were."""
         self.size = size
         self.todo = ExtentSet([(0, size)])
         self.acked = ExtentSet()
         self.proven = ExtentSet()
         self.closed = self.overtaken = self.growing = False
-        self.progress: Callable[[int], None] | None = None
+        self._progress = progress
         self._read = read
         self._handed_out = 0  # one past the highest byte
         self.reached = self.furthest = 0
@@ -103,8 +105,8 @@ class Sending:
         """These bytes were ACKed as written."""
         self.acked.add(offset, offset + count)
         self.reached = max(self.reached, offset + count)
-        if self.progress is not None:
-            self.progress(count)
+        if self._progress is not None:
+            self._progress(count)
 
     def on_unsent(self, offset: int, count: int) -> None:
         """These bytes were not written, and no request that carries them is under way any more."""

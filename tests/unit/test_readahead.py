@@ -14,7 +14,7 @@ from mavftpfs.cache.readahead import (
     Plan,
     Readahead,
 )
-from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.throttle import Throttle, WriteLimit
 from mavftpfs.cache.versions import SMALL_FILE, BlockCache, RateMeter
 
 KIB = 1024
@@ -144,9 +144,9 @@ class Clock:
 
 @pytest.mark.parametrize("rate", [1_000.0, 500_000.0, 20_000_000.0])
 def test_acked_bytes_are_measured_at_any_rate(rate: float) -> None:
-    context = Clock()
-    throttle = Throttle(cast(Context, context))
+    context, limit = Clock(), WriteLimit(None)
+    throttle = Throttle(cast(Context, context), limit)
     while context.now < 5.0:
         context.now += 239 / rate
         throttle.on_acked(239)
-    assert throttle.meter.rate == pytest.approx(rate, rel=0.02)
+    assert limit.meter.rate == pytest.approx(rate, rel=0.02)
