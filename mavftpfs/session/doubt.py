@@ -13,40 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-from mavftpfs.protocol.payload import Opcode
-
 LASTS = 600.0
 """Seconds for which a doubt lasts: a second radio or another client stays for a while."""
 
 LEAST_REST = 1.0
 MOST_REST = 10.0
 """Seconds between two changes of a name, at least and at most, where copies of requests come late."""
-
-
-_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
-
-_OF_SESSIONS = frozenset(
-    (
-        Opcode.OPEN_FILE_RO,
-        Opcode.OPEN_FILE_WO,
-        Opcode.CREATE_FILE,
-        Opcode.READ_FILE,
-        Opcode.BURST_READ_FILE,
-        Opcode.WRITE_FILE,
-        Opcode.TERMINATE_SESSION,
-        Opcode.RESET_SESSIONS,
-    )
-)
-
-
-def session_used_by(payload: bytes) -> int | None:
-    """Return the id of the session that another client's request, or a reply to it, uses; None: none.
-
-    If that may be ours it may be its own now. Listings, checksums and changes of names use none: a ground
-    station that shows directories makes nobody's bytes doubtful.
-    """
-    opcode = payload[_REQ_OPCODE] if payload[_OPCODE] in (Opcode.ACK, Opcode.NAK) else payload[_OPCODE]
-    return payload[_SESSION] if opcode in _OF_SESSIONS else None
 
 
 class LateCopies:

@@ -10,6 +10,7 @@ from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.scheduler import RECENT, Scheduler, SessionUser
+from mavftpfs.session.serversession import OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 
@@ -114,6 +115,10 @@ class FileStream(SessionUser):
         """See SessionUser."""
         return not self._ahead.empty
 
+    def goes_on(self, session: OpenSession) -> bool:
+        """See SessionUser."""
+        return session.path == self.path and not session.writing and not self._wants_open
+
     def fail(self, error: MavftpfsError) -> None:
         """See SessionUser."""
         self._wants_open = False
@@ -169,7 +174,7 @@ class FileStream(SessionUser):
         """
         server, session = self._server, self._server.session
         awaited = self._wants_open
-        if session is None or session.path != self.path or session.writing or awaited:
+        if session is None or not self.goes_on(session):
             session = await server.open(self.path)
         if session.size is None or (self.opened.is_set() and session.size < self.size):
             await server.close_quietly()
@@ -216,6 +221,7 @@ class FileStream(SessionUser):
                     transfer.by_requests = engine.in_flight > transfer.in_flight
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 driver.kick()
+                self._scheduler.expire_held()
                 await server.sleep(_OFTEN)
                 heard_at = max(driver.last_reply_at, transfer.progress_at)  # `bwlimit=` is no silence
                 limit = max(STALL, 4.0 * (engine.rtt or 0.0))

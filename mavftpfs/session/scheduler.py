@@ -21,10 +21,11 @@ from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.protocol.writing import Pieces, WriteTransfer
-from mavftpfs.session.doubt import Doubt, session_used_by
+from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.others import OPENING, took_session
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
-from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
+from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
 from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
@@ -57,7 +58,6 @@ buffers and the 3 s after which ArduPilot gives the session away: so a session i
 
 _MAYBE_OPEN_RETRY = 5.0
 _OFTEN = 0.25
-_OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 
 Action = Callable[[OpenSession], Awaitable[None]]
 
@@ -95,6 +95,10 @@ class SessionUser(ABC):
 
     def prefetches(self) -> bool:
         """Return whether it wants something that nobody waits for."""
+        return False
+
+    def goes_on(self, session: OpenSession) -> bool:
+        """Return whether it uses what is open and opens nothing."""
         return False
 
     def expire(self, error: MavftpfsError) -> None:
@@ -226,9 +230,22 @@ class Scheduler:
         """Return all who wait for the session and could use it now."""
         waiting = []
         for user in self.users:
-            if user.due_at() <= now and not self.server.is_excluded(user.path):
+            if user.due_at() <= now and self._may_use(user, now):
                 waiting.append(user)
         return waiting
+
+    def _may_use(self, user: SessionUser, now: float) -> bool:
+        """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
+        if self.server.is_excluded(user.path):
+            return False
+        session = self.server.session
+        return now >= self.held_until or (session is not None and user.goes_on(session))
+
+    @property
+    def held_until(self) -> float:
+        """Before this nothing is opened: that might end another client's session."""
+        several = self._driver.engine.traits.several_sessions
+        return -inf if several else self.server.others.file_open_until
 
     def first(self) -> SessionUser | None:
         """Return whoever is to use the session now. Readahead comes only if nobody waits for anything, and
@@ -243,7 +260,7 @@ class Scheduler:
             return first
         session = self.server.session
         for user in self.users:
-            if user.prefetches() and not self.server.is_excluded(user.path):
+            if user.prefetches() and self._may_use(user, now):
                 if session is not None and user.path == session.path:
                     return user
                 first = first or user
@@ -265,6 +282,24 @@ class Scheduler:
         for user in self.waiting(now):
             if user.asked_at is not None and user.asked_at < now - self._op_deadline:
                 user.expire(error)
+
+    def expire_held(self) -> float:
+        """Tell the users that wait too long for another client's file to be closed; return when the next one
+        will have done so."""
+        now, next_at = self.clock(), inf
+        if now >= self.held_until:
+            return next_at
+        error = SessionBusy("another client of the vehicle may have a file open, which is not ended for ours")
+        for user in list(self.users):  # who is told may end
+            if user.due_at() > now or user.asked_at is None or self._may_use(user, now):
+                continue
+            expires_at = user.asked_at + self._op_deadline
+            if now >= expires_at:
+                user.expire(error)
+            else:
+                user.on_queued()
+                next_at = min(next_at, expires_at)
+        return next_at
 
     # --- what others ask for
 
@@ -357,19 +392,23 @@ class Scheduler:
     def on_foreign(self, payload: bytes, *, newcomer: bool) -> None:
         """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
         been missed."""
-        now, session, engine = self.clock(), session_used_by(payload), self._driver.engine
+        now, engine = self.clock(), self._driver.engine
+        session = self.server.others.hear(payload, now)
         echoes = engine.traits.ack_carries_own_session  # then each client has an id of its own
         if session is not None and (not echoes or session == engine.home_session):
             self._touched_at = now
         # Whoever uses sessions may just have used ours, too, in a request that was not heard.
         reads = newcomer or now - self._touched_at <= RECENT
         self.doubt.raise_it("another FTP client is active", reads=reads)
+        if not echoes and self.server.session is not None and took_session(payload):
+            self.server.abandon()  # what we read or write would be its file
+        self.server.wake()
 
     def _on_unexplained(self, reply: Payload, late: float) -> None:
         """An answer came that no request of ours explains. An older open that was carried out once more may
         have put its file in the place of ours (MAVSDK); all else is no other file's."""
         session = self.server.session
-        opens = reply.opcode == Opcode.ACK and reply.req_opcode in _OPENING
+        opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         other = opens and session is not None and session.seq != reply.seq
         self.doubt.late.saw(late, self.clock())
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
@@ -416,9 +455,12 @@ class Scheduler:
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
         server = self.server
-        until_due = inf
+        expires_at = self.expire_held()
+        if expires_at < inf:
+            await server.find_out_sessions()
+        until_due = expires_at - now
         for user in self.users:
-            due = user.due_at()
+            due = max(user.due_at(), self.held_until)
             if now < due:
                 until_due = min(until_due, due - now)
         if server.session is not None:

@@ -19,6 +19,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
+from math import inf
 from typing import TypeVar
 
 import trio
@@ -28,6 +29,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.others import LEFT_OPEN, STAYS_ITS_OWN, OtherClients
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import wire_path
 
@@ -52,6 +54,9 @@ _OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
 
 _NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
 """What servers say to a Terminate of a session that is not there; 8 is PX4's sticky errno."""
+
+_BEYOND = 100_000
+"""Offset of a listing that is beyond the end of any directory."""
 
 Asked = TypeVar("Asked", bound=Operation)
 
@@ -173,7 +178,7 @@ class ServerSession:
         state: see State. session: what is open in the state OPEN. transfer: what reads or writes it now.
         maybe_open: files that may be open over there by our doing, by session id.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
-        path_gate: what asks the server for a path passes it.
+        path_gate: what asks the server for a path passes it. others: other clients of this server.
     """
 
     def __init__(
@@ -195,6 +200,8 @@ class ServerSession:
         self.maybe_open: dict[int, bytes] = {}
         self.kept_out = False
         self.path_gate = PathGate()
+        self.others = OtherClients()
+        self._asked_sessions_at = -inf
         self._opening: bytes | None = None
         self._excluded: list[_Excluded] = []
         self._news = trio.Event()
@@ -400,6 +407,24 @@ class ServerSession:
             else:
                 self.kept_out = False
                 return operation
+
+    async def find_out_sessions(self) -> None:
+        """Ask something while another client has a session: an ArduPilot that has no other refuses it."""
+        now, traits = self.clock(), self.engine.traits
+        ours = self.others.session == self.engine.home_session
+        if not traits.ack_carries_own_session or ours or now - self._asked_sessions_at < LEFT_OPEN:
+            return
+        if not self.others.has_session(now, now):
+            return
+        self._asked_sessions_at, refused = now, True
+        with trio.move_on_after(STAYS_ITS_OWN), suppress(MavftpfsError):
+            try:
+                await self.driver.run(Simple(Opcode.LIST_DIRECTORY, b"/", offset=_BEYOND))
+                refused = False
+            except FtpNak as nak:
+                refused = nak.code in _TAKEN
+        traits.several_sessions = not refused and self.others.has_session(now, self.clock())
+        self.wake()
 
     async def _remedy(self, nak: FtpNak, left: _Remedies) -> None:
         """Do the next thing about a refusal because the session is taken.

@@ -454,6 +454,7 @@ class Upload(SessionUser):
                 transfer.paused = False
             driver.kick()
             self._scheduler.expire_waiters()
+            self._scheduler.expire_held()
             pressed = transfer.starved and rival is not None
             await server.sleep(BRIEF_STARVE if pressed else _OFTEN)
         return None

@@ -163,6 +163,7 @@ class Traits:
     Attributes:
         ack_carries_own_session: an Open ACK carried the non-zero id we had asked for (servers.md 14.6);
             then every reply echoes the request's session, and it is checked.
+        several_sessions: it answered us while another client had a session (ArduPilot, generation B).
         queue_limit: the most requests that may be in flight; None where no limit is known.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
@@ -174,6 +175,7 @@ class Traits:
     """
 
     ack_carries_own_session: bool | None = None
+    several_sessions: bool = False
     queue_limit: int | None = None
     write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None

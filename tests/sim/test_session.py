@@ -17,6 +17,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import Opcode, decode_request, request
 from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.others import LEFT_OPEN, OtherClients
 from mavftpfs.session.reader import REOPENS, STALL
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.serversession import SILENCE_ARDUPILOT
@@ -34,7 +35,7 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import put
-from tests.support.worlds import MemorySink, World, begin_to_read, content, path, read_file, world
+from tests.support.worlds import DEFAULTS, MemorySink, World, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -301,7 +302,8 @@ class Log:
 
 def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, heard: bool = True) -> None:
     """Let another client of the vehicle ask something, so that we hear it on our link or not."""
-    session = 0 if here.profile.startswith("px4") and opcode != Opcode.OPEN_FILE_RO else RIVALS_SESSION
+    opens = opcode in (Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE)
+    session = RIVALS_SESSION if opens or here.profile.startswith("ardupilot") else 0
     wire = request(seq, opcode, session=session, size=100 if not data else len(data), data=data).encode()
     now = trio.current_time()
     if heard:
@@ -319,6 +321,7 @@ async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: 
         rival_asks(here, Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), seq=5, heard=False)
         await trio.sleep(0.1)
         assert here.vehicle.server.open_sessions == 1
+        connection.scheduler.server.others = OtherClients()  # its answer went to its own link
         log = Log(here)
 
         async def list_often() -> None:
@@ -343,8 +346,12 @@ async def _tolerate_refusals(work: Callable[[], object]) -> None:
             await trio.sleep(0.3)
 
 
+ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
+"""PX4 of September 2026 and MAVSDK end the session of one client silently when another one opens a file."""
+
+
 @pytest.mark.holds("promise 6", "rule 14.39")
-@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+@pytest.mark.parametrize("profile", ONE_SESSION)
 async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
     here = world(profile, LINK, f=DATA, theirs=OTHER)
@@ -359,12 +366,63 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
 
         nursery.start_soon(rival_reads)
         await trio.sleep(2.0)
+        began = trio.current_time()
         with pytest.raises(SessionBusy):
             await read_file(connection, path(profile, "f"))
+        assert trio.current_time() - began == pytest.approx(DEFAULTS.op_deadline, abs=1.0)
         await trio.sleep(3.0)
         assert here.vehicle.server.open_paths == [path(profile, "theirs")]
-        assert log.count(Opcode.RESET_SESSIONS) == log.count(Opcode.TERMINATE_SESSION) == 0
+        asked = (Opcode.OPEN_FILE_RO, Opcode.RESET_SESSIONS, Opcode.TERMINATE_SESSION)
+        assert sum(map(log.count, asked)) == 0
         nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("promise 6")
+@pytest.mark.parametrize("profile", ONE_SESSION)
+@pytest.mark.parametrize("closes", [True, False])
+async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(
+    closes: bool, profile: str, autojump: MockClock
+) -> None:
+    here = world(profile, LINK, f=DATA, theirs=OTHER)
+    async with here.connection() as connection:
+        log = Log(here)
+        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+        await trio.sleep(4.0)
+        rival_asks(here, Opcode.READ_FILE, seq=7)
+        done = trio.current_time()
+        if closes:
+            await trio.sleep(1.0)
+            rival_asks(here, Opcode.TERMINATE_SESSION, seq=9)
+        assert await read_file(connection, path(profile, "f")) == DATA
+        opened = next(now for now, opcode in log.asked if opcode == Opcode.OPEN_FILE_RO)
+        assert opened - done == pytest.approx(1.0 if closes else LEFT_OPEN, abs=0.2)
+
+
+@pytest.mark.holds("promise 1", "promise 6")
+@pytest.mark.parametrize("ours", ["reading", "writing"])
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
+async def test_a_session_that_another_client_took_is_its_own(
+    profile: str, ours: str, autojump: MockClock
+) -> None:
+    """Only what was on its way goes into its file, which stays open, and ours is whole in the end."""
+    here = world(profile, SLOW, f=DATA, theirs=OTHER)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        if ours == "reading":
+            _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
+        else:
+            nursery.start_soon(put, connection, path(profile, "new"), DATA)
+            await trio.sleep(1.0)
+        rival_asks(here, Opcode.CREATE_FILE, path(profile, "its"), seq=5)
+        await trio.sleep(1.0)
+        spoilt = here.tree.data(path(profile, "its"))
+        await trio.sleep(7.0)
+        assert path(profile, "its") in here.vehicle.server.open_paths
+        assert here.tree.data(path(profile, "its")) == spoilt
+        rival_asks(here, Opcode.TERMINATE_SESSION, seq=7)
+        if ours == "reading":
+            assert await sink.wait_for(0, len(DATA)) == DATA
+    if ours == "writing":
+        assert here.tree.data(path(profile, "new")) == DATA
 
 
 @pytest.mark.holds("rule 14.9")

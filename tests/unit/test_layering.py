@@ -54,6 +54,7 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.doubt",
+    "session.others",
     "session.vehicle",
     "cache.attributes",
     "cache.options",

@@ -1,0 +1,82 @@
+"""Other FTP clients of the vehicle: may one have a file open there? Layer: session; pure.
+
+Servers with one session give it to the client that opens last, or refuse the second one. PX4 of September
+2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and ArduPilot that
+of a client that paused for 3 s. So nothing is opened while another client may have a file open: from its
+first request that uses a session, until its Terminate or Reset, or 10 s after its last request was heard.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+from mavftpfs.protocol.payload import Opcode
+
+LEFT_OPEN = 10.0
+"""Seconds after another client's last request for which its file counts as open. PX4 closes it then; PX4 of
+September 2026 after 30."""
+
+STAYS_ITS_OWN = 2.5
+"""Seconds after an answer for which no ArduPilot with one session gives that away; it does after 3."""
+
+OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
+_USING = OPENING | {Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE}
+_CLOSING = frozenset((Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS))
+_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
+
+
+class OtherClients:
+    """What was heard of them.
+
+    Attributes:
+        session: the id that was used last, or closed; None while none was.
+    """
+
+    def __init__(self) -> None:
+        self.session: int | None = None
+        self._has_file = False
+        self._heard_at = self._answered_at = -inf
+        self._answered_since = inf  # without a gap in which its session may have gone
+
+    def hear(self, payload: bytes, now: float) -> int | None:
+        """Take a request of another client, or an answer to one; return the id of the session that it uses.
+
+        None: it uses none. Listings, checksums and changes of names do not: a ground station that shows
+        directories makes nobody's bytes doubtful.
+        """
+        opcode, answered = _opcode_of(payload)
+        self._heard_at = now
+        if opcode not in _USING | _CLOSING:
+            return None
+        self.session = payload[_SESSION]
+        self._has_file = opcode in _USING
+        if answered and self._has_file:
+            if now - self._answered_at >= STAYS_ITS_OWN:
+                self._answered_since = now
+            self._answered_at = now
+        elif not self._has_file:
+            self._answered_at = -inf
+        return self.session
+
+    @property
+    def file_open_until(self) -> float:
+        """Until when another client may have a file open."""
+        return self._heard_at + LEFT_OPEN if self._has_file else -inf
+
+    def has_session(self, since: float, now: float) -> bool:
+        """Return whether a session was another client's all that time, as its answers show."""
+        return self._answered_since <= since and now - self._answered_at < STAYS_ITS_OWN
+
+
+def took_session(payload: bytes) -> bool:
+    """Return whether what was heard shows that another client has the session that all share."""
+    opcode, answered = _opcode_of(payload)
+    return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
+
+
+def _opcode_of(payload: bytes) -> tuple[int, bool]:
+    """Return the opcode of a request, or of what is answered, and whether this is its ACK."""
+    opcode = payload[_OPCODE]
+    if opcode in (Opcode.ACK, Opcode.NAK):
+        return payload[_REQ_OPCODE], opcode == Opcode.ACK
+    return opcode, False
