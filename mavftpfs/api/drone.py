@@ -54,6 +54,16 @@ class Drone:
         """The mount whose files these are; None for a connection of its own."""
         return self._drone.mountpoint
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing can be called any more."""
+        return self._loop.closed
+
+    @property
+    def has_open_files(self) -> bool:
+        """Whether a file of it is open."""
+        return self._drone.has_open_files
+
     def close(self) -> None:
         """Close the vehicle's session. What is written and still open is withdrawn, and named in the log."""
         self._loop.close()
@@ -147,6 +157,10 @@ class Drone:
     def rename(self, old: PathLike, new: PathLike) -> None:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
         self._loop.call(self._drone.rename, old, new)
+
+    def copy(self, old: PathLike, new: PathLike) -> None:
+        """Copy a file, by way of this computer."""
+        self._loop.call(self._drone.copy, old, new)
 
     def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it by zeros."""

@@ -88,6 +88,11 @@ class RawFile(_Ending, io.RawIOBase):
         self._pid = os.getpid()
         self._at = opened.size if mode.plain[0] == "a" else 0
 
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return self._opened.size
+
     def readable(self) -> bool:
         """Whether it may be read."""
         return self._mode.reads

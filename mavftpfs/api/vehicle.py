@@ -27,8 +27,8 @@ from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
 from mavftpfs.client.source import target_of
-from mavftpfs.shared.errors import NotADirectory, NotFound, UsageError
-from mavftpfs.shared.model import EntryKind, join, normalise, split
+from mavftpfs.shared.errors import AlreadyExists, NotADirectory, NotFound, UsageError
+from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
 from mavftpfs.shared.readable import name_text
 
 log = logging.getLogger("mavftpfs.api")
@@ -103,6 +103,11 @@ class Drone:
     @property
     def _files(self) -> Files:
         return self._session.files
+
+    @property
+    def has_open_files(self) -> bool:
+        """Whether a file of it is open."""
+        return bool(self._opened)
 
     # --- looking
 
@@ -186,6 +191,10 @@ class Drone:
         """
         with translated():
             wanted = remote(path)
+            if wanted == ROOT:
+                if exist_ok:
+                    return
+                raise AlreadyExists("the root is there")
             for above in names.ancestors(wanted) if parents else []:
                 await names.make_directory(self._files, above, may_exist=True)
             await names.make_directory(self._files, wanted, may_exist=exist_ok)
@@ -210,6 +219,11 @@ class Drone:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
         with translated():
             await names.move(self._files, remote(old), remote(new))
+
+    async def copy(self, old: PathLike, new: PathLike) -> None:
+        """Copy a file, by way of this computer."""
+        with translated():
+            await names.copy(self._files, remote(old), remote(new))
 
     async def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it by zeros."""

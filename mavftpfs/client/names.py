@@ -321,7 +321,7 @@ async def move(files: Files, old: bytes, new: bytes) -> None:
     except CrossDevice:
         found = await files.stat(old)
     if found.kind is EntryKind.FILE:
-        await _copy(files, old, new)
+        await copy(files, old, new)
         await files.unlink(old)
         return
     await make_directory(files, new, may_exist=False)
@@ -330,7 +330,12 @@ async def move(files: Files, old: bytes, new: bytes) -> None:
     await files.rmdir(old)
 
 
-async def _copy(files: Files, old: bytes, new: bytes) -> None:
+async def copy(files: Files, old: bytes, new: bytes) -> None:
+    """Copy a file by way of us, so that it is verified.
+
+    Raises:
+        NotDelivered. Else as Files.open.
+    """
     async with reading(files, old) as source:
         file = await emptied(files, new)
         async with written(file):
