@@ -57,14 +57,15 @@ def bar_width(progress: Progress, width: int) -> int:
 class _Screen:
     """What rich draws, again and again."""
 
-    def __init__(self, progress: Progress, console: Console) -> None:
+    def __init__(self, progress: Progress, console: Console, idle: str) -> None:
         self._progress = progress
         self._console = console
+        self._idle = idle
 
     def __rich__(self) -> RenderableType:
         progress, width = self._progress, self._console.width
         if not progress.files:
-            return Text("looking at what is there")
+            return Text(self._idle)
         line = totals(progress)
         share = progress.done / progress.total if progress.total else 1.0
         bar = ProgressBar(total=1.0, completed=share, width=bar_width(progress, width))
@@ -74,13 +75,16 @@ class _Screen:
 
 
 @contextmanager
-def shown(progress: Progress) -> Iterator[Progress]:
-    """Show progress on stderr during the body, if that is a terminal; nothing of it stays at the end."""
+def shown(progress: Progress, idle: str = "looking at what is there") -> Iterator[Progress]:
+    """Show progress on stderr during the body, if that is a terminal; nothing of it stays at the end.
+
+    idle: what is shown where nothing is planned.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         yield progress
         return
-    screen = _Screen(progress, console)
+    screen = _Screen(progress, console, idle)
     # What goes to stdout would come out on stderr if rich took it; only on one terminal are they the same.
     to_terminal = sys.stdout.isatty()
     live = Live(

@@ -26,6 +26,8 @@ from mavftpfs.shared.readable import readable, readable_time
 
 EXEC_LIMIT = 600.0
 """Seconds for the command of --exec."""
+_LAST_WORDS = 1.0
+"""Seconds to read what it said, after it ended."""
 _KILL_AFTER = 5.0
 """Seconds between SIGTERM and SIGKILL."""
 
@@ -49,7 +51,7 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
         await Watch(wanted, say, hand_on, bar).run(target)
 
     try:
-        with drawing.shown(bar):
+        with drawing.shown(bar, idle=""):
             say(f"waiting for vehicles on {args.source}; Ctrl-C ends it")
             run(work)
     except KeyboardInterrupt:
@@ -70,17 +72,38 @@ async def run_command(command: str, file: Path, *, limit: float) -> str:
     """
     words = ["/bin/sh", "-c", f'{command} "$@"', "sh", os.fspath(file)]
     try:
-        process = await trio.lowlevel.open_process(words, stdin=subprocess.DEVNULL, start_new_session=True)
+        process = await trio.lowlevel.open_process(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
     except OSError as exc:
         return f"--exec cannot be run: {exc.strerror}"
-    try:
-        with trio.move_on_after(limit):
-            code = await process.wait()
-            return "" if code == 0 else f"--exec ended with exit code {code}"
-        return f"--exec took longer than {readable_time(limit)} and was ended"
-    finally:
-        with trio.CancelScope(shield=True):
-            await _end(process)
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(_pass_on, process)
+        try:
+            with trio.move_on_after(limit):
+                code = await process.wait()
+                return "" if code == 0 else f"--exec ended with exit code {code}"
+            return f"--exec took longer than {readable_time(limit)} and was ended"
+        finally:
+            with trio.CancelScope(shield=True):
+                await _end(process)
+            nursery.cancel_scope.deadline = trio.current_time() + _LAST_WORDS  # others may hold the pipe
+
+
+async def _pass_on(process: trio.Process) -> None:
+    """Print what a command says, above the progress."""
+    assert process.stdout is not None
+    rest = b""
+    async for data in process.stdout:
+        *lines, rest = (rest + data).split(b"\n")
+        for line in lines:
+            print(readable(line.decode(errors="replace")), flush=True)
+    if rest:
+        print(readable(rest.decode(errors="replace")), flush=True)
 
 
 async def _end(process: trio.Process) -> None:

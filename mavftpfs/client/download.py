@@ -45,7 +45,7 @@ LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/var/APM/lo
 the standard's alias, which shows one of the others again and so comes last."""
 
 NO_LOG = b"LASTLOG.TXT"
-"""ArduPilot keeps the number of its last log beside the logs. `sync --newest` is not to count it as one."""
+"""ArduPilot keeps the number of its last log beside the logs. It is not to be counted as one."""
 
 MAX_TIMEOUTS = 2
 """Requests of so many files in a row that nobody answered end a run: the others would fare no better."""

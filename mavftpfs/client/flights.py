@@ -123,8 +123,12 @@ class Policy:
 
     def refused(self, system: int, now: float) -> None:
         """A vehicle refused to be armed."""
-        if system in self._vehicles:
-            self._vehicles[system].paused_until = now + REFUSED
+        vehicle = self._vehicles.get(system)
+        if vehicle is not None:
+            vehicle.paused_until = now + REFUSED
+            if vehicle.ready:  # what is there is looked at again: it may be another vehicle then
+                vehicle.ready.clear()
+                vehicle.look_at = now
 
     def replaced(self, system: int) -> None:
         """Another vehicle has that system id now."""
@@ -241,4 +245,4 @@ class Policy:
         """Yield when something is to be done that nothing heard tells of."""
         for vehicle in self._vehicles.values():
             if not vehicle.lost and vehicle.armed is False:
-                yield max(-inf if vehicle.ready else vehicle.look_at, vehicle.paused_until)
+                yield max(vehicle.look_at, vehicle.paused_until)

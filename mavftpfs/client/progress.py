@@ -27,8 +27,9 @@ class Progress:
         self.state = ""
 
     def plan(self, files: int, total: int) -> None:
-        """Say how much there is to do in all."""
+        """Say how much there is to do in all, from now on; no files: nothing."""
         self.files, self.total = files, total
+        self.files_done = self._ended = 0
 
     def begin(self, name: str, size: int, here: int = 0) -> None:
         """Begin a file, or begin it again; `here` bytes of it need not move."""

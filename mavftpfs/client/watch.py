@@ -18,7 +18,7 @@ import trio
 from mavftpfs.client.brought import HEAD, Brought, Memory
 from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
 from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
-from mavftpfs.client.download import Wish, named, wanted_logs
+from mavftpfs.client.download import NO_LOG, Wish, named, wanted_logs
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
 from mavftpfs.client.flights import Fetch, Log, Look, Policy, Wait
@@ -76,7 +76,8 @@ class Watch:
         self._leave: LinkError | bool = False
         self._wanted_system = 0
         self._working_on: tuple[int, trio.CancelScope] | None = None
-        self._logs: dict[bytes, Wanted] = {}
+        self._logs: dict[int, dict[bytes, Wanted]] = {}
+        self._names: dict[int, str] = {}
         self._same_heads: set[tuple[str, str]] = set()
         self._done_here: set[tuple[str, str]] = set()
         self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
@@ -225,23 +226,24 @@ class Watch:
                 elif isinstance(step, Look):
                     await self._look(step.system, contact, session)
                 else:
-                    await self._fetch(step.system, step.log, contact, session)
+                    await self._fetch(step.system, step.log, session)
             finally:
                 self._working_on = None
         return not scope.cancelled_caught and self._policy.may_transfer(step.system, trio.current_time())
 
     async def _look(self, system: int, contact: Contact, session: Session) -> None:
         """List the logs, and tell the policy which are new."""
-        name = await contact.identity() or f"system-{system}"
+        name = self._names[system] = await contact.identity() or f"system-{system}"
         local = self._local / (str(system) if self._wish.by_system else name)
         self._complain(f"name of {system}", f"vehicle {system} is {name}; its logs go into {local}")
         session.files.forget_caches()
-        self._logs = {}
+        self._logs[system] = {}
         failed = False
         try:
             with local_disk(self._local):
                 self._memory = Memory(self._local)
             _, logs, unlisted = await wanted_logs(session, self._wish.logs, local)
+            logs = [log for log in logs if not log.remote.endswith(NO_LOG)]
             new = [log for log in logs if not await self._is_known(name, log, session)]
         except NotFound as exc:
             self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
@@ -254,7 +256,7 @@ class Watch:
             self._complain(f"logs of {system}", f"vehicle {system}: {named(path, error)}")
         if not failed:
             self._settled(f"logs of {system}")
-        self._logs = {log.remote: log for log in new}
+        self._logs[system] = {log.remote: log for log in new}
         self._policy.looked(system, [Log(log.remote, log.size) for log in new], trio.current_time())
         if failed:
             self._policy.failed(system, None, trio.current_time())
@@ -278,10 +280,10 @@ class Watch:
             self._same_heads.add(key)
         return same
 
-    async def _fetch(self, system: int, log: Log, contact: Contact, session: Session) -> None:
+    async def _fetch(self, system: int, log: Log, session: Session) -> None:
         """Fetch a log, and tell the policy how it went."""
-        wanted = replace(self._logs[log.path], size=log.size)
-        key = await contact.identity() or f"system-{system}", os.fsdecode(session.on_vehicle(log.path))
+        wanted = self._logs[system][log.path]
+        key = self._names[system], os.fsdecode(session.on_vehicle(log.path))
         if not wanted.here:
             begun = f", from {readable_size(wanted.begun)} on" if wanted.begun else ""
             self._say(f"vehicle {system}: {wanted.name} begins, {readable_size(wanted.size)}{begun}")
@@ -307,6 +309,7 @@ class Watch:
             self._settled(wanted.name)
         finally:
             self._progress.end(wanted.size)
+            self._progress.plan(0, 0)
 
     def _arrived(self, system: int, log: Log, fetched: Fetched, key: tuple[str, str]) -> None:
         wanted, proof = fetched.wanted, fetched.proof
@@ -335,8 +338,8 @@ class Watch:
         if not self._memory.is_there():
             self._complain("local", f"{self._local} is not there any more; waiting for it")
             return False
-        if isinstance(step, Fetch) and step.log.path in self._logs:
-            wanted = self._logs[step.log.path]
+        if isinstance(step, Fetch):
+            wanted = self._logs[step.system][step.log.path]
             missing = 0 if wanted.here else wanted.size - wanted.begun
             free = free_space(self._local)
             if free - SPARE < missing:

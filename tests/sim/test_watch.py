@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import random
+import subprocess
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -367,6 +368,26 @@ async def test_two_vehicles_with_the_same_names(day: Day, by_system: bool) -> No
     }
 
 
+async def test_a_pause_of_one_vehicle_does_not_mix_up_the_names_of_two(day: Day) -> None:
+    tree = MemoryTree(clock=wall)
+    second = SimVehicle(tree, PROFILES["ardupilot"], rng=random.Random(99), address=Address(2, 1))
+    day.world.link = MemoryLink(Two(day.vehicle, second), day.world.model)
+    day.put("log001.ulg", content(200_000, 1))
+    async with day.watched(by_system=True):
+        await day.until("log001.ulg begins")
+        day.vehicle.say(3, "Arming denied: no")
+        tree.add(b"/APM/LOGS/log001.ulg", content(100_000, 2))
+        tree.add(b"/APM/LOGS/LASTLOG.TXT", b"1")
+        second.arm()
+        await trio.sleep(3.0)
+        second.disarm()
+        await day.until("is here, verified", 2)
+    assert day.saying("vehicle 2: log001.ulg is here") == 1
+    assert (day.local / "1" / "log001.ulg").read_bytes() == content(200_000, 1)
+    assert (day.local / "2" / "log001.ulg").read_bytes() == content(100_000, 2)
+    assert not (day.local / "2" / "LASTLOG.TXT").exists()
+
+
 # -- what is done with a log ----------------------------------------------------------------------
 
 
@@ -387,15 +408,20 @@ async def test_what_could_not_be_handed_on_is_tried_at_the_next_start(day: Day) 
 # -- the local disk -------------------------------------------------------------------------------
 
 
+def run(*words: str | Path) -> None:
+    """Run a command of the system."""
+    subprocess.run(words, check=True, capture_output=True, timeout=30)
+
+
 @contextmanager
 def stick(place: Path, size: str) -> Iterator[None]:
     """Have a small disk at that place."""
     place.mkdir(exist_ok=True)
-    assert os.system(f"mount -t tmpfs -o size={size} tmpfs {place}") == 0
+    run("mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place)
     try:
         yield
     finally:
-        os.system(f"umount -l {place}")
+        run("umount", "-l", place)
 
 
 async def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
@@ -430,6 +456,29 @@ async def test_a_directory_that_vanishes_is_said_and_waited_for(tmp_path: Path) 
         place.symlink_to(real)
         await day.until("is here, verified", 2)
     assert day.logs() == {"1.ulg": content(5000), "2.ulg": content(3000)}
+
+
+async def test_a_disk_that_is_pulled_in_mid_transfer(tmp_path: Path) -> None:
+    place, disk = tmp_path / "stick", tmp_path / "disk"
+    disk.mkdir()
+    with stick(disk, "4m"):
+        place.mkdir()
+        run("mount", "--bind", disk, place)
+        day = Day(place)
+        day.put("1.ulg", content(400_000))
+        try:
+            async with day.watched():
+                await day.until("begins")
+                await trio.sleep(3.0)
+                run("umount", "-l", place)
+                await day.until("is not there any more; waiting for it")
+                await trio.sleep(600.0)
+                assert list(place.iterdir()) == []
+                run("mount", "--bind", disk, place)
+                await day.until("is here, verified")
+            assert day.logs() == {"1.ulg": content(400_000)}
+        finally:
+            run("umount", "-l", place)
 
 
 # -- for long -------------------------------------------------------------------------------------

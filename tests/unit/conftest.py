@@ -8,8 +8,8 @@ import pytest
 
 from tests.support.clocks import use_virtual_time
 
-REAL_TIME = ("test_control", "test_kernelnews")
-"""Modules with threads and sockets, which virtual time would not wait for."""
+REAL_TIME = ("test_control", "test_kernelnews", "test_watching")
+"""Modules with threads, sockets and programs, which virtual time would not wait for."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

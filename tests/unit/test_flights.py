@@ -131,6 +131,7 @@ def test_a_refusal_to_arm_pauses_what_is_ready(story: Story) -> None:
     story.policy.refused(1, story.now)
     assert not story.policy.may_transfer(1, story.now)
     assert story.wait_for() == REFUSED
+    story.looks(A)
     assert story.does() == Fetch(1, A)
 
 

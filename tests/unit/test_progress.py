@@ -60,3 +60,14 @@ def test_the_bar_keeps_its_width() -> None:
     assert len(lines) > 3
     assert len(widths) == 1
     assert max(lines) + widths.pop() + 8 <= 100
+
+
+def test_a_second_plan_begins_anew() -> None:
+    progress = Progress(Clock())
+    for _ in range(2):
+        progress.plan(1, 1000)
+        progress.begin("/a", 1000)
+        assert (progress.done, progress.files_done) == (0, 0)
+        progress.at(1000)
+        progress.end(1000)
+        assert (progress.done, progress.files_done) == (1000, 1)
