@@ -179,7 +179,7 @@ class Parameters(Texts[Values]):
         names = {line.name for line in changed}
         known = None if base is None else {name: one for name, one in base.items() if name not in names}
         if plan.wanted:
-            notes += (await self._set(plan.wanted, save.progress, known)).notes
+            notes += (await self._set(save.name, plan.wanted, known)).notes
         return Saved(known, notes + plan.notes)
 
     def _parse(self, save: Save[Values]) -> tuple[list[Line], list[str]]:
@@ -200,9 +200,7 @@ class Parameters(Texts[Values]):
         others = sorted({line.system for line in lines if line.system not in (None, system)} - {None})
         return lines, [f"the lines are of system {other}, this is system {system}" for other in others]
 
-    async def _set(
-        self, wanted: Sequence[Parameter], progress: Callable[[int], None] | None, known: Values | None
-    ) -> Verdict:
+    async def _set(self, name: bytes, wanted: Sequence[Parameter], known: Values | None) -> Verdict:
         """Set values, and read back whether they hold. known: for Refused.
 
         Raises:
@@ -213,7 +211,7 @@ class Parameters(Texts[Values]):
         try:
             for start in range(0, len(wanted), AT_ONCE):
                 pieces = pack_upload(wanted[start : start + AT_ONCE])
-                await self._store.write_whole(PARAM_FILE, pieces, progress)
+                await self.upload(self._store, name, PARAM_FILE, pieces)
         except MavftpfsError as error:
             failure = error
         self._virtual.outdate(PARAM_FILE)  # somebody may have read it while the upload waited for its turn

@@ -23,6 +23,7 @@ import trio
 
 from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.shared.errors import InvalidText, LocalProtocolError, MavftpfsError, NotFound, ReadOnly
 from mavftpfs.shared.model import EntryKind, split
 
@@ -64,7 +65,7 @@ class Save(Generic[B]):
     """A text that is saved.
 
     bases: what its writer read, the oldest first; rereads: see Reads. appended: the lines were appended,
-    each is meant. progress: told how many bytes were ACKed.
+    each is meant.
     """
 
     name: bytes
@@ -72,7 +73,6 @@ class Save(Generic[B]):
     bases: Sequence[B]
     rereads: bool
     appended: bool
-    progress: Callable[[int], None] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,30 @@ class Saved(Generic[B]):
 
     known: B | None
     notes: Sequence[str]
+
+
+@dataclass(slots=True)
+class Sending:
+    """An upload that is under way, in bytes."""
+
+    path: bytes
+    size: int
+    acked: int = 0
+
+    def on_acked(self, count: int) -> None:
+        """So many more were ACKed."""
+        self.acked += count
+
+    def facts(self) -> dict[str, object]:
+        """Return facts for people and scripts."""
+        left = self.size - self.acked
+        return {
+            "path": self.path.decode(errors="replace"),
+            "size": self.size,
+            "bytes_left": left,
+            "sending": True,
+            "eta": None,
+        }
 
 
 class Texts(ABC, Generic[B]):
@@ -99,6 +123,7 @@ class Texts(ABC, Generic[B]):
         self._require_writable = require_writable
         self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
         self._saving = trio.Lock()
+        self._sending: Sending | None = None
 
     # --- what the parameters and the missions implement
 
@@ -198,7 +223,6 @@ class Texts(ABC, Generic[B]):
         program: Program | None,
         base: B | None,
         appended: bool,
-        progress: Callable[[int], None] | None,
     ) -> None:
         """Save a text; one after the other. base: what its handle showed before.
 
@@ -212,7 +236,7 @@ class Texts(ABC, Generic[B]):
                 bases = [*bases, base]
             try:
                 self._require_writable()
-                done = await self.carry_out(Save(name, text, bases, reads.rereads, appended, progress))
+                done = await self.carry_out(Save(name, text, bases, reads.rereads, appended))
             except Refused as refused:
                 self._know(program, refused.known)
                 self._tell(name, refused.lines)
@@ -228,6 +252,23 @@ class Texts(ABC, Generic[B]):
         """A program saved: this is what it still knows."""
         if known is not None and program is not None:
             self._reads[program] = Reads([known])
+
+    async def upload(self, store: VehicleStore, name: bytes, file: bytes, pieces: Sequence[bytes]) -> None:
+        """Send what a save makes, with its progress in `transfers`.
+
+        Raises:
+            As VehicleStore.write_whole.
+        """
+        size = sum(map(len, pieces))
+        sending = self._sending = Sending(self.directory + b"/" + name, size)
+        try:
+            await store.write_whole(file, pieces, sending.on_acked)
+        finally:
+            self._sending = None
+
+    def transfers(self) -> Sequence[dict[str, object]]:
+        """Return the upload that is under way, if one is, as the files that are written are told."""
+        return [] if self._sending is None else [self._sending.facts()]
 
     def refuse_unfinished(self, name: bytes, text: bytes) -> InvalidText:
         """Say that a text ends in the middle of a line, and return the error."""
@@ -280,7 +321,7 @@ class ErrorHandle(OpenFile):
 
 
 class TextHandle(OpenFile, Generic[B]):
-    """One open() of a text. progress: told how many bytes of a save were ACKed."""
+    """One open() of a text."""
 
     direct_io = True
     writable = False
@@ -297,7 +338,6 @@ class TextHandle(OpenFile, Generic[B]):
         program: Program | None,
     ) -> None:
         self.writable = write
-        self.progress: Callable[[int], None] | None = None
         self._texts = texts
         self._name = name
         self._program = program
@@ -380,7 +420,6 @@ class TextHandle(OpenFile, Generic[B]):
                 program=self._program,
                 base=self._base,
                 appended=self._append,
-                progress=self.progress,
             )
         except MavftpfsError as error:
             self._error = error

@@ -418,8 +418,11 @@ class Tree:
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
         files, blocks = self._files, self._blocks
+        writing: dict[str, Any] = self._writing.status()
+        transfers = [one for texts in self._texts for one in texts.transfers()] + writing.pop("transfers")
         return {
-            **self._writing.status(),
+            **writing,
+            "transfers": transfers,
             **files.status(),
             "bytes_local": self._local.used,
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,

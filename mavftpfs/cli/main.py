@@ -309,6 +309,21 @@ def _crc_parser(name: str) -> Parser:
     return _paths_parser(name, "Have the vehicle compute the CRC32 of files.")
 
 
+def _param_parser(name: str) -> Parser:
+    parser = _source_parser(name, "Print, set, load, save or compare the vehicle's parameters.")
+    parser.add_argument(
+        "names", metavar="NAME", nargs="*", help="print these (a pattern, as 'BATT*'); NAME=VALUE: set"
+    )
+    parser.add_argument("--changed", action="store_true", help="only what differs from its default")
+    parser.add_argument("--load", metavar="FILE", help="set what a file says and does not hold")
+    parser.add_argument("--skip-unknown", action="store_true", help="with --load: leave out unknown names")
+    parser.add_argument("--save", metavar="FILE", help="save all, for QGroundControl if it ends in .params")
+    parser.add_argument("--diff", metavar="FILE", help="show where a file differs; exit code 1 if it does")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("-y", "--yes", action="store_true", help="do not ask")
+    return parser
+
+
 def _umount_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Deliver what is held, close the session, unmount.")
     parser.add_argument("mountpoint", metavar="MOUNTPOINT")
@@ -412,6 +427,12 @@ def _hub(args: argparse.Namespace) -> int:
     return hub(args)
 
 
+def _param(args: argparse.Namespace) -> int:
+    from mavftpfs.cli.param import param
+
+    return param(args)
+
+
 def _verb(name: str) -> Run:
     """Return the command of that name without a mount."""
 
@@ -428,6 +449,7 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "mount": (_mount_parser, commands.mount),
     "umount": (_umount_parser, commands.umount),
     "status": (_status_parser, commands.status),
+    "param": (_param_parser, _param),
     "sync": (_sync_parser, _verb("sync")),
     "scan": (_scan_parser, _verb("scan")),
     "ls": (_ls_parser, _verb("ls")),

@@ -57,7 +57,7 @@ def run(
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
     if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
         logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
-    with open_sinks(target.options, debug=args.debug, tell=_say) as sinks:
+    with open_sinks(target.options, debug=args.debug, tell=say) as sinks:
         return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
 
 
@@ -102,7 +102,7 @@ async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]
 STDIN = STDOUT = "-"
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
     print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
@@ -112,7 +112,7 @@ def _on_interrupt(line: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        _say(f"interrupted: {line()}")
+        say(f"interrupted: {line()}")
         raise
 
 
@@ -153,7 +153,7 @@ def sync(args: Args) -> int:
         _print_outcome(args, outcome, since)
     _say_what_is_not_proven(outcome)
     if error is not None:
-        _say(f"{error}; {_here(outcome)}" if not args.check else str(error))
+        say(f"{error}; {_here(outcome)}" if not args.check else str(error))
         return max(exit_code_for(error), ExitCode.INCOMPLETE)
     if outcome.differing:
         return ExitCode.USAGE
@@ -203,7 +203,7 @@ def cat(args: Args) -> int:
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, Progress(), args.verify)
-        await download.Downloads(fetcher, outcome, _ignore, _say).cat(wanted, take)
+        await download.Downloads(fetcher, outcome, _ignore, say).cat(wanted, take)
 
     with_session(args, work, component)
     return _exit_code(outcome)
@@ -227,7 +227,7 @@ def _ignore(fetched: Fetched) -> None:
 
 def _say_what_is_not_proven(outcome: download.Outcome) -> None:
     for lacking, count in outcome.lacking.items():
-        _say(f"not proven: {lacking} ({count_files(count)})")
+        say(f"not proven: {lacking} ({count_files(count)})")
 
 
 def _download(
@@ -242,7 +242,7 @@ def _download(
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify, getattr(args, "resume", True))
-        await function(download.Downloads(fetcher, outcome, tell, _say))
+        await function(download.Downloads(fetcher, outcome, tell, say))
 
     with _on_interrupt(lambda: _here(outcome)), drawing.shown(bar):
         with_session(args, work, component)

@@ -78,8 +78,10 @@ class Files(Protocol):
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return what is in a directory."""
 
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> File:
-        """Open a file that is there, for reading, or for both; `truncate` empties it."""
+    async def open(
+        self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
+    ) -> File:
+        """Open a file that is there; `truncate` empties it. append: of cache.texts, to write an end."""
 
     async def create(self, path: bytes, *, exclusive: bool) -> File:
         """Make a file, or open the one that is there, for reading and writing."""
@@ -108,7 +110,6 @@ class Files(Protocol):
 
 WITHDRAWAL_TIME = 45.0
 """Seconds to take back what was written: a request or two that nobody answers."""
-
 
 CLOSING_TIME = 5.0
 """Seconds to close what nothing more is to be delivered of."""
@@ -452,10 +453,11 @@ class MountedFiles:
 
         return await _call(path, scan, self._place(path))
 
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> MountedFile:
+    async def open(
+        self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
+    ) -> MountedFile:
         """As os.open."""
-        flags = (os.O_RDWR if write else os.O_RDONLY) | (os.O_TRUNC if truncate else 0)
-        return await self._open(path, flags)
+        return await self._open(path, os.O_RDWR * write | os.O_TRUNC * truncate | os.O_APPEND * append)
 
     async def create(self, path: bytes, *, exclusive: bool) -> MountedFile:
         """As os.open with O_CREAT."""

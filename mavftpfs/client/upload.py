@@ -147,7 +147,7 @@ async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Pro
         except CrossDevice:  # this server cannot rename
             source.seek(0)
     file = await emptied(session.files, remote)
-    async with _watched(session, remote, progress), written(file):
+    async with watched(session, remote, progress), written(file):
         return await _copy(source, file)
 
 
@@ -157,7 +157,7 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     files = session.files
     beside = join(split(remote)[0], f"{BESIDE}{secrets.token_hex(4)}".encode())
     file = await files.create(beside, exclusive=True)
-    async with _watched(session, beside, progress), written(file):
+    async with watched(session, beside, progress), written(file):
         size = await _copy(source, file)
     try:
         await files.rename(beside, remote)
@@ -179,7 +179,7 @@ async def _copy(source: BinaryIO, file: File) -> int:
 
 
 @asynccontextmanager
-async def _watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
+async def watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
     """Tell progress what the vehicle has acknowledged of a file while the body sends it."""
     name = session.on_vehicle(path).decode(errors="replace")
 

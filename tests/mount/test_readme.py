@@ -130,6 +130,19 @@ def test_editing(home: Home, field: Field) -> None:
     home.run("mavftpfs umount ~/drone")
 
 
+def test_parameters(home: Home, field: Field) -> None:
+    home.mountpoint.mkdir()
+    home.run(with_vehicle(MOUNTS[0], home, field, "ardupilot"))
+    vim, save, diff = block("Parameters")
+    home.run(save)
+    home.run(vim.replace("vim ", "vim -es -u NONE -c '%s/^RTL_ALT,.*/RTL_ALT,3000/' -c wq "))
+    assert home.run("grep ^RTL_ALT, ~/drone/@PARAM/params.parm") == "RTL_ALT,3000\n"
+    assert home.run(f"{diff} || test $? = 1").split()[-3:] == ["RTL_ALT", "3000", "1500"]
+    home.run(diff.replace("--diff", "--load"))
+    home.run(diff)
+    home.run("mavftpfs umount ~/drone")
+
+
 def told_keys(command: str) -> set[str]:
     """Return the names of keys in the guide's paragraph or table on `COMMAND --json`, without examples."""
     guide = (PROJECT / "docs/guide.md").read_text().partition("\n## JSON\n")[2]

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.parameters.text import parse
+from mavftpfs.client import parameters as client
+from mavftpfs.client.files import Session
+from mavftpfs.client.progress import Progress
+from mavftpfs.parameters.packed import pack_upload
+from mavftpfs.parameters.text import Line, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -532,3 +538,42 @@ async def test_a_mount_that_is_read_only_shows_them() -> None:
         assert b"MODE_001,1\n" in await read_file(tree, ALL)
         with pytest.raises(ReadOnly):
             await tree.open(ALL, write=True)
+
+
+# --- the command
+
+
+async def test_300_values_over_57600_baud() -> None:
+    """It takes at most twice the time that the bytes need, and says how far it is."""
+    rate = 5760.0
+    link = LinkSettings(delay=0.01, rate=rate, queue=4096)
+    parameters = many(count=1329, drifting=0)
+    async with vehicle("ardupilot5", link=link, parameters=parameters) as (here, tree):
+        session = Session(tree, acknowledged=partial(acknowledged, tree))
+        await tree.stat(ALL)
+        await trio.sleep(20)
+        began, bar, seen = trio.current_time(), Progress(trio.current_time), set[int]()
+        lines = [Line(i, f"GAIN_{i:03}", i + 0.5) for i in range(300)]
+        wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
+        assert len(wish.changes) == 300
+
+        async def look() -> None:
+            while True:
+                await trio.sleep(0.1)
+                seen.add(bar.here)
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(look)
+            await client.set_values(session, wish.changes, bar)
+            nursery.cancel_scope.cancel()
+        took = trio.current_time() - began
+        assert number(here, "GAIN_299") == 299.5
+        table = len(table_of(here).download(Selection(), 239, here.server.firmware.now))
+        upload = sum(map(len, pack_upload([change.after for change in wish.changes])))
+        assert took < 2 * (2 * table + upload) / rate
+        assert len(seen) > 2
+
+
+async def acknowledged(tree: Tree) -> dict[str, int]:
+    found: Any = tree.status()["transfers"]
+    return {one["path"]: one["size"] - one["bytes_left"] for one in found}

@@ -1,0 +1,260 @@
+"""`mavftpfs param`: prints, sets, loads, saves and compares a vehicle's parameters. Layer: cli."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import trio
+
+from mavftpfs.cli import drawing, verbs
+from mavftpfs.client import parameters as client
+from mavftpfs.client.files import Session, Target
+from mavftpfs.client.parameters import Change, Difference, Wish
+from mavftpfs.client.progress import Progress
+from mavftpfs.parameters.text import Line
+from mavftpfs.parameters.values import Kind, Parameter, text_of
+from mavftpfs.shared.errors import ExitCode, InvalidText, MavftpfsError, UsageError
+
+Args = argparse.Namespace
+
+
+def param(args: Args) -> int:
+    """Print parameters, or do with them what the words say."""
+    try:
+        return _param(args)
+    except InvalidText as exc:  # of a file, each line that cannot be
+        *others, last = str(exc).split("\n")
+        for line in others:
+            verbs.say(line)
+        raise InvalidText(last) from exc
+
+
+def _param(args: Args) -> int:
+    setting = [word for word in args.names if "=" in word]
+    _require_one_job(args, setting)
+    if args.save is not None:
+        return _with_session(args, partial(_save, args))
+    if args.diff is not None:
+        return _with_session(args, partial(_diff, args, client.load(Path(args.diff))))
+    if args.load is not None:
+        return _change(args, client.load(Path(args.load)), args.load, meant=False)
+    if setting:
+        return _change(args, client.assignments(setting), "", meant=True)
+    return _with_session(args, partial(_print, args))
+
+
+def _require_one_job(args: Args, setting: Sequence[str]) -> None:
+    jobs = [f"--{name}" for name in ("load", "save", "diff") if getattr(args, name) is not None]
+    if len(jobs) > 1 or (jobs and args.names):
+        raise UsageError(f"{jobs[0]} does one thing, with all parameters; leave out the rest")
+    if setting and len(setting) < len(args.names):
+        raise UsageError("set parameters (NAME=VALUE) or print them (NAME), not both")
+    if args.changed and (setting or (jobs and jobs != ["--save"])):
+        raise UsageError("--changed is for what is printed or saved")
+    if args.skip_unknown and args.load is None:
+        raise UsageError("--skip-unknown is for --load")
+
+
+def _with_session(args: Args, function: Any, *, writing: bool = False) -> int:
+    async def work(target: Target) -> int:
+        async with client.at_root(target).session(writing=writing) as session:
+            return int(await function(session))
+
+    return verbs.run(args, work)
+
+
+# -- printing, saving, comparing ------------------------------------------------------------------
+
+
+async def _print(args: Args, session: Session) -> int:
+    if args.changed or args.json:
+        found = await client.read_with_defaults(session)
+        if args.changed:
+            await client.read_text(session, client.CHANGED)  # or says that no defaults are told
+            found = [one for one in found if one.changed]
+    else:
+        found = await client.read_parameters(session)
+    found = client.matching(found, args.names) if found or not args.changed else []
+    if args.json:
+        print(json.dumps([_facts(one) for one in found], indent=2))
+        return ExitCode.OK
+    for one in found:
+        default = (
+            f" # default {text_of(one.kind, one.default)}" if args.changed and one.default is not None else ""
+        )
+        print(f"{one.name},{client.value_text(one)}{default}")
+    return ExitCode.OK
+
+
+def _facts(one: Parameter) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "type": one.kind.name.lower(),
+        "value": _number(one),
+        "default": None if one.default is None else _number(replace(one, value=one.default)),
+    }
+
+
+def _number(one: Parameter) -> int | float | str:
+    """Return what JSON has a number for, else its text; floats as the shortest decimal."""
+    text = client.value_text(one)
+    if one.kind is not Kind.FLOAT:
+        return int(text)
+    return float(text) if math.isfinite(one.value) else text
+
+
+async def _save(args: Args, session: Session) -> int:
+    name = client.CHANGED if args.changed else client.QGC if args.save.endswith(".params") else client.ALL
+    text = await client.read_text(session, name)
+    if args.save == verbs.STDOUT:
+        sys.stdout.write(text)
+        return ExitCode.OK
+    place = Path(args.save)
+    new = place.with_name(place.name + ".part")
+    try:
+        new.write_text(text)
+        os.replace(new, place)
+    except OSError as exc:
+        with suppress(OSError):
+            new.unlink()
+        raise UsageError(f"{place}: {exc.strerror}") from exc
+    count = sum(not line.startswith("#") for line in text.splitlines())
+    print(f"{count} parameters saved in {place}", file=sys.stderr)
+    return ExitCode.OK
+
+
+async def _diff(args: Args, lines: Sequence[Line], session: Session) -> int:
+    found = client.compare(lines, await client.read_parameters(session))
+    if args.json:
+        facts = [{"name": one.name, "vehicle": one.vehicle, "file": one.file} for one in found]
+        print(json.dumps(facts, indent=2))
+    else:
+        for line in _difference_lines(found):
+            print(line)
+    return ExitCode.USAGE if found else ExitCode.OK
+
+
+def _difference_lines(found: Sequence[Difference]) -> list[str]:
+    rows = [("", "VEHICLE", "FILE")] if found else []
+    rows += [(one.name, "-" if one.vehicle is None else one.vehicle, one.file) for one in found]
+    wide = [max((len(row[column]) for row in rows), default=0) for column in range(2)]
+    return [f"{row[0]:<{wide[0]}}  {row[1]:>{wide[1]}}  {row[2]}" for row in rows]
+
+
+# -- setting --------------------------------------------------------------------------------------
+
+
+def _change(args: Args, lines: Sequence[Line], name: str, *, meant: bool) -> int:
+    bar, done = Progress(), list[Change]()
+    error: MavftpfsError | None = None
+    setting = _Setting(args, lines, name, meant, bar, done)
+    try:
+        _with_session(args, setting.run, writing=True)
+    except MavftpfsError as exc:
+        error = exc
+    if args.json:
+        facts = [
+            {"name": one.after.name, "from": _number(one.before), "to": _number(one.after)} for one in done
+        ]
+        print(json.dumps({"set": facts, "error": None if error is None else str(error)}, indent=2))
+    elif error is None:
+        for change in () if setting.announced else done:
+            print(change)
+        if setting.announced or not done:
+            print(f"{len(done)} set" if done else "nothing to set: all of it holds", file=sys.stderr)
+    if error is not None:
+        raise error
+    return ExitCode.OK
+
+
+@dataclass(slots=True)
+class _Setting:
+    """One run that sets parameters. name: of the file that the lines are from. meant: see make_plan. done:
+    what was set and read back.
+    """
+
+    args: Args
+    lines: Sequence[Line]
+    name: str
+    meant: bool
+    bar: Progress
+    done: list[Change]
+    announced: bool = False
+
+    async def run(self, session: Session) -> int:
+        """Set what does not hold; in two steps where some may only appear when others are set."""
+        wish = await self._compare(session)
+        first = client.enabling(wish.changes) if wish.unknown else []
+        if wish.unknown and not first:
+            self._require_known(wish)
+        await self._ask(wish)
+        if first:
+            await self._set(session, first)
+            wish = await self._compare(session)
+            self._require_known(wish)
+        await self._set(session, wish.changes)
+        for note in wish.notes:
+            verbs.say(note)
+        return ExitCode.OK
+
+    async def _compare(self, session: Session) -> Wish:
+        self.bar.plan(1, 0)
+        self.bar.begin("reading the parameters", 0)
+        with drawing.shown(self.bar):
+            current = await client.read_parameters(session)
+        return client.wish(self.lines, current, self.name, meant=self.meant)
+
+    def _require_known(self, wish: Wish) -> None:
+        """Say which names the vehicle does not have.
+
+        Raises:
+            InvalidText: and they may not be left out.
+        """
+        names = ", ".join(line.name for line in wish.unknown)
+        if wish.unknown and not self.args.skip_unknown:
+            hint = "; --skip-unknown leaves them out" if self.name else ""
+            raise InvalidText(f"the vehicle has no {names}{hint}")
+        if wish.unknown:
+            verbs.say(f"left out, because the vehicle does not have them: {names}")
+
+    async def _ask(self, wish: Wish) -> None:
+        """Before more than one is set: say what will change, and ask on a terminal.
+
+        Raises:
+            UsageError: the user said no.
+        """
+        count = len(wish.changes) + len(wish.unknown)
+        if len(wish.changes) < 1 or count < 2 or self.args.yes or self.args.json:
+            return
+        self.announced = True
+        for change in wish.changes:
+            print(change, file=sys.stderr)
+        if not sys.stdin.isatty():
+            return
+        print(f"Set {len(wish.changes)} parameters? [y/N] ", end="", file=sys.stderr, flush=True)
+        answer = await trio.to_thread.run_sync(sys.stdin.readline, abandon_on_cancel=True)
+        if answer.strip().lower() not in ("y", "yes"):
+            raise UsageError("nothing was set")
+
+    async def _set(self, session: Session, changes: Sequence[Change]) -> None:
+        if not changes:
+            return
+        try:
+            with drawing.shown(self.bar):
+                await client.set_values(session, changes, self.bar)
+        except MavftpfsError as error:
+            for line in await client.last_error(session):
+                if line != str(error):
+                    verbs.say(line)
+            raise
+        self.done += changes

@@ -1,0 +1,126 @@
+"""`mavftpfs param`, as a user runs it: on a link of its own, and through a mount."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import mavftpfs
+from tests.support.terminal import Terminal
+
+
+@pytest.fixture(scope="module", params=["link", "mount"])
+def source(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> str:
+    """A vehicle, mounted or not."""
+    vehicle = module_field.sim(small_tree, "ardupilot5")
+    if request.param == "mount":
+        return str(module_field.mount(vehicle.source).path)
+    return str(vehicle.source)
+
+
+def param(source: str, *words: object, code: int = 0) -> list[str]:
+    """Return the lines of stdout."""
+    return mavftpfs("param", source, *words, code=code)[0].splitlines()
+
+
+def said(source: str, *words: object, code: int = 0) -> str:
+    """Return what went to stderr."""
+    return mavftpfs("param", source, *words, code=code)[1]
+
+
+def test_printing(source: str) -> None:
+    assert param(source, "wpnav*", "RTL_ALT") == ["WPNAV_SPEED,1000", "RTL_ALT,1500"]
+    assert len(param(source)) > 60
+    assert "SERVO1_MIN,1101 # default 1100" in param(source, "--changed")
+    assert not any(line.startswith("RTL_ALT") for line in param(source, "--changed"))
+    (facts,) = json.loads("\n".join(param(source, "--json", "ATC_RAT_PIT_P")))
+    assert facts == {"name": "ATC_RAT_PIT_P", "type": "float", "value": 0.135, "default": 0.135}
+    assert "no parameter is called NOPE*" in said(source, "NOPE*", code=1)
+
+
+def test_setting(source: str) -> None:
+    assert param(source, "RTL_ALT=3000") == ["RTL_ALT 1500 -> 3000"]
+    assert param(source, "RTL_ALT") == ["RTL_ALT,3000"]
+    assert "all of it holds" in said(source, "RTL_ALT=3000.0")
+    lines = said(source, "RTL_ALT=1500", "WPNAV_SPEED=750.5").splitlines()
+    assert lines == ["RTL_ALT 3000 -> 1500", "WPNAV_SPEED 1000 -> 750.5", "2 set"]
+    assert param(source, "WPNAV_SPEED=1000", "--yes") == ["WPNAV_SPEED 750.5 -> 1000"]
+    told = json.loads("\n".join(param(source, "RTL_ALT=1600", "--json")))
+    assert told == {"set": [{"name": "RTL_ALT", "from": 1500, "to": 1600}], "error": None}
+    param(source, "RTL_ALT=1500")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("RTL_ALT=x",), "'x' is not a number"),
+        (("RTL_ALT=1.5",), "not a whole number"),
+        (("RTL_ALT=1", "RTL_ALT=2"), "given two values"),
+        (("NOPE=1",), "has no NOPE"),
+        (("RTL_ALT=1", "WPNAV_SPEED"), "not both"),
+        (("--load", "/nowhere/x"), "No such file"),
+        (("--load", "x", "--diff", "y"), "one thing"),
+        (("--skip-unknown",), "--load"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_sets_nothing(source: str, words: tuple[str, ...], named: str) -> None:
+    told = said(source, *words, code=1)
+    assert named in told
+    assert len(told.splitlines()) == 1
+    assert param(source, "RTL_ALT") == ["RTL_ALT,1500"]
+
+
+def test_saving_comparing_and_loading(source: str, tmp_path: Path) -> None:
+    saved, qgc = tmp_path / "a.parm", tmp_path / "a.params"
+    param(source, "--save", saved)
+    param(source, "--save", qgc)
+    assert param(source, "--diff", saved) == []
+    assert param(source, "--diff", qgc) == []
+    assert "# Vehicle-Id" in qgc.read_text()
+    param(source, "RTL_ALT=1700", "SERVO1_MIN=900", "-y")
+    table = [line.split() for line in param(source, "--diff", saved, code=1)]
+    assert table == [["VEHICLE", "FILE"], ["SERVO1_MIN", "900", "1101"], ["RTL_ALT", "1700", "1500"]]
+    facts = json.loads("\n".join(param(source, "--diff", saved, "--json", code=1)))
+    assert facts[1] == {"name": "RTL_ALT", "vehicle": "1700", "file": "1500"}
+    told = said(source, "--load", qgc)
+    assert "RTL_ALT 1700 -> 1500" in told
+    assert "STAT_RUNTIME" in told  # left alone
+    assert param(source, "--diff", saved) == []
+    names = [line.partition(",")[0] for line in saved.read_text().splitlines()]
+    assert [line.partition(",")[0] for line in param(source, "--save", "-")] == names
+
+
+def test_loading_goes_twice_where_parameters_appear_only_then(source: str, tmp_path: Path) -> None:
+    file = tmp_path / "grip.parm"
+    file.write_text("GRIP_GRAB,1800\nGRIP_ENABLE,1\nNO_SUCH,4\nRTL_ALT,1500\n")
+    assert "has no NO_SUCH" in said(source, "--load", file, code=1)
+    param(source, "GRIP_ENABLE=0")
+    told = said(source, "--load", file, "--skip-unknown")
+    assert "left out" in told
+    assert "NO_SUCH" in told
+    assert param(source, "GRIP*") == ["GRIP_ENABLE,1", "GRIP_GRAB,1800"]
+    param(source, "GRIP_GRAB=1900")
+    param(source, "GRIP_ENABLE=0")
+
+
+def test_bad_lines_of_a_file_are_all_named(source: str, tmp_path: Path) -> None:
+    file = tmp_path / "bad.parm"
+    file.write_text("RTL_ALT,x\n\nRTL_ALT\n")
+    lines = said(source, "--load", file, code=1).splitlines()
+    assert [line.partition("bad.parm")[2][:4] for line in lines] == [":1: ", ":3: "]
+
+
+@pytest.mark.parametrize(("answer", "code"), [("y\r", 0), ("n\r", 1), ("\r", 1)])
+def test_on_a_terminal_it_asks_before_it_sets_several(source: str, answer: str, code: int) -> None:
+    words = ["RTL_ALT=1800", "WPNAV_SPEED=800"]
+    terminal = Terminal([sys.executable, "-m", "mavftpfs", "param", source, *words], 100, 30)
+    terminal.read_until(lambda shown: "[y/N]" in shown.raw)
+    assert "RTL_ALT 1500 -> 1800" in terminal.raw
+    terminal.type(answer)
+    assert terminal.finish() == code, terminal.raw
+    assert param(source, "RTL_ALT") == ["RTL_ALT,1500" if code else "RTL_ALT,1800"]
+    param(source, "RTL_ALT=1500", "WPNAV_SPEED=1000", "-y")
