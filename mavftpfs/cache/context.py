@@ -16,9 +16,9 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
-from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import Armed, FileBusy
 from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.sameness import Listed, Sameness, compare
 
 
 @dataclass(slots=True)
@@ -54,7 +54,7 @@ class Context:
     def require_changeable(self) -> None:
         """Raise Armed if nothing may be changed now, VehicleLost if nothing can be."""
         self.require_disarmed()
-        self.directories.require_reachable()
+        self.directories.require_heard()
 
     def require_idle(self, path: bytes) -> None:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
@@ -92,7 +92,7 @@ class Context:
                 continue
             if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue
-            if became_another(draft.base.size, draft.base.mtime, entry):
+            if compare(draft.base.known, Listed(entry)) is Sameness.OTHER:
                 self.on_replaced(node, draft)
             elif draft.base.mtime is None and entry.size == draft.base.size:
                 draft.base = replace(draft.base, mtime=entry.mtime)

@@ -271,7 +271,7 @@ class Directories:
         directory = await self.get(parent)
         entry = directory.entries.get(name)
         if entry is None and not directory.complete and name:
-            self.require_reachable()
+            self.require_heard()
             try:
                 entry = DirEntry(name, EntryKind.FILE, await self._store.stat_size(path))
             except FtpNak as nak:
@@ -329,7 +329,7 @@ class Directories:
         """
         directory = self.known(path)
         if directory is None:
-            self.require_reachable()
+            self.require_heard()
             return await self._list(path)
         if self.clock() < directory.fresh_until or self._store.why_lost() is not None:
             return directory
@@ -338,7 +338,7 @@ class Directories:
         except VehicleLost:
             return directory
 
-    def require_reachable(self) -> None:
+    def require_heard(self) -> None:
         """Raise VehicleLost if the vehicle is known to be lost: what begins now would wait for nothing."""
         why = self._store.why_lost()
         if why is not None:
@@ -365,7 +365,7 @@ class Directories:
                 sweep = partial(self._sweep, path)
                 directory = await self._sweeping.run(path, sweep, again=waited_for)
                 break
-            self.require_reachable()
+            self.require_heard()
             waited_for = True
         if self.on_swept is not None:
             await self.on_swept(path, directory)

@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import Sending
 
 STEP = 64 * 1024
@@ -122,6 +123,12 @@ class Base:
     size: int
     mtime: int | None = None
     crc32: int | None = None
+
+    @property
+    def known(self) -> Known:
+        """What it is compared by. Where its CRC32 is known that tells more than its time: we wrote it, or no
+        time was told."""
+        return Known(self.size, self.mtime, self.crc32, ours=self.crc32 is not None)
 
 
 class Draft:

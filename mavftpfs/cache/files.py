@@ -23,6 +23,7 @@ from __future__ import annotations
 import errno
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import trio
@@ -34,7 +35,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import NEVER, BlockCache, Version, became_another
+from mavftpfs.cache.versions import NEVER, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -46,6 +47,7 @@ from mavftpfs.shared.errors import (
     NotFound,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.sameness import Listed, Opened, Sameness, compare
 
 MAX_CLOSED = 4096
 """How many files that nobody has open are remembered with their blocks."""
@@ -117,7 +119,7 @@ class Files:
         keep_cache, direct_io = same and version.shown, False
         for other in self.open_versions:
             if other.path == path and other is not version:
-                direct_io |= other.dead is None or other.lost
+                direct_io |= not other.replaced or other.lost
         version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
         version.handles += 1
         self.open_versions[version] = None
@@ -143,18 +145,19 @@ class Files:
 
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
-        entry, listed_at = found.entry, found.directory.listed_at
-        if listed_at > version.known_at and became_another(version.size, version.mtime, entry):
+        listed_at = found.directory.listed_at
+        answer = compare(replace(version.known, anew=True), Listed(found.entry))
+        if answer is Sameness.OTHER and listed_at > version.known_at:
             self.kill(version)
-        if version.dead is not None or found.size != version.size:
+        if version.replaced or found.size != version.size:
             return False
-        if fresh and entry.mtime is not None and entry.mtime == version.mtime:
-            version.known_at = max(version.known_at, listed_at)
+        if fresh and answer is Sameness.SAME:
+            version.prove(listed_at)
             return True
         return self._clock() - version.known_at < self._proof_time
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
-        self._directories.require_reachable()
+        self._directories.require_heard()
         version = Version(self.cache, path)
         reader = await self._store.open_reader(path, version)
         try:
@@ -164,11 +167,11 @@ class Files:
             reader.close()
             raise
         version.reader, version.size = reader, reader.size
-        version.known_at = self._clock()
+        version.prove(self._clock())
         if entry.size == reader.size:
             version.mtime = entry.mtime
         old = self._current.get(path)
-        if old is not None and old.size > reader.size:
+        if old is not None and compare(old.known, Opened(reader.size)) is Sameness.OTHER:
             self.kill(old)
         self._replace(version)
         if entry.size != reader.size:  # what the kernel was told is wrong
@@ -199,7 +202,7 @@ class Files:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
         """
         async with self.paths.steady(version) as path:
-            version.require_alive()
+            version.require_not_replaced()
             expected = None if version.doubted else version.size
             version.close_reader()
             version.doubted = False
@@ -207,10 +210,10 @@ class Files:
         if version.handles == 0:
             reader.close()
             raise LocalProtocolError(f"{version.path!r} was closed while it was read")
-        if reader.size < version.size:
+        if compare(version.known, Opened(reader.size)) is Sameness.OTHER:
             reader.close()
             self.kill(version)
-            version.require_alive()
+            version.require_not_replaced()
         version.reader = reader
 
     def _replace(self, version: Version) -> None:
@@ -247,15 +250,15 @@ class Files:
         soon = not now and self._clock() < version.compare_after
         if not (soon or self._is_sure(version) or self.is_changing(version.path)):
             await self._compare(version)
-        version.require_alive()
+        version.require_not_replaced()
 
     def _is_sure(self, version: Version) -> bool:
         """Return whether a version is known to be the path's file since the server opened that last, or a
         listing would tell no more than an open reply does: that it did not become smaller."""
-        if version.compared:
+        if version.current:
             return True
-        restarted = version.known_at == NEVER
-        return not (restarted or version.mtime is not None or self._directories.tells_times)
+        reply = Opened(version.size, self._directories.tells_times)  # a smaller one was refused
+        return compare(version.known, reply) is Sameness.SAME
 
     async def _compare(self, version: Version) -> None:
         path = version.path
@@ -274,28 +277,24 @@ class Files:
     def _compare_listed(self, version: Version, directory: Directory) -> None:
         """Take what a listing shows that began after a version was last known to be the path's file."""
         entry = directory.entries.get(split(version.path)[1])
-        if entry is None or entry.kind is not EntryKind.FILE:
-            if directory.complete or entry is not None:
-                self.kill(version)
-            return
-        # Nobody goes on writing a file after a restart.
-        resized = version.known_at == NEVER and entry.size != version.size
-        if not resized and not became_another(version.size, version.mtime, entry):
-            if version.known_at < version.opened_at <= directory.listed_at:
-                version.known_at = directory.listed_at
+        answer = compare(version.known, Listed(entry, directory.complete))
+        if answer is Sameness.OTHER:
+            self.kill(version)
+        elif entry is None:
+            return  # what came of the listing does not tell
+        elif answer is Sameness.UNPROVEN and not version.given:
+            version.start_over(entry.mtime, directory.listed_at)
+        else:
+            if version.opened_at <= directory.listed_at and not version.current:
+                version.prove(directory.listed_at)
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
-        elif version.given or entry.size != version.size:
-            self.kill(version)
-        else:  # nobody got a byte of it: it is the file that is there now
-            version.mtime, version.known_at, version.kept = entry.mtime, directory.listed_at, None
-            version.on_suspect("another file has its name")
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed, for whatever reason."""
         for version in list(self.open_versions):
             parent, name = split(version.path)
-            known = parent == path and name in directory.entries and version.dead is None
+            known = parent == path and name in directory.entries and not version.replaced
             if known and directory.listed_at > version.known_at and not self.is_changing(version.path):
                 self._compare_listed(version, directory)
 
@@ -305,9 +304,9 @@ class Files:
         newest = self._current.get(version.path) is version
         older = [v for v in self.open_versions if newest and v.path == version.path]
         for one in dict.fromkeys((version, *older)):
-            if one.dead is None:
+            if not one.replaced:
                 one.lost = lost
-                one.end(f"{one.path!r} changed on the vehicle after it was opened")
+                one.replace(f"{one.path!r} changed on the vehicle after it was opened")
                 self._invalidate(one.path)
 
     def forget_pages(self, path: bytes) -> None:
@@ -330,16 +329,14 @@ class Files:
         """Nothing is proven any more; open files are compared before more of them is given out."""
         self._restarted_at = self._clock()
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
-            version.known_at = version.compare_after = NEVER
-            version.on_opened(self._restarted_at)
-            version.kept = None
+            version.on_restart(self._restarted_at)
 
     # --- we changed the file ourselves
 
     def whole(self, path: bytes) -> Version | None:
         """Return a path's version if all of it is held, surely of one file, and nobody has another open."""
         version = self._current.get(path)
-        if version is None or version.dead is not None or not version.complete:
+        if version is None or version.replaced or not version.complete:
             return None
         alone = all(v is version or v.lost for v in self.open_versions if v.path == path)
         return version if alone and self._is_sure(version) else None
@@ -350,7 +347,7 @@ class Files:
 
     def end(self, path: bytes) -> None:
         """What we are about to write there must not be given to who has another file open."""
-        for version in [v for v in self.open_versions if v.path == path and v.dead is None]:
+        for version in [v for v in self.open_versions if v.path == path and not v.replaced]:
             self.kill(version)
 
     def on_changed(self, path: bytes) -> None:
@@ -358,7 +355,7 @@ class Files:
         for version in self._at_or_below(path):
             if self._current.get(version.path) is version:
                 del self._current[version.path]
-            version.end(f"{version.path!r} was changed here")
+            version.replace(f"{version.path!r} was changed here")
 
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Take over the content of a file we wrote, which was proven then; `read(start, stop)` returns it."""
@@ -366,7 +363,8 @@ class Files:
         if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
         version = Version(self.cache, path, size)
-        version.known_at, version.shown, version.given = proven_at, True, True
+        version.known_at, version.shown = proven_at, True
+        version.ours = version.given = True
         self._replace(version)
         for at in range(0, size, ADOPTED_AT_ONCE):
             version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
@@ -404,7 +402,7 @@ class Files:
         version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
             version.clear()
-        elif version.dead is not None or version.known_at == NEVER:
+        elif version.replaced or version.known_at == NEVER:
             self._forget(version)
 
     def forget_closed(self) -> None:
@@ -446,7 +444,7 @@ class VersionHandle(OpenFile):
             return b""
         files, version = self._files, self._version
         for pause in (*PAUSES, 0.0):
-            version.require_alive()
+            version.require_not_replaced()
             drops = version.drops
             pieces: list[bytes | memoryview] = []
             for start in range(offset, stop, files.cache.piece):
@@ -467,7 +465,7 @@ class VersionHandle(OpenFile):
     def require_not_lost(self) -> None:
         """Raise FileChanged if the file became another one by somebody else's doing."""
         if self._version.lost:
-            self._version.require_alive()
+            self._version.require_not_replaced()
 
     def close(self) -> None:
         """Release the handle."""
@@ -491,7 +489,7 @@ class VersionHandle(OpenFile):
             async with files.cache.reads:
                 if files.kept is not None:
                     await files.kept.fill(version, start, stop)
-                    version.require_alive()
+                    version.require_not_replaced()
                 if version.missing(start, stop):
                     if version.reader is None or version.doubted:
                         await files.reopening.run(version, partial(files.open_reader, version))
@@ -506,5 +504,5 @@ class VersionHandle(OpenFile):
             if not isinstance(error, FileChanged) and errno_for(error) != errno.ENOENT:
                 raise
             files.kill(version)
-            version.require_alive()
+            version.require_not_replaced()
             raise

@@ -31,6 +31,7 @@ from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
 from mavftpfs.cache.versions import BLOCK_SIZE, NEVER, BlockCache, Version
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import DirEntry, is_virtual
+from mavftpfs.shared.sameness import Listed, Sameness, compare
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -151,7 +152,7 @@ class KeptCache:
             return None
         with trio.move_on_after(CRC_LIMIT) as scope:
             try:
-                self._directories.require_reachable()
+                self._directories.require_heard()
                 return _of_crc32(key, await self._crc32(key.path))
             except MavftpfsError:  # without one all is read
                 return None
@@ -203,7 +204,7 @@ class KeptCache:
         if self._directories.is_growing(key.path):
             return False
         listed = self._directories.entry(key.path)
-        return listed is None or (listed.size, listed.mtime) == (key.size, version.mtime)
+        return listed is None or compare(version.known, Listed(listed)) is Sameness.SAME
 
     async def _keep(self, version: Version, blocks: dict[int, bytearray], *, by_crc32: bool = False) -> None:
         """Write blocks of a version that are held whole. by_crc32: all of them, under its CRC32 only."""
@@ -213,7 +214,7 @@ class KeptCache:
             return
         key = kept.key
         if _is_dated(key) and not by_crc32:
-            if not version.compared:
+            if not version.current:
                 return
         elif sum(map(len, blocks.values())) < version.size:
             return

@@ -252,7 +252,7 @@ class Tree:
         key = (remote, found.size, found.entry.mtime or 0)
         value = self._checksums.get(key)
         if value is None:
-            self._directories.require_reachable()
+            self._directories.require_heard()
             value = await self._store.crc32(remote, size=found.size)
             if len(self._checksums) == MAX_CHECKSUMS:
                 self._checksums.clear()

@@ -25,6 +25,7 @@ from mavftpfs.shared.errors import (
     SessionBusy,
     VerificationFailed,
 )
+from mavftpfs.shared.sameness import Listed, Opened, Sameness, Summed, compare
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -92,21 +93,21 @@ class Verifier:
             As VehicleStore.stat_size and Directories.current.
         """
         context, options = self._context, self._context.options
-        if context.directories.tells_times:
-            entry = await self._context.directories.current(path)
-            if entry is None or entry.size != base.size:
-                return False
-            if None not in (entry.mtime, base.mtime) and entry.mtime != base.mtime:
+        timed = context.directories.tells_times or base.mtime is not None
+        if timed:
+            entry = await context.directories.current(path)
+            if compare(base.known, Listed(entry)) in (Sameness.OTHER, Sameness.GREW):
                 return False
         if base.crc32 is not None and base.size <= options.verify_max and options.verify in ("auto", "crc"):
-            # Of what we delivered no listing may have told the time before others replaced it.
             with suppress(FtpNak, RequestTimeout, Armed):
-                crc32 = await context.store.crc32(path, size=base.size)
-                if crc32 or crc32 != base.crc32:
-                    return crc32 == base.crc32
-        if context.directories.tells_times:
+                told = Summed(await context.store.crc32(path, size=base.size))
+                answer = compare(base.known, told)
+                if answer is not Sameness.UNPROVEN:
+                    return answer is Sameness.SAME
+        if timed:
             return True
-        return await self._size(path) == base.size
+        size = await self._size(path)
+        return size is not None and compare(base.known, Opened(size)) is Sameness.SAME
 
     # --- inside
 

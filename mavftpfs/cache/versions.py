@@ -2,8 +2,8 @@
 
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
 one version share its bytes and its remote reader. When the file turns out to have become another one the
-version is `dead`: its handles get FileChanged, and later opens start a new version. If somebody else did that
-it is `lost`, too: its handles never get what has the path now, whoever wrote it.
+version is REPLACED: its handles get FileChanged, and later opens start a new version. If somebody else
+replaced it the version is `lost`: its handles never get what has the path now, whoever wrote that.
 
 A version is the sink that its reader fills; those who wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
@@ -19,15 +19,16 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 
 import trio
 
 from mavftpfs.cache.kept_disk import Kept
 from mavftpfs.cache.readahead import MAX_WINDOW
 from mavftpfs.cache.remote import Reader
-from mavftpfs.shared.errors import FileChanged, MavftpfsError, RequestTimeout
+from mavftpfs.shared.errors import FileChanged, RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.model import DirEntry
+from mavftpfs.shared.sameness import Known
 
 NEVER = float("-inf")
 
@@ -144,19 +145,31 @@ class _Waiter:
     error: Exception | None = None
 
 
+class VersionState(Enum):
+    """What is known of a version."""
+
+    CURRENT = "current"
+    """The path was known to be this file after the server last opened it."""
+    UNPROVEN = "unproven"
+    """The server opened the path again since, or restarted."""
+    REPLACED = "replaced"
+    """The path is another file now. It stays so."""
+
+
 class Version:
     """A file as it was when it was opened; implements cache.remote.ReadSink. Times are those of the caches'
     clock.
 
     Attributes:
+        state: see VersionState.
         path: what it is called by now. size: in bytes, by the open reply. mtime: None if not known to belong
-            to this size. reader: where its bytes come from, if it is open. handles: how many are open.
+            to this size. ours: we wrote it. given: a program got bytes of it.
         known_at: when the path was last known to be this file; NEVER after the vehicle restarted.
-            compare_after: no listing is asked for before, only to compare.
-        shown: whether the kernel may hold pages of it and all of them are good. given: whether a program got
-            any of the bytes. dead: why it is not the path's file any more; lost: somebody else changed that.
-        kept: its part on the local disk, if it may have one.
         opened_at: when the server opened the file for the session that bytes come from now.
+        compare_after: no listing is asked for before, only to compare.
+        lost: somebody else replaced it.
+        reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
+            local disk, if it may have one. shown: the kernel may hold pages of it, and all of them are good.
         doubted: what comes from the present reader is ignored, until a new one is opened.
         drops: how often all bytes were dropped because they were in doubt, or another file's.
     """
@@ -167,13 +180,13 @@ class Version:
         self.mtime = mtime
         self.reader: Reader | None = None
         self.handles = 0
+        self.state = VersionState.CURRENT
         self.known_at = cache.clock()
-        self.compare_after = NEVER
-        self.shown = self.given = self.lost = self.doubted = False
-        self.dead: MavftpfsError | None = None
+        self.opened_at = self.compare_after = NEVER
+        self.ours = self.given = self.lost = self.shown = self.doubted = False
         self.kept: Kept | None = None
-        self.opened_at = NEVER
         self.drops = 0
+        self._why = ""
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
@@ -213,6 +226,7 @@ class Version:
     def on_opened(self, at: float) -> None:
         """What comes from now on is of the file that was opened at that time."""
         self.opened_at = max(self.opened_at, at)
+        self._look()
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""
@@ -289,14 +303,47 @@ class Version:
     # --- life of the version
 
     @property
-    def compared(self) -> bool:
-        """Whether the path was known to be this file after the server opened it for what comes now."""
-        return self.known_at >= self.opened_at
+    def current(self) -> bool:
+        """Whether it is in the state CURRENT."""
+        return self.state is VersionState.CURRENT
 
-    def require_alive(self) -> None:
-        """Raise FileChanged if the file became another one."""
-        if self.dead is not None:
-            raise self.dead.with_traceback(None)
+    @property
+    def replaced(self) -> bool:
+        """Whether it is in the state REPLACED."""
+        return self.state is VersionState.REPLACED
+
+    @property
+    def known(self) -> Known:
+        """What it is compared by."""
+        restarted = self.known_at == NEVER
+        return Known(self.size, self.mtime, given=self.given, restarted=restarted, ours=self.ours)
+
+    def require_not_replaced(self) -> None:
+        """Raise FileChanged if the path became another file."""
+        if self.replaced:
+            raise FileChanged(self._why)
+
+    def prove(self, at: float) -> None:
+        """The path was known to be this file at that time."""
+        self.known_at = max(self.known_at, at)
+        self._look()
+
+    def on_restart(self, at: float) -> None:
+        """The vehicle restarted: nothing of it is proven any more."""
+        self.known_at = self.compare_after = NEVER
+        self.kept = None
+        self.on_opened(at)
+
+    def start_over(self, mtime: int | None, at: float) -> None:
+        """Nobody got a byte of it, so it is the file that a listing showed then, of this time."""
+        self.mtime, self.kept = mtime, None
+        self.prove(at)
+        self.on_suspect("another file has its name")
+
+    def _look(self) -> None:
+        if not self.replaced:
+            proven = self.known_at >= self.opened_at
+            self.state = VersionState.CURRENT if proven else VersionState.UNPROVEN
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -305,11 +352,11 @@ class Version:
             reader.drop_readahead()
             reader.close()
 
-    def end(self, why: str) -> None:
-        """It is not the path's file any more; who waits for its bytes hears so."""
-        self.dead, self.kept = FileChanged(why), None
+    def replace(self, why: str) -> None:
+        """It is not the path's file any more; readers that wait for its bytes are told so."""
+        self.state, self.kept, self._why = VersionState.REPLACED, None, why
         self.close_reader()
-        self.on_failed(self.dead)
+        self.on_failed(FileChanged(why))
         self.clear()
 
     def clear(self) -> None:
@@ -387,10 +434,3 @@ class Version:
         assert self._present.end <= self.size
         for start, stop in self._present:
             assert all(i in self._blocks for i in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)))
-
-
-def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:
-    """Return whether a newer listing contradicts what is known of a file; a larger one only grew."""
-    if entry.size != size:
-        return entry.size < size
-    return entry.mtime is not None and mtime is not None and entry.mtime != mtime

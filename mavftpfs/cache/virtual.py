@@ -157,6 +157,7 @@ class VirtualTrees:
                 await self._probing.run(None, self._probe_once)
 
     async def _probe_once(self) -> None:
+        self._directories.require_heard()
         try:
             await self._store.stat_size(PARAM_FILE)
         except (FtpNak, RemoteProtocolError):
@@ -334,7 +335,7 @@ class VirtualTrees:
         return await self._reading.run(path, partial(self._read_once, path))
 
     async def _read_once(self, path: bytes) -> bytes:
-        self._directories.require_reachable()
+        self._directories.require_heard()
         began = self._clock()
         try:
             data = await self._store.read_whole(path, self._options.at_file_limit)

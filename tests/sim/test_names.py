@@ -351,6 +351,7 @@ async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, aut
         here.world.link.cut()
         await trio.sleep(20.0)
         began, asked = trio.current_time(), tree.status()["listings_asked"]
+        await tree.list(b"/")
         await show(tree)
         acts: list[Callable[[], Awaitable[object]]] = [
             lambda: tree.list(UNKNOWN),

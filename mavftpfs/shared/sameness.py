@@ -1,0 +1,118 @@
+"""Is it still the same file? Layer: shared; pure.
+
+A version of a file is its size, and its time where listings tell one. Three things tell of it: the reply to
+an open has a size, a listing has a size and perhaps a time, and there is the CRC32. `compare` holds what was
+seen against what is known. It alone decides that: for readers, and the sessions that are opened anew for
+them, for drafts and their deliveries, and for blocks on the local disk. Its callers decide what follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from mavftpfs.shared.model import DirEntry, EntryKind
+
+
+class Sameness(Enum):
+    """An answer of `compare`."""
+
+    SAME = "same"
+    """All that was told agrees."""
+    GREW = "grew"
+    """It is the same file, and somebody appended to it: logs grow."""
+    UNPROVEN = "unproven"
+    """Nothing contradicts, and something else can tell more; or nobody has anything of it that could be
+    wrong."""
+    OTHER = "other"
+    """Another file has its name, or none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What is known of a file.
+
+    size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
+    given: a program may have bytes of it, so that another file of its size must not go on in its place.
+    restarted: the vehicle did, since it was known to be this file. Nobody goes on writing a file then.
+    ours: we wrote it. Before a listing told its time others may have replaced it, so its time is no proof.
+    anew: a program opens it now, so that equal sizes are no proof where no time is told.
+    """
+
+    size: int
+    mtime: int | None = None
+    crc32: int | None = None
+    given: bool = True
+    restarted: bool = False
+    ours: bool = False
+    anew: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """The size in a reply to an open. tells_times: listings of this server tell times."""
+
+    size: int
+    tells_times: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """What a listing shows under the name, None if nothing. complete: the listing came to its end."""
+
+    entry: DirEntry | None
+    complete: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Summed:
+    """The CRC32 that the vehicle told."""
+
+    crc32: int
+
+
+Seen = Opened | Listed | Summed
+
+
+def compare(known: Known, seen: Seen) -> Sameness:
+    """Return whether what was seen is still the file that is known."""
+    match seen:
+        case Opened():
+            return _by_open(known, seen)
+        case Listed():
+            return _by_listing(known, seen)
+        case Summed():
+            return _by_crc32(known, seen)
+
+
+def _by_open(known: Known, seen: Opened) -> Sameness:
+    if seen.size < known.size:
+        return Sameness.OTHER
+    if known.restarted or known.mtime is not None or seen.tells_times:
+        return Sameness.UNPROVEN  # a listing tells more
+    return Sameness.SAME if seen.size == known.size else Sameness.GREW
+
+
+def _by_listing(known: Known, seen: Listed) -> Sameness:
+    entry = seen.entry
+    if entry is None:
+        return Sameness.OTHER if seen.complete else Sameness.UNPROVEN
+    if entry.kind is not EntryKind.FILE or entry.size < known.size:
+        return Sameness.OTHER
+    if entry.size > known.size:
+        return Sameness.OTHER if known.restarted else Sameness.GREW
+    timed = known.mtime is not None and entry.mtime is not None
+    if timed and known.mtime != entry.mtime:
+        return Sameness.OTHER if known.given else Sameness.UNPROVEN
+    if known.ours or (known.anew and not timed):
+        return Sameness.UNPROVEN
+    return Sameness.SAME
+
+
+def _by_crc32(known: Known, seen: Summed) -> Sameness:
+    if known.crc32 is None:
+        return Sameness.UNPROVEN
+    if known.crc32 != seen.crc32:
+        return Sameness.OTHER
+    # It starts with 0, so zeros before the first other byte do not change it (docs/servers.md 10).
+    return Sameness.SAME if seen.crc32 else Sameness.UNPROVEN
