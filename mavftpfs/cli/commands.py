@@ -9,6 +9,7 @@ import select
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,11 +17,12 @@ from pathlib import Path
 from mavftpfs.cli import report
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours
-from mavftpfs.client.options import with_root
-from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of
+from mavftpfs.client.options import split_words, with_root
+from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, with_vehicles
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import MountOptions, parse_options
+from mavftpfs.mount.roster import Member
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
@@ -48,7 +50,7 @@ def mount(args: argparse.Namespace) -> int:
     except DeadMount as exc:
         raise DeadMount("; ".join(filter(None, (str(exc), left_by_killed_mounts_line())))) from exc
     work = partial(_serve, args, options, spec, place)
-    if args.foreground or args.debug:
+    if args.foreground or args.debug or args.member:
         return work(_report_in_foreground)
     return daemon.in_background(work)
 
@@ -87,7 +89,35 @@ def _serve(
     _start_logging(options, foreground=foreground, debug=args.debug)
     with open_sinks(options.client, debug=args.debug, tell=say) as sinks:
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
+        if options.all:
+            from mavftpfs.mount.supervisor import run_all
+
+            return run_all(request, _member_command(args, place), report)
         return run_mount(request, report)
+
+
+def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], list[str]]:
+    """Return what gives the command that mounts one vehicle of several.
+
+    Endpoints are the hub's, and it has them already. A trace and a raw log are written by each vehicle's own.
+    """
+    own: list[tuple[str, bool]] = []
+    for word in split_words(args.options):
+        option, equals, value = word.partition("=")
+        if equals and option in (*_PATH_OPTIONS, "log_file"):
+            word = f"{option}={os.path.abspath(value)}"  # now: a process in the background works in `/`
+        if option not in ("all", "forward"):
+            escaped = word.replace("\\", "\\\\").replace(",", "\\,")
+            own.append((f"-o{escaped}", option in ("trace", "tlog")))
+    shown = ["-d"] if args.debug else ["-f"] if args.foreground else []
+
+    def command(member: Member) -> list[str]:
+        mount = [sys.executable, "-m", "mavftpfs", "mount", args.source, os.path.join(place, member.name)]
+        target = f"-otarget_system={member.system},target_component={member.component}"
+        words = [f"{word}.{member.name}" if each else word for word, each in own]
+        return [*mount, "--member", target, *shown, *words]
+
+    return command
 
 
 def say(line: str) -> None:
@@ -141,8 +171,9 @@ def umount(args: argparse.Namespace) -> int:
     except control.NobodyThere as exc:
         if not is_ours(place):
             raise MountFailed(f"no vehicle is mounted on {place}") from exc
+        codes = [_umount_below(path, args) for path in mountpoint.ours_below(place)]
         mountpoint.unmount(place, lazy=args.lazy)
-        return _after_a_killed_mount()
+        return max(*codes, _after_a_killed_mount(), key=int)
     except KeyboardInterrupt:
         print("mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status", file=sys.stderr)
         return ExitCode.INTERRUPTED
@@ -150,6 +181,11 @@ def umount(args: argparse.Namespace) -> int:
     if reply.get("message"):
         print(f"mavftpfs: {reply['message']}", file=sys.stderr)
     return int(reply["exit_code"])
+
+
+def _umount_below(path: str, args: argparse.Namespace) -> int:
+    """Unmount a vehicle of several, whose supervisor is gone."""
+    return umount(argparse.Namespace(mountpoint=path, lazy=args.lazy))
 
 
 class _Delivery:
@@ -245,7 +281,7 @@ def status(args: argparse.Namespace) -> int:
         place = canonical(args.mountpoint)
 
         def fetch() -> list[Status]:
-            return [status_of(place)]
+            return with_vehicles(status_of(place))
 
     if args.json:
         report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)

@@ -133,6 +133,7 @@ def _add_mount_arguments(parser: Parser) -> None:
     parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="an existing directory")
     _add_options(parser)
     parser.add_argument("-f", "--foreground", action="store_true", help="stay in the foreground")
+    parser.add_argument("--member", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument(
         "-d", "--debug", action="store_true", help="foreground, and print every payload, decoded"
     )

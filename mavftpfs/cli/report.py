@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mavftpfs.client.status import Status, is_read_only
+from mavftpfs.client.status import Status, is_read_only, second_vehicle
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 WATCH_PERIOD = 1.0
@@ -50,9 +50,19 @@ def status_lines(status: Status, *, verbose: bool = False) -> list[Line]:
     first = Line("", str(status.get("mountpoint", "?")), f": {_headline(status)}")
     if status.get("problem"):
         return [first]
-    lines = [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
+    if "members" in status:
+        return [first, *_member_lines(status)]
+    second = [Line(f"  {second_vehicle(status)}")] if status["link"].get("second") else []
+    lines = [first, *second, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
     rest = {key: value for key, value in status.items() if key not in _IN_THE_LINES}
     return [*lines, *_rows(rest, "  ")] if verbose else lines
+
+
+def _member_lines(status: Status) -> Iterator[Line]:
+    """Yield a line for each vehicle whose own mount is not up."""
+    for member in status["members"]:
+        if member["state"] != "mounted":
+            yield Line(f"  vehicle {member['name']}: {member['problem'] or member['state']}")
 
 
 def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
@@ -78,9 +88,12 @@ def _fact(value: object) -> str:
 def _headline(status: Status) -> str:
     if status.get("problem"):
         return str(status["problem"])
+    leaving = "being unmounted, " if status.get("state") == "unmounting" else ""
+    if "members" in status:
+        count = len(status["members"])
+        return f"{leaving}{count} {'vehicle' if count == 1 else 'vehicles'} of {status['source']}"
     vehicle = status["vehicle"]
     name = f"{vehicle['autopilot'] or 'vehicle'} {vehicle['system']}/{vehicle['component']}"
-    leaving = "being unmounted, " if status.get("state") == "unmounting" else ""
     return f"{leaving}{name}, {_armed_words(vehicle)}, {_link_words(status)}"
 
 
@@ -156,8 +169,8 @@ def count_files(count: int) -> str:
 
 def delivery_line(status: Status) -> str:
     """Return what a mount that is being unmounted waits for, in a line; "" if for nothing."""
-    held = status["held"]
-    if not held["files"]:
+    held = status.get("held")
+    if held is None or not held["files"]:
         return ""
     sending = [transfer for transfer in status["transfers"] if transfer["state"] == "sending"]
     eta = max((t["eta"] for t in status["transfers"] if t["eta"] is not None), default=None)

@@ -142,14 +142,16 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 
 
 @asynccontextmanager
-async def opened(spec: LinkSpec, options: Options) -> AsyncIterator[Link]:
+async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other programs of ours.
+
+    beats: only to hear who is there; then it is shared from the beginning.
 
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
     """
     own = Address(options.source_system, options.source_component)
-    wish = Wish(own, options.forward, process_name())
+    wish = Wish(own, options.forward, process_name(), beats)
     for place in options.forward:
         if same_link(parse_source(place), spec):
             raise UsageError(

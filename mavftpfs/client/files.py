@@ -24,8 +24,7 @@ from mavftpfs.client import control
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.mountpoint import XATTR_CRC32, enclosing_mount, is_ours, mounts
 from mavftpfs.client.options import Options
-from mavftpfs.client.status import has_link, told_by
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
+from mavftpfs.client.status import has_link, is_wanted, told_by, vehicle_below
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
@@ -277,17 +276,6 @@ async def mounts_on(spec: LinkSpec) -> list[Mapping[str, Any]]:
     return found
 
 
-def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
-    """Return whether a mount is of the vehicle that the options ask for, and that one still answers there."""
-    vehicle, component = status["vehicle"], options.target_component
-    autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
-    return (
-        options.target_system in (0, vehicle["system"])
-        and (component == vehicle["component"] or (component == 0 and autopilot))
-        and status["link"]["state"] != "replaced"
-    )
-
-
 async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Session:
     """Return the files below `subtree` of a mount.
 
@@ -296,6 +284,9 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
         UsageError: the options ask for another vehicle or component.
     """
     status = await mount_status(mountpoint)
+    if "members" in status:
+        mountpoint = vehicle_below(status, subtree, options)
+        status = await mount_status(mountpoint)
     system, component = status["vehicle"]["system"], status["vehicle"]["component"]
     if options.target_system not in (0, system) or options.target_component not in (0, component):
         raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")

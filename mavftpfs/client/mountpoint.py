@@ -136,6 +136,11 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
     return found
 
 
+def ours_below(path: str) -> list[str]:
+    """Return the mountpoints of ours below another one."""
+    return [known for known in mounts() if known.startswith(path.rstrip("/") + "/") and is_ours(known)]
+
+
 def unmount(path: str, *, lazy: bool = False) -> None:
     """Unmount, waiting for it; with `lazy` even if it is in use.
 

@@ -13,6 +13,7 @@ import trio
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
 from mavftpfs.client.files import Target, mount_status, mounts_on
 from mavftpfs.client.options import Options
+from mavftpfs.client.status import second_vehicle, with_vehicles
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer
@@ -40,7 +41,11 @@ async def scan(target: Target) -> list[Entry]:
         VehicleLost: nobody at all within connect_timeout.
     """
     if target.mount is not None:
-        return _of_mount(await mount_status(target.mount[0]))
+        status = await mount_status(target.mount[0])
+        if "members" in status:
+            _, *below = await trio.to_thread.run_sync(with_vehicles, status)
+            return [_own_entry(vehicle) for vehicle in below if not vehicle["problem"]]
+        return _of_mount(status)
     assert target.spec is not None
     statuses = await mounts_on(target.spec)
     found = [_own_entry(status) for status in statuses]
@@ -50,10 +55,10 @@ async def scan(target: Target) -> list[Entry]:
                 link, target, {Address(one["system"], one["component"]) for one in found}
             )
     except LinkClosed:  # the mount is another user's, who does not share the port
-        status = await mount_with(target.spec)
-        if status is None:
+        holder = await mount_with(target.spec)
+        if holder is None:
             raise
-        return _of_mount(status)
+        return _of_mount(holder)
     return sorted(found, key=itemgetter("system", "component"))
 
 
@@ -151,7 +156,7 @@ def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
         seen.append("listings with times" if times else "listings without times")
     if facts["link"]["other_ftp_client"]:
         seen.append("another FTP client is heard")
-    return seen
+    return seen + _second(facts)
 
 
 def _own_entry(status: Mapping[str, Any]) -> Entry:
@@ -168,9 +173,14 @@ def _own_entry(status: Mapping[str, Any]) -> Entry:
         "uid": vehicle["uid"],
         "ftp": f"mounted on {status['mountpoint']}",
         "answers": not lost,
-        "seen": ["the vehicle is silent"] if lost else [],
+        "seen": ["the vehicle is silent"] * lost + _second(status),
         "facts": status["connection"],
     }
+
+
+def _second(facts: Mapping[str, Any]) -> list[str]:
+    second = facts["link"].get("second")
+    return [] if second is None else [second_vehicle(facts)]
 
 
 def _of_mount(status: Mapping[str, Any]) -> list[Entry]:

@@ -25,10 +25,12 @@ import trio
 
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
-from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts
+from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts, ours_below
+from mavftpfs.client.options import Options
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.rendezvous import same_link
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import MavftpfsError, NotFound, UsageError
 from mavftpfs.shared.readable import readable_time
 
 log = logging.getLogger("mavftpfs.vehicle")
@@ -206,6 +208,46 @@ def told_by(mountpoint: str) -> Status | None:
     return facts
 
 
+def second_vehicle(status: Status) -> str:
+    """Return what is said of a second vehicle with the system id of the one that counts."""
+    system, address = status["vehicle"]["system"], status["link"]["second"]
+    return f"a second vehicle has the system id {system}, at {address}: it is ignored; give each its own id"
+
+
+def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -> str:
+    """Return the mountpoint of the vehicle that is meant, where several are mounted below one.
+
+    Raises:
+        UsageError: it is not said which. NotFound: it is not there.
+    """
+    place, names = status["mountpoint"], [member["name"] for member in status["members"]]
+    first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
+    system, component = options.target_system, options.target_component
+    wanted = f"{system}-{component}" if component else str(system)
+    if first.replace("-", "").isdigit():
+        raise NotFound(f"no vehicle is mounted on {place}/{first}")
+    if not system and len(names) == 1:
+        wanted = names[0]
+    elif not system:
+        shown = ", ".join(names) or "none yet"
+        raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
+    if wanted not in names:
+        raise NotFound(f"no vehicle {wanted} is mounted below {place}")
+    return os.path.join(place, wanted)
+
+
+def with_vehicles(status: Status) -> list[Status]:
+    """Return the statuses that belong to one mountpoint: its own, and of several vehicles theirs, which stand
+    under `vehicles` of the first, too."""
+    if "members" not in status:
+        return [status]
+    vehicles: list[Status] = []
+    for path in ours_below(status["mountpoint"]):
+        with suppress(NobodyThere):
+            vehicles.append(status_of(path))
+    return [{**status, "vehicles": vehicles}, *vehicles]
+
+
 def find_socket(mountpoint: str) -> Path:
     """Return the control socket of a mount; root finds other users', too.
 
@@ -294,3 +336,14 @@ def has_link(status: Status, spec: LinkSpec) -> bool:
 def holder_of(spec: LinkSpec) -> Status | None:
     """Return the status of the mount that has a link, whoever may look into it; None if there is none."""
     return next((status for status in all_statuses() if has_link(status, spec)), None)
+
+
+def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
+    """Return whether a mount is of the vehicle that the options ask for, and that one still answers there."""
+    vehicle, component = status["vehicle"], options.target_component
+    autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
+    return (
+        options.target_system in (0, vehicle["system"])
+        and (component == vehicle["component"] or (component == 0 and autopilot))
+        and status["link"]["state"] != "replaced"
+    )

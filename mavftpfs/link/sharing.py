@@ -294,6 +294,12 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
         raise failure
 
 
+def own_environment() -> dict[str, str]:
+    """Return the environment of another process of this very program, wherever it works."""
+    path = os.pathsep.join(filter(None, (_PACKAGES, os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "PYTHONPATH": path}
+
+
 async def start_hub(link: Link, door: Door, spec: LinkSpec, wish: Wish, seat: Seat | None) -> HubLink:
     """Start a hub that goes on with an open port, and return our link to it.
 
@@ -313,10 +319,7 @@ async def start_hub(link: Link, door: Door, spec: LinkSpec, wish: Wish, seat: Se
             stderr=subprocess.PIPE,
             text=True,
             cwd="/",
-            env={
-                **os.environ,
-                "PYTHONPATH": os.pathsep.join(filter(None, (_PACKAGES, os.environ.get("PYTHONPATH")))),
-            },
+            env=own_environment(),
             timeout=_START_PATIENCE,
             check=False,
         )

@@ -323,7 +323,9 @@ async def fuse_loop() -> None:
 
 
 @contextmanager
-def kernel_mount(operations: Operations, request: MountRequest, invalidator: Invalidator) -> Iterator[None]:
+def kernel_mount(
+    operations: pyfuse3.Operations, request: MountRequest, invalidator: Invalidator
+) -> Iterator[None]:
     """Have the kernel show `operations` at the mountpoint for the length of the body.
 
     Raises:

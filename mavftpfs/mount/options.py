@@ -41,7 +41,8 @@ IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 @dataclass(frozen=True, slots=True)
 class MountOptions:
-    """What `-o` says. Octal bits; None = not given. client: what is no matter of the kernel."""
+    """What `-o` says. Octal bits; None = not given. client: what is no matter of the kernel. all: a mount for
+    each vehicle that is heard, below the mountpoint."""
 
     client: Options = field(default_factory=Options)
     allow_other: bool = False
@@ -53,6 +54,7 @@ class MountOptions:
     dmask: int | None = None
     fsname: str | None = None
     log_file: str | None = None
+    all: bool = False
     kernel_words: tuple[str, ...] = ()
 
     def file_mode(self, default_umask: int) -> int:
@@ -89,6 +91,7 @@ OWN_VALUES: Values = {
 OWN_FLAGS: Flags = {
     "allow_other": Flag("allow_other", True, "other users may see it (permissions apply)"),
     "auto_unmount": Flag("auto_unmount", True, "unmount when this process dies"),
+    "all": Flag("all", True, "each vehicle, below the mountpoint by its system id"),
     "default_permissions": Flag("", True, ""),
 }
 """default_permissions is always on, and not shown."""
@@ -108,7 +111,10 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
     for word in client.split_words(texts):
         _take(word, values, words)
     own = {name: values.pop(name) for name in MountOptions.__slots__ if name in values}
-    return MountOptions(Options(**values), kernel_words=tuple(words), **own)
+    options = MountOptions(Options(**values), kernel_words=tuple(words), **own)
+    if options.all and (options.client.target_system or options.client.target_component):
+        raise UsageError("option all is for each vehicle; leave out target_system= and target_component=")
+    return options
 
 
 def fuse_words(options: MountOptions, source: str) -> set[str]:

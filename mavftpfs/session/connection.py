@@ -161,6 +161,7 @@ class Connection:
                 "reopened": link.stats.reopened,
                 "source": link.description,
                 "address": None if self.driver.peer is None else readable_address(self.driver.peer),
+                "second": None if self.driver.second is None else readable_address(self.driver.second),
             },
             "connection": details,
         }

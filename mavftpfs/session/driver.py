@@ -25,7 +25,10 @@ from mavftpfs.shared.errors import RequestTimeout
 log = logging.getLogger("mavftpfs.session")
 
 _MOVED = "the vehicle is not heard at %s any more; asking who it is at %s"
-_IGNORED = "%s says that it is %d/%d, too: ignored as long as the vehicle is heard where it was"
+_IGNORED = (
+    "%s says that it is %d/%d, too: ignored as long as the vehicle is heard where it was; "
+    "if these are two vehicles, give each a system id of its own"
+)
 
 QUIET = 0.5
 """Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
@@ -50,6 +53,7 @@ class Driver:
 
     Attributes:
         peer: the network address that the vehicle is known by; None where the link has only one.
+        second: where somebody else says that he is the vehicle, too.
         on_batch: called after each batch of replies, with the time, by whoever reads or writes a file now.
     """
 
@@ -68,6 +72,7 @@ class Driver:
         self.engine = engine
         self.vehicle = vehicle
         self.peer: NetAddress | None = None
+        self.second: NetAddress | None = None
         self.last_reply_at = clock()
         self._heard_at = clock()
         self.on_batch: Callable[[float], None] | None = None
@@ -253,7 +258,7 @@ class Driver:
         if is_vehicle and sender != self.peer:
             self._pass_on(now)
             if moves:
-                self._impostor_at = None
+                self._impostor_at = self.second = None
                 if self.peer is not None:
                     log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
                     self.vehicle.identity.moved(now)
@@ -267,6 +272,7 @@ class Driver:
             self._impostor_at = now
         elif self.vehicle.identity.heard_since(self._impostor_at):
             self._impostor_at = inf
+            self.second = sender
             log.warning(_IGNORED, readable_address(sender), *source)
 
     def _send_to(self, address: NetAddress) -> None:

@@ -18,8 +18,8 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.files import is_wanted
 from mavftpfs.client.options import Options
+from mavftpfs.client.status import is_wanted
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32

@@ -86,9 +86,11 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
             assert await read_file(connection, b"/f") == OURS
             await trio.sleep(1.0)
         assert connection.status()["link"]["address"] == "10.0.0.1:14550"
+        assert connection.status()["link"]["second"] == "10.0.0.2:14550"
         nursery.cancel_scope.cancel()
     assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
-        "10.0.0.2:14550 says that it is 1/1, too: ignored as long as the vehicle is heard where it was"
+        "10.0.0.2:14550 says that it is 1/1, too: ignored as long as the vehicle is heard where it was; "
+        "if these are two vehicles, give each a system id of its own"
     ]
 
 

@@ -57,6 +57,8 @@ class FlownVehicle(SimVehicle):
 
     def outgoing(self, now: float) -> list[bytes]:
         frames = super().outgoing(now)
+        if self.address.component != 1:
+            frames = [frame for frame in frames if int.from_bytes(frame[7:10], "little") != 0]
         while self._to_tell and self._tell_at <= now:
             frames.append(self._parameter(self._to_tell.pop(0)))
             self._tell_at += _PARAMETER_PERIOD
@@ -163,6 +165,7 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     parser.add_argument("--record", required=True)
+    parser.add_argument("--component", type=int, default=1, help="another sends no heartbeats")
     parser.add_argument("--key", type=bytes.fromhex, default=None)
     args = parser.parse_args()
     rng = random.Random(args.seed)
@@ -172,7 +175,7 @@ def main() -> int:
         DirectoryTree(args.directory),
         PROFILES[args.profile],
         rng=rng,
-        address=Address(args.system, 1),
+        address=Address(args.system, args.component),
         telemetry=args.telemetry,
         armed=args.armed,
         signing_key=args.key,

@@ -67,13 +67,14 @@ PURE_MODULES = {
     "hub.outbox",
     "hub.routing",
     "mount.handles",
+    "mount.roster",
     "mount.options",
 }
 IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"mount.operations", "mount.kernel"},
+    "pyfuse3": {"mount.operations", "mount.kernel", "mount.root"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli"},

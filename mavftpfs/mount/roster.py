@@ -1,0 +1,155 @@
+"""Which vehicles a mount of all of them has, and in which state each is. Layer: mount; pure.
+
+A vehicle is told by its system id; a part of it other than the autopilot by both ids. What was heard once
+stays: a name never disappears, so that no program takes a lost vehicle for an empty directory.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Heartbeat
+
+FIRST_INO = 2
+"""1 is the root's."""
+HEARD_LATELY = 10.0
+"""Seconds after its last heartbeat in which a vehicle's mount is worth starting."""
+FIRST_PAUSE = 1.0
+LONGEST_PAUSE = 30.0
+"""Seconds before a mount that failed is started again; doubled each time."""
+MOST = 64
+"""Vehicles of one mount: anybody can send heartbeats with any id."""
+
+_NAME = re.compile(rb"([1-9][0-9]{0,2})(?:-([1-9][0-9]{0,2}))?")
+
+
+class State(Enum):
+    """What a vehicle's own mount is doing."""
+
+    HEARD = "heard"
+    STARTING = "starting"
+    MOUNTED = "mounted"
+    FAILED = "failed"
+    UNMOUNTED = "unmounted"
+
+
+NEXT = {
+    State.HEARD: {State.STARTING},
+    State.STARTING: {State.MOUNTED, State.FAILED, State.UNMOUNTED},
+    State.MOUNTED: {State.FAILED, State.UNMOUNTED},
+    State.FAILED: {State.STARTING},
+    State.UNMOUNTED: set(),
+}
+"""State -> what may follow. A mount that the user ended stays so."""
+
+
+@dataclass(slots=True)
+class Member:
+    """A vehicle, or a part of one. component: 0 = its autopilot. ino: its directory's number.
+
+    problem: why its mount failed, or "". due_at: when it is started again.
+    """
+
+    system: int
+    component: int
+    ino: int
+    state: State = State.HEARD
+    heard_at: float = float("-inf")
+    due_at: float = float("-inf")
+    pause: float = FIRST_PAUSE
+    problem: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of its directory: `1`, or `1-100`."""
+        return f"{self.system}-{self.component}" if self.component else str(self.system)
+
+    def _go_to(self, state: State) -> None:
+        assert state in NEXT[self.state], (self.state, state)
+        self.state = state
+
+    def start(self) -> None:
+        """Its mount is being started."""
+        self._go_to(State.STARTING)
+
+    def mounted(self) -> None:
+        """Its mount is up."""
+        self._go_to(State.MOUNTED)
+        self.pause, self.problem = FIRST_PAUSE, ""
+
+    def ended(self, code: int, problem: str, now: float) -> None:
+        """Its mount's process ended; code 0: because somebody unmounted it."""
+        if code == 0:
+            self._go_to(State.UNMOUNTED)
+            return
+        self._go_to(State.FAILED)
+        self.problem = problem
+        self.due_at = now + self.pause
+        self.pause = min(self.pause * 2, LONGEST_PAUSE)
+
+
+def parse_name(name: bytes) -> tuple[int, int] | None:
+    """Return system and component that the name of a directory stands for, None if for nothing."""
+    found = _NAME.fullmatch(name)
+    if found is None:
+        return None
+    system, component = int(found[1]), int(found[2] or 0)
+    return (system, component) if system <= 255 and component <= 255 else None
+
+
+def is_component(name: bytes) -> bool:
+    """Return whether a name stands for a part of a vehicle beside its autopilot."""
+    key = parse_name(name)
+    return key is not None and key[1] != 0
+
+
+class Roster:
+    """The vehicles of one mount."""
+
+    def __init__(self) -> None:
+        self._members: dict[tuple[int, int], Member] = {}
+
+    def __iter__(self) -> Iterator[Member]:
+        return iter(list(self._members.values()))
+
+    def __len__(self) -> int:
+        return len(self._members)
+
+    def find(self, name: bytes) -> Member | None:
+        """Return the vehicle of a name."""
+        key = parse_name(name)
+        return None if key is None else self._members.get(key)
+
+    def at(self, ino: int) -> Member | None:
+        """Return the vehicle whose directory has a number."""
+        return next((member for member in self if member.ino == ino), None)
+
+    def hear(self, heartbeat: Heartbeat, now: float) -> None:
+        """Note a heartbeat: an autopilot's makes its vehicle known."""
+        system = heartbeat.source.system
+        if system and heartbeat.autopilot != MAV_AUTOPILOT_INVALID:
+            self.add(system, 0)
+        for member in self:
+            if member.system == system:
+                member.heard_at = now
+
+    def add(self, system: int, component: int) -> Member | None:
+        """Return the vehicle, or the part of one, made known if it was not; None if there are too many."""
+        member = self._members.get((system, component))
+        if member is None and len(self._members) < MOST:
+            member = Member(system, component, FIRST_INO + len(self._members))
+            self._members[system, component] = member
+        return member
+
+    def due(self, now: float) -> list[Member]:
+        """Return those whose mount is to be started now."""
+        return [
+            member
+            for member in self
+            if member.state in (State.HEARD, State.FAILED)
+            and member.due_at <= now
+            and now - member.heard_at <= HEARD_LATELY
+        ]

@@ -1,0 +1,335 @@
+"""`-o all`: each vehicle on a port is a mount below one mountpoint."""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address
+from tests.mount.conftest import Field
+from tests.support.mounts import PATIENCE, Mount, mavftpfs, mounted_at, wait_until
+from tests.support.vehicles import HOST, PROJECT, Process, SimVehicle, free_udp_port
+
+PROFILES = {1: "px4", 2: "ardupilot5", 3: "mavsdk"}
+
+
+class Fleet:
+    """Three vehicles of three kinds on one port."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.port = free_udp_port()
+        self.cards: dict[int, Path] = {}
+        self.vehicles: dict[int, SimVehicle] = {}
+        for system in PROFILES:
+            self.cards[system] = root = field.local(f"card{system}")
+            (root / "log").mkdir()
+            for number in range(4):
+                content = random.Random(system * 10 + number).randbytes(20_000 + 5000 * number)
+                (root / "log" / f"{number}.bin").write_bytes(content)
+
+    @property
+    def source(self) -> str:
+        return f"udpin:{HOST}:{self.port}"
+
+    def launch(self, system: int, *options: str) -> SimVehicle:
+        words = ("--system", str(system), "--seed", str(system), *options)
+        link = f"udpout:{HOST}:{self.port}"
+        vehicle = self.field.sim(self.cards[system], PROFILES[system], words, link=link)
+        self.vehicles[system] = vehicle
+        return vehicle
+
+
+class Mounts(Mount):
+    """A mount of all vehicles."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return what `status` says of all."""
+        facts: dict[str, Any] = json.loads(mavftpfs("status", "--json", self.path)[0])
+        return facts
+
+    def states(self) -> dict[str, str]:
+        """Return what state each vehicle's mount is in."""
+        return {member["name"]: member["state"] for member in self.facts()["members"]}
+
+    def await_up(self, *names: str) -> None:
+        """Wait until the vehicles of these names are mounted."""
+        wait_until(
+            f"{names} are mounted",
+            lambda: (
+                all(self.states().get(name) == "mounted" for name in names)
+                and all(mounted_at(self.path / name) for name in names)
+            ),
+        )
+
+    def pids(self) -> dict[str, int]:
+        """Return the process of each vehicle's mount."""
+        return {Path(one["mountpoint"]).name: one["pid"] for one in self.facts()["vehicles"]}
+
+    def unmount(self) -> int:
+        """Unmount all, by our own command."""
+        assert self.process is not None
+        mavftpfs("umount", self.path)
+        return self.process.wait(60)
+
+    def finish(self) -> None:
+        """End it, whatever state it is in."""
+        process, self.process = self.process, None
+        if process is not None and process.running:
+            subprocess.run(
+                [sys.executable, "-m", "mavftpfs", "umount", "-l", str(self.path)],
+                cwd=PROJECT,
+                check=False,
+                timeout=PATIENCE,
+                capture_output=True,
+            )
+            process.stop()
+
+
+@pytest.fixture
+def fleet(field: Field) -> Fleet:
+    """Three cards; no vehicle speaks yet."""
+    return Fleet(field)
+
+
+def mount_all(fleet: Fleet, *options: str) -> Mounts:
+    folder = fleet.field.local("mount")
+    path = folder / "mnt"
+    path.mkdir()
+    mounts = Mounts(fleet.source, path, folder, ("all", *options))
+    fleet.field._stack.callback(mounts.finish)
+    mounts.start()
+    return mounts
+
+
+def rsync(mounts: Mounts, name: str, local: Path) -> subprocess.Popen[bytes]:
+    argv = ["rsync", "-a", "--inplace", f"{mounts.path}/{name}/log/", f"{local}/"]
+    return subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def same(card: Path, local: Path) -> bool:
+    names = sorted(path.name for path in (card / "log").iterdir())
+    wrong = filecmp.cmpfiles(card / "log", local, names, shallow=False)[1:]
+    return wrong == ([], []) and sorted(os.listdir(local)) == names
+
+
+def test_three_vehicles_are_copied_at_once_one_dies_and_one_is_armed(fleet: Fleet) -> None:
+    for system in PROFILES:
+        fleet.launch(system, *(("--armed",) if system == 3 else ()))
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2", "3")
+    assert sorted(mounts.run("ls", mounts.path).stdout.split()) == ["1", "2", "3"]
+    locals_ = {system: fleet.field.local(f"copy{system}") for system in PROFILES}
+    copies = {system: rsync(mounts, str(system), local) for system, local in locals_.items()}
+    fleet.vehicles[1].kill()
+    time.sleep(0.5)
+    fleet.vehicles[1].start()
+    for system, copy in copies.items():
+        _, errors = copy.communicate(timeout=120)
+        if system == 1 and copy.returncode:
+            # It may have been in the middle of a file; rsync says so, and the next one is right.
+            assert errors
+            wait_until("it reads again", lambda: rsync(mounts, "1", locals_[1]).wait(60) == 0)
+        else:
+            assert copy.returncode == 0, errors
+        assert same(fleet.cards[system], locals_[system])
+    assert "ARMED" in mavftpfs("status", mounts.path)[0]
+    code = "open(sys.argv[1], 'w')"
+    assert mounts.errno_of(code, mounts.path / "3" / "new") == "EROFS"
+    assert mounts.errno_of(code, mounts.path / "2" / "new") == ""
+    fleet.vehicles[1].left_alone = True
+    assert mounts.unmount() == 0
+    assert not any(mounted_at(mounts.path / name) for name in ("1", "2", "3"))
+
+
+def test_before_the_first_heartbeat_nothing_reads_as_empty(fleet: Fleet) -> None:
+    mounts = mount_all(fleet)
+    assert mounts.errno_of("os.listdir(sys.argv[1])", mounts.path) == "EAGAIN"
+    assert mounts.errno_of("os.stat(sys.argv[1])", mounts.path / "1") == "EAGAIN"
+    kept = fleet.field.local("kept")
+    (kept / "1").mkdir()
+    (kept / "1" / "log.bin").write_bytes(b"yesterday's")
+    done = mounts.run("rsync", "-a", "--delete", f"{mounts.path}/", f"{kept}/", code=None)
+    assert done.returncode != 0
+    assert (kept / "1" / "log.bin").exists()
+    fleet.launch(1)
+    mounts.await_up("1")
+    fleet.launch(2)
+    mounts.await_up("1", "2")
+    assert mounts.read_bytes(mounts.path / "2/log/0.bin") == (fleet.cards[2] / "log/0.bin").read_bytes()
+    assert mounts.unmount() == 0
+
+
+def test_what_was_heard_stays_and_is_not_empty_when_it_is_lost(fleet: Fleet) -> None:
+    fleet.launch(1)
+    mounts = mount_all(fleet, "op_deadline=2")
+    mounts.await_up("1")
+    fleet.vehicles[1].kill()
+    os.kill(mounts.pids()["1"], signal.SIGKILL)
+    wait_until("its mount is gone", lambda: mounts.states()["1"] in ("failed", "starting"))
+    wait_until("it is taken away", lambda: not mounted_at(mounts.path / "1"))
+    assert mounts.run("ls", mounts.path).stdout.split() == ["1"]
+    assert mounts.errno_of("os.listdir(sys.argv[1])", mounts.path / "1") == "EAGAIN"
+
+
+def test_a_killed_mount_of_one_comes_back_and_the_others_go_on(fleet: Fleet) -> None:
+    for system in PROFILES:
+        fleet.launch(system)
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2", "3")
+    before = mounts.pids()
+    fleet.vehicles[2].left_alone = True
+    os.kill(before["2"], signal.SIGKILL)
+    assert mounts.read_bytes(mounts.path / "1/log/1.bin") == (fleet.cards[1] / "log/1.bin").read_bytes()
+    wait_until("it comes back", lambda: mounts.pids().get("2") not in (None, before["2"]))
+    mounts.await_up("2")
+    assert mounts.read_bytes(mounts.path / "2/log/1.bin") == (fleet.cards[2] / "log/1.bin").read_bytes()
+    assert mounts.pids()["1"] == before["1"]
+
+
+def test_a_killed_supervisor_leaves_the_mounts_and_loses_nothing(fleet: Fleet) -> None:
+    for system in (1, 2):
+        fleet.launch(system)
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2")
+    mounts.alive().kill()
+    for system in (1, 2):
+        log = f"{system}/log/2.bin"
+        assert mounts.read_bytes(mounts.path / log) == (fleet.cards[system] / "log/2.bin").read_bytes()
+        data = f"written {system}".encode() * 300
+        code = "open(sys.argv[1], 'wb').write(bytes.fromhex(sys.argv[2]))"
+        mounts.run(sys.executable, "-c", f"import sys; {code}", mounts.path / f"{system}/new", data.hex())
+        assert (fleet.cards[system] / "new").read_bytes() == data
+    mavftpfs("umount", mounts.path)
+    assert not mounted_at(mounts.path)
+    again = mount_all(fleet)
+    again.await_up("1", "2")
+
+
+def test_a_component_is_looked_for_when_it_is_named(field: Field, fleet: Fleet) -> None:
+    fleet.launch(1)
+    card = field.local("camera")
+    (card / "photo.jpg").write_bytes(b"photo" * 1000)
+    record = field.local("record") / "frames"
+    words = ["--system", "1", "--component", "100", "--link", f"udpout:{HOST}:{fleet.port}"]
+    argv = [sys.executable, "-m", "tests.support.flown", str(card), "--record", str(record), *words]
+    camera = Process("camera", [*argv, "--telemetry", "500"], field.local("output"))
+    try:
+        mounts = mount_all(fleet)
+        mounts.await_up("1")
+        assert mounts.errno_of("os.stat(sys.argv[1])", mounts.path / "1-77") == "ENOENT"
+        assert mounts.errno_of("os.stat(sys.argv[1])", mounts.path / "log") == "ENOENT"
+        mounts.run("stat", mounts.path / "1-100")
+        mounts.await_up("1-100")
+        assert mounts.read_bytes(mounts.path / "1-100/photo.jpg") == b"photo" * 1000
+        assert sorted(mounts.run("ls", mounts.path).stdout.split()) == ["1", "1-100"]
+        assert mounts.unmount() == 0
+    finally:
+        camera.kill()
+
+
+def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
+    fleet.launch(1)
+    mounts = mount_all(fleet)
+    mounts.await_up("1")
+    assert "0.bin" in mavftpfs("ls", mounts.path, "/log")[0], "there is only one"
+    fleet.launch(2)
+    mounts.await_up("1", "2")
+    said = mavftpfs("ls", mounts.path, "/log", code=1)[1]
+    assert "(1, 2)" in said
+    for system in (1, 2):
+        local = fleet.field.local(f"sync{system}")
+        mavftpfs("sync", mounts.path, local, "-o", f"target_system={system}", "--from", "/log")
+        assert same(fleet.cards[system], local)
+        shutil.rmtree(local)
+        mavftpfs("sync", mounts.path / str(system), local, "--from", "/log")
+        assert same(fleet.cards[system], local)
+        assert "0.bin" in mavftpfs("ls", fleet.source, "/log", "-o", f"target_system={system}")[0]
+    assert "no vehicle 9" in mavftpfs("ls", mounts.path, "/", "-o", "target_system=9", code=1)[1]
+    assert "9" in mavftpfs("ls", mounts.path / "9", code=1)[1]
+    for source in (mounts.path, fleet.source):
+        found = json.loads(mavftpfs("scan", "--json", source)[0])
+        assert [entry["system"] for entry in found if entry["answers"]] == [1, 2]
+    assert len(mounts.facts()["vehicles"]) == 2
+    lines = mavftpfs("status", mounts.path)[0].splitlines()
+    assert lines[0] == f"{mounts.path}: 2 vehicles of {fleet.source}"
+
+
+def test_a_busy_one_refuses_the_unmount_of_all(fleet: Fleet) -> None:
+    fleet.launch(1)
+    mounts = mount_all(fleet)
+    mounts.await_up("1")
+    with mounts.started("sleep", "100", cwd=mounts.path / "1") as holder:
+        said = mavftpfs("umount", mounts.path, code=3)[1]
+        assert "in use" in said
+        assert mounted_at(mounts.path / "1")
+        holder.kill()
+    assert mounts.unmount() == 0
+
+
+def test_a_signal_ends_all(fleet: Fleet) -> None:
+    for system in (1, 2):
+        fleet.launch(system)
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2")
+    assert mounts.end_by(signal.SIGTERM) == 0
+    assert not mounted_at(mounts.path)
+
+
+def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
+    fleet.launch(1)
+    mounts = mount_all(fleet)
+    mounts.await_up("1")
+    stop = threading.Event()
+
+    def be_another() -> None:
+        framer = Framer(Address(1, 1), stream=False)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind((HOST, 0))
+            while not stop.wait(0.3):
+                sock.sendto(framer.encode_heartbeat(2, 12), (HOST, fleet.port))
+
+    thread = threading.Thread(target=be_another)
+    thread.start()
+    try:
+        wait_until("status says it", lambda: "a second vehicle" in mavftpfs("status", mounts.path)[0])
+        assert "a second vehicle" in mavftpfs("scan", fleet.source)[0]
+        assert "a second vehicle" in mavftpfs("hub", fleet.source)[0]
+        assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
+    finally:
+        stop.set()
+        thread.join()
+    assert "give each a system id of its own" in mounts.alive().text()
+
+
+def test_nothing_can_be_made_beside_the_vehicles(fleet: Fleet) -> None:
+    fleet.launch(1)
+    mounts = mount_all(fleet)
+    mounts.await_up("1")
+    for code in (
+        "os.mkdir(sys.argv[1] + '/new')",
+        "open(sys.argv[1] + '/new', 'w')",
+        "os.symlink('x', sys.argv[1] + '/new')",
+        "os.rename(sys.argv[1] + '/1', sys.argv[1] + '/2')",
+    ):
+        assert mounts.errno_of(code, mounts.path) in ("EROFS", "EBUSY")
+    assert mounts.run("df", mounts.path).stdout
+
+
+def test_all_and_a_target_exclude_each_other(fleet: Fleet) -> None:
+    said = mavftpfs(fleet.source, fleet.field.local("mnt"), "-o", "all,target_system=1", code=1)[1]
+    assert "target_system" in said
