@@ -439,6 +439,40 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         assert here.litter() == []
 
 
+@pytest.mark.holds("promise 3", "rule 14.12")
+@pytest.mark.parametrize("known", [False, True], ids=["first", "known"])
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
+async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(
+    profile: str, known: bool, autojump: MockClock
+) -> None:
+    """What moved the old file aside takes the new one away 5 s later. No program lists the directory."""
+    async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": b""}, link=CLEAN) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
+        if known:
+            here.connection.scheduler.doubt.raise_it("a copy was late")
+            here.connection.scheduler.doubt.late.saw(0.1, trio.current_time())
+        handle = here.world.vehicle.server.handle
+        asked: list[bytes] = []
+
+        async def again(wire: bytes, source: Address) -> None:
+            await trio.sleep(5.0)
+            handle(wire, source, trio.current_time())
+            here.world.link.kick()
+
+        def watch(wire: bytes, source: Address, now: float) -> None:
+            if wire[3] == Opcode.RENAME and not asked:
+                asked.append(wire)
+                here.nursery.start_soon(again, wire, source)
+            handle(wire, source, now)
+
+        here.world.vehicle.server.handle = watch  # type: ignore[method-assign]
+        await write_file(tree, b"/d/f", content(500, 2))
+        await trio.sleep(30.0)
+        assert here.data(b"/d/f") == content(500, 2)
+        assert here.litter() == []
+
+
 @pytest.mark.holds("promise 2", "rule 14.12")
 @pytest.mark.parametrize("late", [0.1, 0.3, 0.5, 2.0])
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "mavsdk"])
