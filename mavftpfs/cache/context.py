@@ -57,7 +57,7 @@ class Context:
         self.directories.require_heard()
 
     def require_idle(self, path: bytes) -> None:
-        """Raise FileBusy if somebody on the vehicle seems to write the file."""
+        """Raise FileBusy if the vehicle, or another client, seems to write the file."""
         if not self.options.force and self.directories.is_growing(path):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
 

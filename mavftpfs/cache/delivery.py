@@ -1,11 +1,11 @@
 """Brings drafts to the vehicle, and knows that they are there. Layer: cache.
 
-`deliver` returns when the vehicle has the file, checked (promise 2), or raises why not; what was not
-delivered stays held, and the next call goes on. While it runs the file is not written (`Node.lock`), so
-what is verified is what was sent. Uploads begin earlier (`push`), where that is of use.
+`deliver` returns when the vehicle has the file, checked (promise 2), or raises why not. What was not
+delivered stays held, and the next call goes on with it. Meanwhile nobody writes the file (`Node.lock`), so
+what is verified is what was sent. While a program still writes, `push` begins the upload.
 
-One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
-place (`draft`, `names`). Only cards that cannot rename get it under its own name.
+There is one way to the card: the whole file is sent under a reserved name, verified there, and renamed into
+place. In doubt it is then compared once more. A card that cannot rename gets the file under its own name.
 """
 
 from __future__ import annotations
@@ -49,30 +49,30 @@ from mavftpfs.shared.model import DirEntry, EntryKind
 log = logging.getLogger("mavftpfs.cache")
 
 MISMATCHES = 2
-"""After so many copies that are not what was sent the delivery fails."""
+"""The delivery fails after the file arrived as another one so often."""
 
 RESEND_PAUSE = 1.0
-"""Seconds before it is sent again: what spoiled it may last a moment."""
+"""Seconds before such a file is sent again: what spoiled it may last a moment."""
 
 SENT_TWICE = 4096
-"""Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
-trip or two, so sending it again on the few cards that cannot costs less than four requests in each mount."""
+"""Bytes of the largest file that is sent before it is known whether the card can rename. A card that cannot
+gets it twice, once in a mount: a round trip or two. To find out first costs four requests on every card."""
 
 SHORT = 4096
-"""Bytes of the largest file of which the slowest card has the checksum at once."""
+"""Bytes of the largest file whose checksum the slowest card computes at once."""
 
 START_AT = 64 * 1024
 """A background upload begins when so many bytes wait; fewer wait for the close."""
 
 START_PAUSE = 5.0
-"""Seconds after which one that could not begin is tried again."""
+"""Seconds after which an upload that could not begin is tried again."""
 
 PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 
 def may_pass(node: Node) -> bool:
-    """Return whether what kept a file from being delivered, if anything did, may be over by itself."""
+    """Return whether a delivery may succeed that is tried again: nothing failed, or what failed may pass."""
     return node.error is None or isinstance(node.error, PASSING)
 
 
@@ -87,7 +87,7 @@ class Deliverer:
         self.verifier = Verifier(context, names)
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
-        """Have the vehicle hold the node's file, checked, as long as that is `wanted`.
+        """Have the vehicle hold the node's file, checked. It is given up when it is not `wanted` any more.
 
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
@@ -102,7 +102,7 @@ class Deliverer:
                     if draft is None or not node.undelivered:
                         await self.abandon(node)
                         return
-                    with trio.CancelScope() as node.delivery:  # who cancels it has it begin again
+                    with trio.CancelScope() as node.delivery:  # cancelled, it begins again
                         try:
                             if not context.unfinished.lacks_file(node.path):  # else it gets its file first
                                 context.require_disarmed()
@@ -115,12 +115,12 @@ class Deliverer:
                         finally:
                             node.delivery = None
                             self._throttle.waiting.unpark_all()
-                            if node.undelivered:  # also if who waited for it gave up
+                            if node.undelivered:  # also if the caller was cancelled
                                 context.retry_later()
 
     async def push(self, node: Node) -> None:
-        """The draft changed: send it, or begin to, if that can be done beside the program. The caller has
-        the node's lock."""
+        """The draft changed: begin to send it, or go on, while the program writes. The caller has the node's
+        lock."""
         context, attempt, draft = self._context, node.attempt, node.draft
         if draft is None or not node.undelivered:
             return
@@ -130,7 +130,7 @@ class Deliverer:
                 attempt.sending.growing = True
                 attempt.upload.wake()
                 return
-            node.start_after = float("inf")  # who changes what was sent does so again
+            node.start_after = float("inf")  # a program that changed sent bytes will do so again
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.unacked < START_AT or not may_pass(node):
             return
@@ -152,8 +152,8 @@ class Deliverer:
             self._throttle.waiting.unpark_all()
 
     async def abandon(self, node: Node) -> None:
-        """Give up the present attempt; what it left under reserved names goes now or at the next listing. The
-        caller has the node's lock, or holds its path alone."""
+        """Give up the present attempt. What it left under reserved names is removed now, else after the next
+        listing. The caller has the node's lock, or holds its path alone."""
         attempt, node.attempt = node.attempt, None
         if attempt is None:
             return
@@ -168,12 +168,12 @@ class Deliverer:
         finally:
             if attempt.trial is not None:
                 attempt.trial.leave()
-            self._context.own.live.discard(attempt.path)
+            self._context.own.in_use.discard(attempt.path)
 
     async def withdraw(self, node: Node) -> bool | None:
         """Take back what the vehicle does not have of a file, so that nothing of it is sent from now on.
 
-        What has the name on the vehicle keeps it, and whoever has this file open has one without a name.
+        What has the name on the vehicle keeps it. Programs that have this file open keep it without a name.
         Returns whether the vehicle has all of it; None if that is not known, or if others write it, too.
         """
         context = self._context
@@ -208,7 +208,7 @@ class Deliverer:
     # --- one delivery
 
     def _require_deliverable(self, draft: Draft) -> None:
-        """Check that it may replace what it changes.
+        """Check that a draft may replace what it lies over.
 
         Raises:
             FileChanged: the base is another file now. NotSupported: it cannot be replaced safely.
@@ -220,7 +220,7 @@ class Deliverer:
             raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
 
     async def _try(self, node: Node, draft: Draft) -> None:
-        """Deliver; again after a wrong copy, and after it showed that the card cannot rename."""
+        """Deliver: once more if the file arrived as another one, or if the card proved unable to rename."""
         mismatches, store = 0, self._context.store
         while True:
             in_place = store.traits.rename_works is False
@@ -233,7 +233,9 @@ class Deliverer:
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
-                if mismatches == MISMATCHES or isinstance(error.__cause__, Armed):  # none can be checked
+                if mismatches == MISMATCHES or isinstance(
+                    error.__cause__, Armed
+                ):  # a second copy could not be checked either
                     raise
                 log.warning("%s; sending it again", error)
                 await trio.sleep(RESEND_PAUSE)
@@ -245,7 +247,7 @@ class Deliverer:
                 log.debug("%r: %s; trying another way", node.path, error)
 
     async def _mend(self, node: Node, draft: Draft) -> None:
-        """The renames of this file were interrupted: have them completed or undone, and look what came of it.
+        """The renames of this file were interrupted. Have a listing show what has the name, and compare that.
 
         Raises:
             As Directories.ask and Verifier.check.
@@ -254,7 +256,7 @@ class Deliverer:
         await self._cleaner.mend(node)
         there = await context.directories.current(node.path)
         record = context.unfinished.get(node.path)
-        if there is None:
+        if there is None and not draft.base_limit:
             draft.base = None
         elif record is not None and record.placed is None and draft.whole:
             with suppress(VerificationFailed):
@@ -300,28 +302,33 @@ class Deliverer:
         context, path = self._context, node.path
         trial = await self._begin_trial(node, draft)
         in_place = traits.rename_works is False
-        if in_place or isinstance(node.error, AlreadyExists):  # which all of it was sent for
-            await self._require_expected(node, draft)
-        if not in_place:
-            path = context.own.beside(node.path, Kind.NEW)
-            context.own.live.add(path)
         begun_at = context.clock()
         try:
+            # Last time all of it was sent before its name proved to be taken: look first.
+            if in_place or isinstance(node.error, AlreadyExists):
+                await self._require_expected(node, draft)
+            if not in_place:
+                path = context.own.beside(node.path, Kind.NEW)
+                context.own.in_use.add(path)
             sending = draft.begin(in_place=in_place, progress=self._throttle.on_acked)
             upload = await context.store.open_upload(path, sending)
         except BaseException:
             draft.give_up()
-            context.own.live.discard(path)
+            context.own.in_use.discard(path)
+            if trial is not None:
+                trial.leave()
             raise
         attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at, trial)
         if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
+            if trial is not None:
+                await trial.end()
         elif trial is not None and not await trial.rename():  # while the upload begins
-            return await self._attempt(node, draft)  # in place
+            return await self._attempt(node, draft)  # under its own name
         return attempt
 
     async def _begin_trial(self, node: Node, draft: Draft) -> RenameTrial | None:
-        """Before all of a large file is sent, begin to find out whether the card can rename.
+        """Before a large file is sent, begin to find out whether the card can rename.
 
         Raises:
             As RenameTrial.begin and _require_deliverable.
@@ -331,7 +338,7 @@ class Deliverer:
             return None
         trial = await self._names.begin_trial(node.path)
         try:
-            if inplace:  # the card may have no room beside the file, and never tell
+            if inplace:  # first, for the card may have no room for both files, and never tell
                 await trial.rename()
                 await trial.end()
             self._require_deliverable(draft)  # it may have changed meanwhile
@@ -347,8 +354,8 @@ class Deliverer:
     async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
         """Compare what was sent, and look what has the name; return the CRC32 if that was compared.
 
-        What the server answers at once goes out together. A long checksum goes alone: whatever waited behind
-        it would be repeated, and the look at the name would be of before it.
+        Requests that the server answers at once go out together. A long checksum goes alone: requests behind
+        it would be repeated meanwhile, and the name may be taken while it is computed.
 
         Raises:
             As Verifier.check and _require_expected.
@@ -412,14 +419,14 @@ class Deliverer:
                     await self._names.discard(attempt.path)
             raise
         finally:
-            own.live.discard(attempt.path)  # what is left there is for the next listing to clean up
+            own.in_use.discard(attempt.path)  # what is left there is for the next listing to clean up
         await self._confirm(node, draft, attempt)
 
     async def _confirm(self, node: Node, draft: Draft, attempt: Attempt) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.
 
-        A copy of its CreateFile may have emptied it after it was compared, a copy of an earlier rename may
-        have taken it away, and some server may ACK a rename and do something else.
+        A late copy of its CreateFile may have emptied it after it was compared. A late copy of an earlier
+        rename may have taken it away. A server may ACK a rename and do something else.
 
         Raises:
             VerificationFailed: it is not there. Else as Verifier.check. The replacement is unfinished then.
@@ -433,7 +440,7 @@ class Deliverer:
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
             old = self._context.unfinished.on_unknown(path).aside
-            self._context.own.live.discard(old or b"")  # if the name has no file the old one is given back
+            self._context.own.in_use.discard(old or b"")  # if the name has no file the old one is given back
             draft.interrupted(ours=True)
             if unproven and isinstance(error, VerificationFailed):
                 await self._names.find_out(path)
@@ -455,7 +462,7 @@ class Deliverer:
         context.files.on_changed(node.path)
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:
-        """Latch the error, and keep the bytes where the end of this process does not lose them."""
+        """Keep the error for the next close, and the bytes where they outlive this process."""
         known, node.error = node.error, error
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again

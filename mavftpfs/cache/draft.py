@@ -5,10 +5,9 @@ it), else *base* (below `base_limit`: the vehicle has it), else zero: the conten
 write beyond it, or of a file that was extended.
 
 All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`;
-`delivery` takes the steps. Whatever changes a file's content is sent as a whole new file under a reserved
-name beside it, verified there, and renamed into place. Only on cards that cannot rename it is sent under its
-own name. What is appended while that file is sent joins it; during a close writers wait.
-
+`delivery` takes the steps. A changed file is sent as a whole new file under a reserved name beside it,
+verified there, and renamed into place; on a card that cannot rename it is sent under its own name. Bytes that
+are appended while it is sent join it. Writers wait while a close delivers it.
 """
 
 from __future__ import annotations
@@ -108,7 +107,7 @@ class Content(Protocol):
 
 
 class Where(Enum):
-    """Who has a byte."""
+    """Where a byte of the content is."""
 
     HELD = "held"
     BASE = "base"
@@ -180,7 +179,7 @@ class Draft:
         return self._held.missing(0, min(self.base_limit, self.size))
 
     def segments(self, start: int, stop: int) -> list[tuple[Where, int, int]]:
-        """Return who has which part of [start, stop), cut at the file's size, ascending."""
+        """Return where each part of [start, stop) is, cut at the file's size, ascending."""
         found = []
         at, end = start, min(stop, self.size)
         for a, b in [*self._held.intersection(start, end), (end, end)]:
@@ -283,8 +282,8 @@ class Draft:
             self.on(Event.GIVEN_UP)
 
     def interrupted(self, *, ours: bool = False) -> None:
-        """Nobody knows which file has the name now; all of the draft is known here, so none matters. ours:
-        what has the name is what was sent, or what became of it."""
+        """Nobody knows which file has the name now. All of the draft is here, so no base counts any more.
+        ours: the file that has the name is the one that was sent, or what became of it."""
         self.on(Event.REFUSED)
         self.base_limit = 0
         if ours:

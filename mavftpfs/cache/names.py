@@ -1,10 +1,10 @@
 """What the vehicle has under a name, changes of names, and how files get their names. Layer: cache.
 
-Servers do what they are told to whatever has the name by then: RemoveFile takes an empty directory where the
-server calls remove(3), a rename moves into a directory on NuttX, and replaces a file that others made
-(servers.md 9, 14.34). So whoever is about to change a name asks `current`, not what is remembered of it.
+A server does not ask what has a name by now: RemoveFile removes an empty directory where the server calls
+remove(3), a rename moves into a directory on NuttX, and it replaces a file that others made (servers.md 9,
+14.34). So before a name is changed the vehicle is asked what has it (`Directories.current`).
 
-Whether a change happened is found out by the session; here the remembered listings follow.
+The session finds out whether a change happened. Here the remembered listings follow it.
 
 A new file is renamed to a name that is free, and never over anything. A file that exists is replaced by one
 rename where the server does that in one step; else (FAT refuses it, NuttX removes the target first) the old
@@ -46,7 +46,7 @@ KEEP_OLD = 10.0
 """Seconds for which the old file is kept when it was replaced in doubt."""
 
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
-"""Refusals that mean what they say; others do not tell whether the server replaces files at all."""
+"""Refusals that mean what they say. Others may mean that the server never renames over a file."""
 
 _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
 """Takes all bytes beyond ASCII for one."""
@@ -161,8 +161,8 @@ class Names:
         self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
     async def discard(self, path: bytes) -> None:
-        """Remove a reserved name that is not needed any more; if that cannot be now, a later listing has it
-        removed, and so has who removes the name that it belongs to (`purge`)."""
+        """Remove a reserved name that is not needed any more. If that fails the next listing of its directory
+        has it removed, or `purge`, when the name that it belongs to goes."""
         try:
             await self.remove_if_there(path)
         except MavftpfsError as error:
@@ -226,7 +226,7 @@ class Names:
         return trial
 
     async def purge(self, path: bytes) -> None:
-        """A path is about to lose its name: have nothing of an earlier replacement bring it back.
+        """Before a path loses its name, remove what an earlier replacement left and would bring it back.
 
         Raises:
             As VehicleStore: then the name has to stay.
@@ -235,7 +235,7 @@ class Names:
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
         ended = self._context.unfinished.end(path)
-        needed = own.live | self._context.unfinished.asides()
+        needed = own.in_use | self._context.unfinished.asides()
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
             if reserved is None or reserved.owner != own.owner or left in needed:
@@ -255,7 +255,7 @@ class Names:
     ) -> bytes | None:
         """Rename over a file that exists. compared: see rename.
 
-        keep_old: return the reserved name that this file has from now on, which is in `OwnNames.live`; None
+        keep_old: return the reserved name that this file has from now on, which is in `OwnNames.in_use`; None
         if it was gone.
 
         One rename does where the server never leaves the name without a file. NuttX, where storages are
@@ -280,7 +280,7 @@ class Names:
         await self._forget_old(target)
         own, moved = self._context.own, None
         aside = own.beside(target, Kind.OLD)
-        own.live.add(aside)
+        own.in_use.add(aside)
         try:
             try:
                 await self.rename(target, aside, compared=compared)
@@ -304,10 +304,10 @@ class Names:
                 await self._discard_old(target, aside)
         finally:
             if self._context.unfinished.owner_of(aside) is None or self._context.unfinished.is_open(target):
-                own.live.discard(aside)
+                own.in_use.discard(aside)
         if not (moved and keep_old):
             return None
-        own.live.add(aside)
+        own.in_use.add(aside)
         return aside
 
     # --- inside
@@ -318,7 +318,7 @@ class Names:
         context = self._context
         if not context.store.in_doubt():
             await self.discard(aside)
-            context.own.live.discard(aside)
+            context.own.in_use.discard(aside)
         context.unfinished.put(target, Replacement(aside, placed=True, until=context.clock() + KEEP_OLD))
         context.retry_later()
 
@@ -329,12 +329,12 @@ class Names:
         if record is None or not record.placed:
             return
         unfinished.end(path)
-        if record.aside in own.live:
-            own.live.discard(record.aside)
+        if record.aside in own.in_use:
+            own.in_use.discard(record.aside)
             await self.remove_if_there(record.aside)
 
     def _note_unfinished(self, path: bytes, aside: bytes, *, placed: bool | None) -> None:
-        """The file of a name may lie aside for now: show it on, and have that listed."""
+        """The file of a name may lie aside for now: go on showing it, and have its directory listed."""
         context = self._context
         entry = context.directories.entry(path) or context.directories.entry(aside)
         if entry is not None:
@@ -346,7 +346,7 @@ class Names:
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
-        """If nobody knows whether the body changed names, what is remembered of them proves nothing."""
+        """After an unknown outcome of the body, what is remembered of these names proves nothing."""
         try:
             yield
         except (OutcomeUnknown, trio.Cancelled):
@@ -365,6 +365,7 @@ class Names:
 
 
 def _plain(name: bytes) -> bytes:
-    """Return what a name has in common with those that a card may take for the same: letters in any case, and
-    beyond ASCII whatever a code page makes of them (by page 850 FatFs folds the UTF-8 of ä and å)."""
+    """Return a key that is equal for all names which a card may take for one name. A card ignores the case of
+    letters, and beyond ASCII it folds bytes by its code page (by page 850 FatFs folds the UTF-8 of ä and å).
+    """
     return name.rstrip(b". ").lower().translate(_ONE_LETTER)

@@ -1,12 +1,13 @@
 """mkdir, rmdir, unlink and rename on the vehicle, as rename(2) and its kin have it. Layer: cache.
 
 Servers check little: some remove files by rmdir, or move into directories by rename (servers.md 9). So types
-and targets are looked up in listings first. Whoever changes a name holds its path alone (`pathlocks`); what a
-draft has undelivered is delivered before its path changes.
+and targets are looked up in listings first. A change holds its paths alone (`pathlocks`). Before a path
+changes, what a draft of it has undelivered is delivered.
 
-Who has a file open that loses its name reads on. What was written here whole is held here. Else the file is
-kept on the vehicle under a reserved name until its last handle is closed. Where the card cannot rename
-(LittleFS), what is cached whole is held here, too; else the change of the name is refused (EBUSY).
+A program that has a file open reads on when the file loses its name. If the file was written here whole, its
+bytes are here. Else it is kept on the vehicle under a reserved name until its last handle is closed. Where
+the card cannot rename (LittleFS), a file that is cached whole is kept here, too; else the change of the name
+is refused (EBUSY).
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_pa
 log = logging.getLogger("mavftpfs.cache")
 
 RECENT = 2.0
-"""Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
-removal of many files does not list their directory before each."""
+"""Seconds for which a listing is recent enough to change a name by. So the removal of many files does not
+list their directory before each."""
 
 
 class Namespace:
@@ -102,20 +103,20 @@ class Namespace:
             await self._rename(old, new, noreplace=noreplace)
 
     async def release(self, node: Node) -> None:
-        """Nobody has an unlinked file open any more: remove what was hidden of it. If that cannot be now, the
+        """The last handle of an unlinked file was closed: remove the file from the vehicle. If that fails the
         next listing of its directory has it removed."""
         node.drop_draft()
         if not node.hidden:
             return
         async with self._context.paths.steady(node) as path:  # a directory above it may be about to move
             self._context.nodes.forget_hidden(node)
-            self._context.own.live.discard(path)
+            self._context.own.in_use.discard(path)
             await self._names.discard(path)
             self._context.files.on_changed(path)
 
     @asynccontextmanager
     async def _claim(self, path: bytes) -> AsyncIterator[None]:
-        """The body takes the name of what is open at a path, or not delivered yet."""
+        """For the length of the body: take the name away from a file that is open, or not delivered."""
         nodes = self._context.nodes
         node = nodes.get(path)
         try:
@@ -159,7 +160,7 @@ class Namespace:
     # --- inside: renaming
 
     async def _deliver_below(self, path: bytes) -> None:
-        """Have the vehicle hold what is about to get another name. Raises FileBusy if that takes too long."""
+        """Deliver what is about to get another name. Raises FileBusy if that takes too long."""
         with trio.move_on_after(self._context.options.op_deadline) as scope:
             for node in self._context.nodes.below(path):
                 await self._deliverer.deliver(node)
@@ -202,8 +203,8 @@ class Namespace:
         self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
-        """Rename on the vehicle. listed: what it has at `new`, which may be replaced; who has that open keeps
-        it."""
+        """Rename on the vehicle. listed: what it has at `new`, which is replaced; programs that have it open
+        keep it."""
         context, displaced = self._context, self._context.nodes.get(new)
         for node in context.nodes.below(old):
             await self._deliverer.abandon(node)
@@ -230,7 +231,7 @@ class Namespace:
     # --- inside: open files that lose their names
 
     def _hold(self, node: Node) -> bool:
-        """Keep here what a program reads of a file; return whether all of it is known."""
+        """Keep a file's bytes here for the programs that have it open; return whether all of it is known."""
         context, version = self._context, self._context.files.whole(node.path)
         if version is None or node.draft is not None:
             return False
@@ -242,11 +243,11 @@ class Namespace:
             log.info("%r cannot be held here: %s", node.path, error)
             node.drop_draft()
             return False
-        draft.content.restate(delivered=True)  # nobody misses a copy, whatever becomes of this mount
+        draft.content.restate(delivered=True)  # the next mount has nothing to deliver of it
         return True
 
     async def _hide(self, node: Node) -> None:
-        """Keep an unlinked file on the vehicle under a reserved name as long as somebody has it open.
+        """Keep an unlinked file on the vehicle under a reserved name as long as a program has it open.
 
         Raises:
             FileBusy: that cannot be. Else as VehicleStore.rename.
@@ -256,11 +257,11 @@ class Namespace:
             hidden = own.beside(path, Kind.DELETED)
         except PathTooLong as error:
             raise FileBusy(f"{path!r} is open, and its path is too long to keep it: {error}") from error
-        own.live.add(hidden)
+        own.in_use.add(hidden)
         try:
             await self._names.rename(path, hidden)
         except BaseException as error:
-            own.live.discard(hidden)
+            own.in_use.discard(hidden)
             if isinstance(error, FtpNak | NotSupported):
                 raise FileBusy(f"{path!r} is open, and this card cannot keep it: {error}") from error
             raise
@@ -271,5 +272,5 @@ class Namespace:
         node.lose_name()
         self._context.files.on_renamed(node.path, hidden)
         self._context.nodes.hide(node, hidden)
-        if not node.handles:  # the last one was closed before there was anything to remove
+        if not node.handles:  # the last handle was closed meanwhile
             await self.release(node)

@@ -55,8 +55,8 @@ class Node:
     vehicle was changed by us. removed: it has no name any more. hidden: it is still on the vehicle, under a
     reserved name. error: why it could not be delivered. attempt: the present one to deliver it. base: reads
     the vehicle's file. start_after: no upload begins by itself before (infinite: only a close sends it).
-    known_at: when the vehicle was last known to have it all. lock: held by who writes or delivers it, or
-    takes its name. delivery: what ends the delivery under way. claims: how many wait for the lock to take
+    known_at: when the vehicle was last known to have it all. lock: held to write or deliver it, or to take
+    its name. delivery: what ends the delivery under way. claims: how many wait for the lock to take
     name or content away; they go before deliveries.
     """
 
@@ -92,8 +92,8 @@ class Node:
 
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:
-        """The body takes the name or the content away, and has the lock: what is being delivered is called
-        off, unless it is just being renamed into place. Who waits for that delivery has it begin again."""
+        """The body takes the name or the content away, and has the lock. A delivery under way is called off,
+        unless it is just being renamed into place; its caller begins it again."""
         self.claims += 1
         try:
             committing = self.draft is not None and self.draft.state is State.COMMITTING
@@ -109,7 +109,7 @@ class Node:
 
     @property
     def needs_card(self) -> bool:
-        """Whether somebody has it open of which the card has the only bytes."""
+        """Whether a program has it open, and only the card has all of its bytes."""
         return self.handles > 0 and not (self.draft is not None and self.draft.whole)
 
     def require_reachable(self) -> None:
@@ -129,7 +129,7 @@ class Node:
             base.close()
 
     def lose_name(self) -> None:
-        """It has no name any more; only who has it open needs its bytes."""
+        """It has no name any more: only the programs that have it open need its bytes."""
         self.removed = True
         if self.draft is not None:
             self.draft.content.name = None
@@ -196,7 +196,7 @@ class Nodes:
             node.drop_draft()
 
     def replaced(self, node: Node) -> None:
-        """The node's name is another file's: who has it open keeps the node, and others get a new one."""
+        """The node's name is another file's: its open handles keep the node, later opens get a new one."""
         self._stale = [other for other in self._stale if other.handles] + [node]
         node.lose_name()
         self.detach(node)

@@ -1,7 +1,7 @@
 """What becomes of reserved names that an interruption left on the card. Layer: cache.
 
 `leftovers` finds them in a listing, `Cleaner` acts on each:
-  what was sent, or was deleted  is removed: who sent it was not told that it is on the card
+  what was sent, or was deleted  is removed: no close() reported it to be on the card
   an old file, its name there    is removed: the new one has the name
   an old file, its name missing  gets its name again
   an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy
@@ -25,13 +25,13 @@ from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 log = logging.getLogger("mavftpfs.cache")
 
 MAX_LEFTOVERS = 128
-"""Names mended per listing."""
+"""Leftovers that are dealt with after one listing."""
 
 STALE_AFTER = 600.0
-"""Seconds a stranger's reserved name must have stayed the same before it counts as left behind."""
+"""Seconds for which another mount's reserved name must have stayed the same before it counts as left."""
 
 MAX_SEEN = 1024
-"""Of how many such names it is remembered since when they are the same."""
+"""How many such names are remembered, with the time since when they stayed the same."""
 
 
 def leftovers(
@@ -50,7 +50,7 @@ def leftovers(
 
 
 class Cleaner:
-    """Looks at every listing."""
+    """Looks at every listing, removes leftovers, and ends unfinished replacements."""
 
     def __init__(self, context: Context, names: Names, dead_owners: frozenset[bytes]) -> None:
         """`dead_owners`: mounts that are known to have ended."""
@@ -92,12 +92,12 @@ class Cleaner:
         context, now = self._context, self._context.clock()
         directories = set()
         for path, record in context.unfinished:
-            if record.lacks_file and record.aside not in context.own.live:
+            if record.lacks_file and record.aside not in context.own.in_use:
                 directories.add(split(path)[0])
             elif record.aside is None and not self._is_asked_for(path):
                 context.unfinished.end(path)
             elif record.placed and (at_once or record.until <= now):
-                context.own.live.discard(record.aside or b"")
+                context.own.in_use.discard(record.aside or b"")
                 if not context.store.in_doubt():
                     context.unfinished.end(path)
                     continue
@@ -110,7 +110,7 @@ class Cleaner:
                         context.unfinished.end(path)
 
     async def mend(self, node: Node) -> None:
-        """Do so for one file, whose lock the caller has."""
+        """Mend the name of one file, whose lock the caller has."""
         self._being_delivered.add(node)
         try:
             await self._list(split(node.path)[0])
@@ -142,7 +142,7 @@ class Cleaner:
         return node is not None and node.undelivered
 
     def _is_dead(self, path: bytes, owner: bytes, entry: DirEntry) -> bool:
-        if path in self._context.own.live:
+        if path in self._context.own.in_use:
             return False
         if owner in self._dead_owners:
             return True

@@ -4,9 +4,9 @@ A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is th
 it, SSS counts, and the kind k is
   n  what is sent of a file, perhaps incomplete (version 0.1 used t for some of these);
   o  the old file of NAME, moved aside until the new one has its name;
-  d  a file that was unlinked while somebody has it open.
-They lie beside the file they belong to. Only o tells its NAME, if that fits: a rename carries both paths in
-one request of 238 bytes.
+  d  a file that was unlinked while a program has it open.
+It lies beside the file that it belongs to. Only o tells its NAME, if that fits: a rename carries both paths
+in one request of 238 bytes.
 
 `repair` says what becomes of those that an interruption left.
 """
@@ -105,12 +105,12 @@ class OwnNames:
 
     Attributes:
         owner: the mount's token.
-        live: names in use, so no listing's repair touches them.
+        in_use: names in use, so no listing's repair touches them.
     """
 
     def __init__(self, owner: bytes, rng: Random) -> None:
         self.owner = owner
-        self.live: set[bytes] = set()
+        self.in_use: set[bytes] = set()
         self._serial = rng.randrange(_SERIALS)
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
@@ -127,6 +127,6 @@ class OwnNames:
 
     def follow_rename(self, old: bytes, new: bytes) -> None:
         """A directory has another name."""
-        for path in list(self.live):
-            self.live.remove(path)
-            self.live.add(renamed(path, old, new))
+        for path in list(self.in_use):
+            self.in_use.remove(path)
+            self.in_use.add(renamed(path, old, new))

@@ -57,7 +57,7 @@ class Throttle:
     """Has writers wait while too many bytes are not ACKed.
 
     Attributes:
-        waiting: the writers who wait for room; who changes what may be un-ACKed has them look again.
+        waiting: the writers that wait for room. Whatever may give room unparks them all.
     """
 
     def __init__(self, context: Context, limit: WriteLimit) -> None:

@@ -45,7 +45,7 @@ class RenameTrial:
             self._second = own.beside(self._first, Kind.NEW)
         except PathTooLong:
             return
-        own.live |= {self._first, self._second}
+        own.in_use |= {self._first, self._second}
         try:
             await self._store.create_empty(self._first)
             self._place = self._first
@@ -91,7 +91,7 @@ class RenameTrial:
     def leave(self) -> None:
         """Nothing more comes of it; what is left there is for the next listing to clean up."""
         self._place = None
-        self._own.live -= {self._first, self._second}
+        self._own.in_use -= {self._first, self._second}
         self._directories.expire(split(self._near)[0])
 
     # --- inside

@@ -1,9 +1,10 @@
 """Compares a file that was sent with what it should be (promise 2). Layer: cache.
 
-The CRC32 up to verify_max, in doubt whatever the size, always with verify=crc. It runs over the whole file,
-so if it is right the size is right, too. Only zeros before the first other byte do not change it (servers.md
-10): so where it is 0, or was not told, the size is asked for by opening the file. Silence or a refusal counts
-as verified by size, is logged once and counted; in doubt the file is read back instead, past every cache.
+The vehicle's CRC32 is compared for files up to verify_max; in doubt, and with verify=crc, of any size. It
+covers the whole file, so one that is right proves the size, too. But zeros before the first other byte do not
+change it (servers.md 10). So where it is 0, or was not told, the size is asked for by opening the file.
+Without a CRC32 a file counts as verified by size, which is logged and counted. In doubt it is read back
+instead, past every cache.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ PIECE = 64 * 1024
 """Bytes that are read back at once."""
 
 READ_TRIES = 3
-"""How often a file is read back anew because another FTP client may have mixed up the bytes."""
+"""How often a file is read back at most because another FTP client may have mixed up the bytes."""
 
 
 class Verifier:
-    """Counts, too (for status): files verified by CRC32, by reading back, by size alone, and CRC32s that were
-    not answered."""
+    """Compares, and counts for status: comparisons by CRC32, by reading back and by size alone, and CRC32s
+    that were not answered."""
 
     def __init__(self, context: Context, names: Names) -> None:
         self._context = context

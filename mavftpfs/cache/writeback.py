@@ -137,7 +137,7 @@ class Writeback:
                 context, node = self._context, self._context.nodes.need(path)
                 made = node.draft is None
                 if made and node.handles:
-                    # Who has a file open that others removed is not to read the one that is about to be made.
+                    # A program has a file open that others removed: it must not read the one made now.
                     context.nodes.replaced(node)
                     context.files.end(path)
                     node = context.nodes.need(path)
@@ -207,8 +207,8 @@ class Writeback:
         return None if node is None else await self._deliverer.withdraw(node)
 
     async def _forget_draft(self, node: Node) -> None:
-        """What was to be written is not wanted any more, since its caller got an error. What may have the
-        name already is completed later."""
+        """The caller got an error, so its bytes are not wanted any more. If some of them may be on the
+        vehicle, the delivery is completed later."""
         async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
@@ -294,7 +294,7 @@ class Writeback:
     # --- delivering while nobody waits for it
 
     async def _try_all(self) -> None:
-        """What failed, or was refused, may work now."""
+        """Finish and deliver everything that failed or was refused: it may work now."""
         await self._cleaner.finish()
         for node in self._context.nodes:
             node.start_after = float("-inf")
@@ -313,14 +313,14 @@ class Writeback:
                 self._context.nodes.maybe_forget(node)
 
     def _retry_later(self) -> None:
-        """Something was not delivered, or left a name without a file: try again by and by."""
+        """Something was not delivered, or a replacement is unfinished: try again by and by."""
         if self._nursery is not None and not self._retrying:
             self._retrying = True
             self._nursery.start_soon(self._retry)
 
     async def _retry(self) -> None:
-        """Try again, ever more seldom, as long as that may help: a link that fails and returns between two
-        looks at its heartbeats is no news to anybody."""
+        """Try again, ever more seldom, as long as that may help. No news tells of a link that fails and
+        returns between two heartbeats."""
         nodes, unfinished, (pause, longest) = self._context.nodes, self._context.unfinished, PAUSES
         try:
             while unfinished or any(n.undelivered and may_pass(n) for n in nodes):
@@ -332,5 +332,5 @@ class Writeback:
             self._retrying = False
 
     def _is_left_to_us(self, node: Node) -> bool:
-        """Nobody writes it any more, or its name may lack a file."""
+        """Return whether we deliver a file unasked: no program writes it, or its name may lack its file."""
         return not node.writers or self._context.unfinished.lacks_file(node.path)

@@ -55,7 +55,7 @@ class DuplicateDetector:
             del self._sent[next(iter(self._sent))]
 
     def on_settled(self, request: Request, answered: int | None) -> None:
-        """Nobody waits for a request any more. answered: the seq of the answer that came, if one did."""
+        """A request is over. answered: the seq of the answer that came, if one did."""
         seqs = {request.seq + 1, *(request.aliases or ())}
         for seq in seqs:
             # With several seqs nobody knows how often each was sent.
