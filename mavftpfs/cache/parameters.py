@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from mavftpfs.cache.attributes import SECOND
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, require_found
+from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, problems_refused, require_found
 from mavftpfs.cache.virtual import PARAM_FILE, VirtualTrees
 from mavftpfs.parameters.packed import Download, pack_upload, unpack
 from mavftpfs.parameters.saving import Values, Verdict, judge, make_plan, pick_base, unchanged
@@ -27,7 +27,6 @@ from mavftpfs.parameters.text import (
 from mavftpfs.parameters.values import Number, Parameter
 from mavftpfs.shared.errors import (
     FtpNak,
-    InvalidText,
     MavftpfsError,
     NotFound,
     NotTaken,
@@ -172,7 +171,7 @@ class Parameters(Texts[Values]):
         before = (await self._read(reread=True)).values
         plan = make_plan(changed, base, before, meant=save.appended)
         if plan.problems:
-            raise _invalid(save.name, plan.problems)
+            raise problems_refused(save.name, plan.problems)
         if plan.conflicts:
             raise Refused(NotTaken(plan.conflicts[0]), [*plan.conflicts, "nothing was set"])
         # What the program changed itself counts from now on whatever it says, also if it goes back.
@@ -193,10 +192,10 @@ class Parameters(Texts[Values]):
             text = save.text.decode()
         except UnicodeDecodeError as error:
             number = save.text.count(b"\n", 0, error.start) + 1
-            raise _invalid(save.name, [Problem(number, "this is no text")]) from None
+            raise problems_refused(save.name, [Problem(number, "this is no text")]) from None
         lines, problems = parse(text, component)
         if problems:
-            raise _invalid(save.name, problems)
+            raise problems_refused(save.name, problems)
         others = sorted({line.system for line in lines if line.system not in (None, system)} - {None})
         return lines, [f"the lines are of system {other}, this is system {system}" for other in others]
 
@@ -240,12 +239,6 @@ def _complete(download: Download) -> Download:
             f"the parameter file has {len(download.parameters)} of {download.total} parameters"
         )
     return download
-
-
-def _invalid(name: bytes, problems: Sequence[Problem]) -> Refused:
-    ordered = sorted(problems, key=lambda problem: problem.number)
-    lines = [f"{name.decode()}:{problem.number}: {problem.reason}" for problem in ordered]
-    return Refused(InvalidText(lines[0]), [*lines, "nothing was set"])
 
 
 def _several(wanted: Sequence[Parameter]) -> str:

@@ -11,6 +11,7 @@ for each, until it saves.
 
 from __future__ import annotations
 
+import zlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -24,6 +25,7 @@ import trio
 from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.parameters.text import Problem
 from mavftpfs.shared.errors import InvalidText, LocalProtocolError, MavftpfsError, NotFound, ReadOnly
 from mavftpfs.shared.model import EntryKind, split
 
@@ -196,6 +198,11 @@ class Texts(ABC, Generic[B]):
             self._require_writable()
         shown = await self.show(name, reread=not truncate)
         return TextHandle(self, name, shown, write=write, truncate=truncate, append=append, program=program)
+
+    async def crc32(self, name: bytes) -> int:
+        """Return the CRC32 (start value 0, no final xor) of what a reader gets. Raises as show."""
+        text = self.error_text if name == LAST_ERROR else (await self.show(name, reread=False)).text
+        return zlib.crc32(text, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
     def note_other_file(self, program: Program | None) -> None:
         """A program tried to make a file beside these."""
@@ -441,6 +448,13 @@ class TextHandle(OpenFile, Generic[B]):
 
     def close(self) -> None:
         """Let the text go."""
+
+
+def problems_refused(name: bytes, problems: Sequence[Problem]) -> Refused:
+    """Return the refusal of a text with lines that cannot be; names each."""
+    ordered = sorted(problems, key=lambda problem: problem.number)
+    lines = [f"{name.decode()}:{problem.number}: {problem.reason}" for problem in ordered]
+    return Refused(InvalidText(lines[0]), [*lines, "nothing was set"])
 
 
 def require_found(found: B | None, name: bytes) -> B:

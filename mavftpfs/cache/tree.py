@@ -22,6 +22,7 @@ from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import CLOCK_SET, KeptCache
 from mavftpfs.cache.localfiles import LocalFiles
+from mavftpfs.cache.missions import Missions
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.parameters import Parameters
@@ -111,10 +112,10 @@ class Tree:
             spool_directory=spool,
         )
         self._context = self._writing.context
-        self._parameters = Parameters(
-            store, self._virtual, wall=wall, require_writable=self._require_texts_writable
+        self._texts: tuple[Texts[Any], ...] = tuple(
+            texts(store, self._virtual, wall=wall, require_writable=self._require_texts_writable)
+            for texts in (Parameters, Missions)
         )
-        self._texts: tuple[Texts[Any], ...] = (self._parameters,)
 
     # --- asking
 
@@ -237,8 +238,9 @@ class Tree:
             NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
         """
         remote = self._remote(path)
-        if self._texts_of(remote) is not None:
-            raise NotSupported(f"{remote!r} is not a file of the vehicle")
+        texts = self._texts_of(remote)
+        if texts is not None:
+            return await texts.crc32(split(remote)[1])
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
         node = self._context.nodes.get(remote)

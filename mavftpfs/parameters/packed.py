@@ -34,9 +34,8 @@ _VALUES = {
     Kind.FLOAT: struct.Struct("<f"),
 }
 _BY_TYPE = {int(kind): (kind, WIDTHS[kind], _VALUES[kind].unpack_from) for kind in Kind}
-_NAME = re.compile(rb"[!-~]{1,16}")
-_IN_TEXT = re.compile(rb"[,#=]")
-"""What would end a name in a text."""
+_NAME = re.compile(rb"(?![^,#=]*[,#=])[!-~]{1,16}")
+"""Without what would end a name in a text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +85,7 @@ def _unpack_entry(data: bytes, at: int, last: bytes) -> tuple[Parameter, bytes, 
         flags, shared, rest = data[at] >> 4, data[at + 1] & 15, (data[at + 1] >> 4) + 1
         start = at + 2 + rest
         name = last[:shared] + data[at + 2 : start]
-        if flags > _DEFAULT or shared > len(last) or not _NAME.fullmatch(name) or _IN_TEXT.search(name):
+        if flags > _DEFAULT or shared > len(last) or not _NAME.fullmatch(name):
             raise RemoteProtocolError(f"the parameter file is damaged at byte {at}")
         value = read(data, start)[0]
         if not flags:

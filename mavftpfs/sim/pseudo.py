@@ -6,9 +6,10 @@ Source: servers.md 11 and 17; AP_Filesystem_Sys, _Mission, _ROMFS, and recording
 from __future__ import annotations
 
 import errno
-import struct
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
+from mavftpfs.sim.missions import NAMES, MissionFile, Missions
 from mavftpfs.sim.parameters import (
     FLOAT,
     INT8,
@@ -26,12 +27,9 @@ from mavftpfs.sim.parameters import (
 from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
 
 TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
-MISSION_MAGIC = 0x763D
 MAX_HANDLES = 4
-_MISSION_HEADER = struct.Struct("<HHHHH")
 _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20
-_MISSIONS = (b"mission.dat", b"fence.dat", b"rally.dat")
 _REAL_SIZES = (b"storage.bin",)
 _STORAGE = bytes(i * 31 % 251 for i in range(16_384))
 _SYS_NAMES = (
@@ -129,6 +127,7 @@ class VirtualTrees:
     ) -> None:
         self._exact = exact
         self._says_so = says_so
+        self.missions = Missions(says_so=says_so)
         self.clock: Callable[[], float] = lambda: 0.0
         made = _px4_parameters() if exact else _default_parameters()
         self.table = table if table is not None else Table(made)
@@ -200,8 +199,8 @@ class VirtualTrees:
     def _content(self, tree: bytes, name: bytes, block: int) -> bytes:
         if tree == b"@PARAM" and _is_parameter_file(name):
             return self.table.download(selection(name.partition(b"?")[2]), block, self.clock())
-        if tree == b"@MISSION" and name in _MISSIONS:  # of no items
-            return _MISSION_HEADER.pack(MISSION_MAGIC, _MISSIONS.index(name), 0, 0, 0)
+        if tree == b"@MISSION" and name in NAMES:
+            return self.missions.packed(name)
         files = {b"@SYS": self.sys_files, b"@ROMFS": self.romfs}.get(tree, {})
         if name not in files:
             raise fail(errno.ENOENT, name)
@@ -222,6 +221,9 @@ class VirtualTrees:
         self._open[tree] += 1
         if tree == b"@PARAM":
             return self._open_parameters(name, size, write=write)
+        if tree == b"@MISSION":
+            closed = partial(self._closed, tree)
+            return MissionFile(self.missions, name, size, write=write, on_close=closed)
         return VirtualFile(self._content(tree, name, 239), size, on_close=lambda: self._closed(tree))
 
     def _open_parameters(self, name: bytes, size: int, *, write: bool) -> ParameterFile:

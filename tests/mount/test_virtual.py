@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from pymavlink import mavwp
 
 from mavftpfs.sim.pseudo import VirtualTrees
 from tests.mount.conftest import Field
@@ -46,6 +47,28 @@ def test_copying_tools_get_the_true_bytes(ardupilot: Mount, tmp_path: Path, tool
         again = ardupilot.run("rsync", "-aRi", *sources, f"{tmp_path}/", cwd=ardupilot.path).stdout
         assert again == ""
     assert {path.name: path.read_bytes() for path in (tmp_path / "@SYS").iterdir()} == FILLED
+
+
+PLAN = """QGC WPL 110
+0 0 0 16 0 0 0 0 0 0 0 1
+1 0 3 22 0 0 0 0 0 0 20 1
+2 0 3 16 3 0 0 0 -35.361 149.161 30 1
+"""
+
+
+def test_a_mission_is_copied_edited_and_copied_back(ardupilot: Mount, tmp_path: Path) -> None:
+    plan, missions = tmp_path / "plan.waypoints", ardupilot.path / "@MISSION"
+    plan.write_text(PLAN)
+    ardupilot.run("cp", plan, missions / "mission.waypoints")
+    ardupilot.run("cp", missions / "mission.waypoints", plan)
+    assert mavwp.MAVWPLoader().load(str(plan)) == 3
+    ardupilot.run("sh", "-c", f"sed 's/30/40/' {plan} > {missions / 'mission.waypoints'}")
+    assert ardupilot.read_bytes(missions / "mission.waypoints").split()[-2:] == [b"40", b"1"]
+    assert len(ardupilot.read_bytes(missions / "mission.dat")) == 10 + 3 * 38
+    vim = "vim -es -N -u NONE -i NONE -n -c '%s/\\t40\\t/\\tx\\t/' -c wq mission.waypoints"
+    ardupilot.run("sh", "-c", vim, cwd=missions, code=1)
+    assert b"mission.waypoints:4: 'x' is not a number" in ardupilot.read_bytes(missions / "last_error.txt")
+    assert ardupilot.errno_of("open(sys.argv[1], 'w')", missions / "mission.dat") == "EROFS"
 
 
 def test_writing_below_at_is_refused(ardupilot: Mount) -> None:

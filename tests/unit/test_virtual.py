@@ -70,7 +70,9 @@ async def names(tree: Tree, path: bytes) -> set[bytes]:
 async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree) -> None:
     assert await names(tree, b"/") == {b"APM", b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION"}
     assert await names(tree, b"/@PARAM") == {b"param.pck", *TEXTS}
-    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat", b"rally.dat"}
+    missions = {b"mission", b"fence", b"rally"}
+    packed, texts = {name + b".dat" for name in missions}, {name + b".waypoints" for name in missions}
+    assert await names(tree, b"/@MISSION") == packed | texts | {b"last_error.txt"}
     assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
     assert (await tree.stat(b"/@PARAM")).valid_for == 1.0
     assert dict(await tree.list(b"/"))[b"@MISSION"].kind is EntryKind.DIRECTORY

@@ -1,0 +1,123 @@
+"""`@MISSION` as texts: a mission, a fence, rally points. Layer: cache.
+
+Saving replaces all items, and only reading back tells whether the vehicle took them: it ACKs what it refuses
+(docs/servers.md 17).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mavftpfs.cache.attributes import SECOND
+from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, problems_refused
+from mavftpfs.cache.virtual import VirtualTrees
+from mavftpfs.parameters.missions import (
+    FENCE,
+    MISSION,
+    RALLY,
+    Difference,
+    Item,
+    differences,
+    pack_upload,
+    parse,
+    render,
+    unpack,
+)
+from mavftpfs.parameters.text import Problem
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotTaken, RemoteProtocolError
+
+DIRECTORY = b"/@MISSION"
+KINDS = {b"mission.waypoints": MISSION, b"fence.waypoints": FENCE, b"rally.waypoints": RALLY}
+
+Items = Sequence[Item]
+
+
+class Missions(Texts[Items]):
+    """The texts of `@MISSION`."""
+
+    names = tuple(KINDS)
+
+    def __init__(
+        self,
+        store: VehicleStore,
+        virtual: VirtualTrees,
+        *,
+        wall: Callable[[], float],
+        require_writable: Callable[[], None],
+    ) -> None:
+        super().__init__(DIRECTORY, wall, require_writable)
+        self._store = store
+        self._virtual = virtual
+        self._shown: dict[bytes, tuple[bytes, Shown[Items]]] = {}
+
+    def forget(self) -> None:
+        """See Texts."""
+        self._shown.clear()
+
+    async def show(self, name: bytes, *, reread: bool) -> Shown[Items]:
+        """See Texts."""
+        raw = await self._virtual.content(_file_of(name), reread=reread)
+        known = self._shown.get(name)
+        if known is not None and known[0] == raw:
+            return known[1]
+        try:
+            items = unpack(raw, KINDS[name])
+        except RemoteProtocolError:  # it may have changed while it was read
+            self._virtual.outdate(_file_of(name))
+            raw = await self._virtual.content(_file_of(name), reread=True)
+            items = unpack(raw, KINDS[name])
+        shown: Shown[Items] = Shown(render(items).encode(), items, int(self._wall() * SECOND))
+        self._shown[name] = raw, shown
+        return shown
+
+    async def carry_out(self, save: Save[Items]) -> Saved[Items] | None:
+        """See Texts."""
+        if save.appended:
+            raise problems_refused(
+                save.name, [Problem(1, "a mission is written as a whole, not appended to")]
+            )
+        try:
+            wanted, problems = parse(save.text.decode())
+        except UnicodeDecodeError:
+            wanted, problems = [], [Problem(1, "this is no text")]
+        if problems:
+            raise problems_refused(save.name, problems)
+        kind = KINDS[save.name]
+        if not differences(wanted, (await self.show(save.name, reread=True)).base, kind):
+            return None
+        found = await self._replace(save.name, wanted)
+        return Saved(None, [f"{one.text} (the vehicle does not keep it)" for one in found])
+
+    async def _replace(self, name: bytes, wanted: Items) -> list[Difference]:
+        """Replace all items, read them back, and return what the vehicle has no room for.
+
+        Raises:
+            Refused: it has other items.
+        """
+        failure: MavftpfsError | None = None
+        file, kind = _file_of(name), KINDS[name]
+        self._virtual.outdate(file)
+        try:
+            await self.upload(self._store, name, file, pack_upload(wanted, kind, self._store.address()))
+        except MavftpfsError as error:
+            failure = error
+        self._virtual.outdate(file)
+        try:
+            found = differences(wanted, (await self.show(name, reread=True)).base, kind)
+        except MavftpfsError as error:
+            raise Refused(
+                failure or error, [f"{failure or error}; it is not known whether it was set"]
+            ) from error
+        missed = [one.text for one in found if one.kept]
+        if not missed:
+            return found
+        refused = failure is None or isinstance(failure, FtpNak)
+        why = (
+            NotTaken(f"the vehicle has not taken it: {missed[0]}") if refused or failure is None else failure
+        )
+        raise Refused(why, [str(why), *missed])
+
+
+def _file_of(name: bytes) -> bytes:
+    return DIRECTORY + b"/" + name.partition(b".")[0] + b".dat"

@@ -1,0 +1,119 @@
+"""Missions of one vehicle, and what ArduPilot makes of `@MISSION/*.dat`. Layer: sim; pure.
+
+Source: servers.md 11 and 17; AP_Filesystem_Mission and a recording. An upload replaces all items when it is
+closed. One that is refused is ACKed all the same by some, and the old items stay.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from mavftpfs.sim.tree import fail
+
+MAGIC = 0x763D
+NAMES = (b"mission.dat", b"fence.dat", b"rally.dat")
+HEADER = struct.Struct("<HHHHH")
+ITEM = struct.Struct("<ffffiifHHBBBBBB")
+HOME = (0.0, 0.0, 0.0, 0.0, -353632610, 1491652299, 584.0899658203125, 0, 16, 0, 0, 0, 0, 1, 0)
+
+Item = tuple[float | int, ...]
+_COMMAND, _WAYPOINT = 8, 16
+_PLACELESS = frozenset((20, 112, 114, 115, 177, 178, 183, 206, 211))
+
+
+@dataclass
+class Missions:
+    """Items by kind: mission, fence, rally. The mission's first item is home.
+
+    limit: more items are refused. says_so: a refused upload is EINVAL at the close; else nobody is told.
+    """
+
+    limit: int = 700
+    says_so: bool = False
+    items: dict[int, list[Item]] = field(default_factory=lambda: {0: [HOME], 1: [], 2: []})
+
+    def packed(self, name: bytes) -> bytes:
+        """Return a file."""
+        kind = NAMES.index(name)
+        items = self.items[kind]
+        return HEADER.pack(MAGIC, kind, 0, 0, len(items)) + b"".join(ITEM.pack(*item) for item in items)
+
+    def replace(self, name: bytes, data: bytes) -> None:
+        """Take an upload.
+
+        Raises:
+            OSError: EINVAL, it is refused and that is told.
+        """
+        kind = NAMES.index(name)
+        items = self._parsed(kind, data)
+        if items is not None:
+            self.items[kind] = [HOME, *items[1:]] if kind == 0 else items
+        elif self.says_so:
+            raise fail(errno.EINVAL)
+
+    def _parsed(self, kind: int, data: bytes) -> list[Item] | None:
+        """Return the items as the vehicle keeps them, None if it refuses them."""
+        if len(data) < HEADER.size:
+            return None
+        magic, found, _, start, count = HEADER.unpack_from(data)
+        body = data[HEADER.size :]
+        if magic != MAGIC or found != kind or start or len(body) != count * ITEM.size or count > self.limit:
+            return None
+        parts = [body[at : at + ITEM.size] for at in range(0, len(body), ITEM.size)]
+        if not all(map(any, parts)):
+            return None
+        return [self._kept(place, ITEM.unpack(part), kind) for place, part in enumerate(parts)]
+
+    def _kept(self, place: int, item: Item, kind: int) -> Item:
+        """Return what of an item there is room for: no ids, no yaw of a waypoint, heights in steps."""
+        p1, p2, p3, p4, x, y, z, _, command, _, _, frame, *_ = item
+        if command == _WAYPOINT and kind == 0:
+            p2 = p3 = p4 = 0.0
+        if command in _PLACELESS:
+            frame = 0
+        height = float(int(z)) if kind == 2 else int(z * 100) / 100
+        return (p1, p2, p3, p4, x, y, height, place, command, 0, 0, frame, 0, 1, kind)
+
+
+class MissionFile:
+    """One of the files as a session has it open."""
+
+    def __init__(
+        self, missions: Missions, name: bytes, claimed: int, *, write: bool, on_close: Callable[[], None]
+    ) -> None:
+        self._missions = missions
+        self._name = name
+        self._claimed = claimed
+        self._written = bytearray() if write else None
+        self._on_close = on_close
+        self._closed = False
+
+    def read(self, offset: int, size: int) -> bytes:
+        """See OpenFile; items are those of now."""
+        if self._written is not None:
+            raise fail(errno.EINVAL)
+        return self._missions.packed(self._name)[offset : offset + size]
+
+    def write(self, offset: int, data: bytes) -> int:
+        """See OpenFile."""
+        if self._written is None:
+            raise fail(errno.EBADF)
+        self._written += bytes(max(0, offset + len(data) - len(self._written)))
+        self._written[offset : offset + len(data)] = data
+        return len(data)
+
+    def size(self) -> int:
+        """See OpenFile."""
+        return self._claimed
+
+    def close(self) -> None:
+        """See OpenFile."""
+        if self._closed:
+            return
+        self._closed = True
+        self._on_close()
+        if self._written is not None:
+            self._missions.replace(self._name, bytes(self._written))
