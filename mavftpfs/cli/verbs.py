@@ -218,7 +218,8 @@ def _tell(fetched: Fetched) -> None:
     resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
     before = ", here already" if fetched.was_here else resumed
     name = printable(fetched.wanted.name)
-    print(f"{name}: {readable_size(fetched.size)}{before}, verified by {fetched.proof.words}", flush=True)
+    verified = f"verified by {fetched.proof.words}{printable(fetched.kept_words)}"
+    print(f"{name}: {readable_size(fetched.size)}{before}, {verified}", flush=True)
 
 
 def _ignore(fetched: Fetched) -> None:

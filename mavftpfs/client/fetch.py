@@ -133,13 +133,21 @@ def _size(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file that is here. resumed: bytes that were here before; was_here: it was, whole, under its name."""
+    """A file that is here. resumed: bytes that were here before; was_here: it was, whole, under its name;
+    kept: what another file that had its name is called now.
+    """
 
     wanted: Wanted
     size: int
     resumed: int
     proof: Proof
     was_here: bool = False
+    kept: Path | None = None
+
+    @property
+    def kept_words(self) -> str:
+        """What is said of the other file, if there was one."""
+        return "" if self.kept is None else f"; another one of that name is kept as {self.kept.name}"
 
 
 def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
@@ -193,14 +201,17 @@ class Part:
         self._file.write(data)
         self._file.flush()
 
-    def commit(self, mtime: int | None, *, keep_old: bool) -> None:
-        """Give the file its name, once it is on the disk. mtime: None leaves the present."""
+    def commit(self, mtime: int | None, *, keep_old: bool) -> Path | None:
+        """Give the file its name, once it is on the disk; return what another file that had it is called now.
+        mtime: None leaves the present."""
+        kept: Path | None = None
         os.fsync(self._file.fileno())
         if mtime is not None:
             os.utime(self.path, (mtime, mtime))
         if keep_old and self.local.exists() and not self._begins_like(self.local):
-            self.local.rename(_free_name(self.local))
+            kept = self.local.rename(_free_name(self.local))
         self.path.replace(self.local)
+        return kept
 
     def _begins_like(self, old: Path) -> bool:
         """Return whether all of another file is at the beginning of this one."""
@@ -323,8 +334,8 @@ class Fetcher:
             part.cut(0)
             resumed = 0
             size, proof = await self._attempt(wanted, part)
-        await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
-        return Fetched(wanted, size, resumed, proof)
+        kept = await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
+        return Fetched(wanted, size, resumed, proof, kept=kept)
 
     async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, Proof]:
         """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""

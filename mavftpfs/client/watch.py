@@ -29,7 +29,7 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected
-from mavftpfs.shared.errors import LinkError, MavftpfsError, NotFound
+from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound
 from mavftpfs.shared.readable import readable_size
 
 REOPEN = 5.0
@@ -78,6 +78,7 @@ class Watch:
         self._working_on: tuple[int, trio.CancelScope] | None = None
         self._logs: dict[int, dict[bytes, Wanted]] = {}
         self._names: dict[int, str] = {}
+        self._target: Target | None = None
         self._same_heads: set[tuple[str, str]] = set()
         self._done_here: set[tuple[str, str]] = set()
         self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
@@ -151,6 +152,7 @@ class Watch:
         Raises:
             UsageError: SOURCE or the options are wrong.
         """
+        self._target = target
         async with plain_nursery() as nursery:
             nursery.start_soon(self._hand_on_all)
             while True:
@@ -202,12 +204,18 @@ class Watch:
                     self._wanted_system = step.system
                     await trio.sleep(TICK)
                     break
+                elif isinstance(step, Look) and isinstance(contact, LinkContact) and await self._is_mounted():
+                    self._leave = LinkClosed("a mount has this vehicle now: its files are used")
                 else:
                     session = session or await contact.enter(stack)
                     if not await self._work(step, contact, session):
                         break
         if isinstance(self._leave, LinkError):
             raise self._leave
+
+    async def _is_mounted(self) -> bool:
+        """Return whether a mount of that vehicle came up, with which we would share its only session."""
+        return self._target is not None and await self._target.mounted() is not None
 
     async def _wait(self, step: Wait) -> None:
         self._changed = trio.Event()
@@ -327,7 +335,7 @@ class Watch:
         self._policy.fetched(system, log)
         self._done_here.add(key)
         self._came += 1
-        self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}")
+        self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}{fetched.kept_words}")
         if self._hand_on is not None:
             self._to_hand_on.send_nowait(brought)
 

@@ -288,13 +288,13 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
 # -- by itself ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "mounted"), [("px4", False), ("ardupilot", True)])
-def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, mounted: bool) -> None:
+@pytest.mark.parametrize(("kind", "mounted"), [("px4", "never"), ("ardupilot", "before"), ("px4", "later")])
+def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, mounted: str) -> None:
     place = start_place(field, kind)
     vehicle = place.vehicle
     assert isinstance(vehicle, SimVehicle)
     card = vehicle.root / "APM/LOGS"
-    if mounted:
+    if mounted == "before":
         field.mount(vehicle.source)
     write_log(card / "1.BIN", 50_000, 1, 1)
     handed, local, said = tmp_path / "handed", tmp_path / "logs", tmp_path / "said"
@@ -305,6 +305,8 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
         subprocess.Popen(words, stdout=output, stderr=output, cwd=PROJECT) as child,
     ):
         wait_until("the first log was handed on", lambda: handed.read_text() == "1.BIN\n")
+        if mounted == "later":
+            field.mount(vehicle.source)
         vehicle.send_signal(signal.SIGUSR1)  # armed
         wait_until("that is noticed", lambda: "vehicle 1 is armed" in said.read_text())
         write_log(card / "2.BIN", 60_000, 2, 2)
@@ -315,6 +317,7 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
     out = said.read_text()
     assert out.splitlines()[-1] == "ended; the next run goes on"
     assert out.count("is here, verified by size and CRC32") == 2
+    assert ("a mount has this vehicle now" in out) is (mounted == "later")
     (home,) = (path for path in local.iterdir() if path.is_dir())
     assert filecmp.cmpfiles(card, home, ["1.BIN", "2.BIN"], shallow=False) == (["1.BIN", "2.BIN"], [], [])
 

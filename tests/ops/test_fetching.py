@@ -383,6 +383,7 @@ async def test_what_is_made_anew_at_each_opening_is_never_skipped(tmp_path: Path
         (b"/l/*.ulg", ["a.ulg", "b.ulg"]),
         (b"/l/[b-c].*", ["b.ulg"]),
         (b"/?/a.ulg", ["a.ulg"]),
+        (b"/l/*", ["[odd]", "a.ulg", "b.ulg"]),
         (b"/*/.*", [".x"]),
         (b"/l/[odd]", ["[odd]"]),
     ],
@@ -470,6 +471,7 @@ async def test_another_log_of_that_name_does_not_destroy_the_old_one(tmp_path: P
     assert outcome.complete
     assert (tmp_path / "1.BIN").read_bytes() == new
     assert (tmp_path / "1.BIN.~1~").read_bytes() == b"flight of May"
+    assert outcome.fetched[0].kept_words == "; another one of that name is kept as 1.BIN.~1~"
 
 
 async def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:

@@ -172,8 +172,13 @@ async def test_an_armed_vehicle_is_left_alone(day: Day) -> None:
     assert day.said == ["vehicle 1 is here, armed"]
 
 
-@pytest.mark.parametrize("how", ["armed", "refused", "denied"])
-async def test_a_transfer_lets_go_within_a_second(day: Day, how: str) -> None:
+@pytest.mark.holds("promise 9")
+@pytest.mark.parametrize(
+    ("profile", "how"),
+    [*((profile, "armed") for profile in PLACES), ("px4", "refused"), ("ardupilot", "denied")],
+)
+async def test_a_transfer_lets_go_within_a_second(tmp_path: Path, profile: str, how: str) -> None:
+    day = Day(tmp_path / "logs", profile)
     day.put("1.ulg", content(400_000))
     async with day.watched():
         await day.until("begins")
@@ -382,6 +387,7 @@ async def test_a_pause_of_one_vehicle_does_not_mix_up_the_names_of_two(day: Day)
         await trio.sleep(3.0)
         second.disarm()
         await day.until("is here, verified", 2)
+        await trio.sleep(60.0)
     assert day.saying("vehicle 2: log001.ulg is here") == 1
     assert (day.local / "1" / "log001.ulg").read_bytes() == content(200_000, 1)
     assert (day.local / "2" / "log001.ulg").read_bytes() == content(100_000, 2)
