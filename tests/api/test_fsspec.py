@@ -14,6 +14,7 @@ import pytest
 from fsspec.tests import abstract
 
 import mavftpfs
+from mavftpfs.api import fs as fs_module
 from mavftpfs.api.fs import DroneFileSystem
 from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
@@ -91,13 +92,15 @@ class TestPipe(abstract.AbstractPipeTests, Fixtures):  # type: ignore[misc]
 
 
 @pytest.fixture(scope="module")
-def source(module_field: Field) -> str:
+def source(module_field: Field) -> Iterator[str]:
     """A PX4 with a CSV, and a directory with a file."""
     card = module_field.local("card")
     (card / "d" / "e").mkdir(parents=True)
     (card / "data.csv").write_text("time,alt\n" + "".join(f"{n},{n / 2}\n" for n in range(5000)))
     (card / "d" / "f").write_bytes(DATA)
-    return module_field.sim(card, "px4").source
+    yield module_field.sim(card, "px4").source
+    for connection in fs_module._connections.values():
+        connection.close()
 
 
 @pytest.fixture
