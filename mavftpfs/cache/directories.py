@@ -11,6 +11,14 @@ so the result expires at once.
 
 Only a path that its parent's listing shows as a directory is listed: listing a file ends a MAVSDK server
 (servers.md 6), so a path is walked from the root. A walk costs nothing where listings are fresh.
+
+Callers ask about a directory, or about one name in it, and say how good the answer has to be:
+
+| good enough | a directory | a name |
+|---|---|---|
+| what is remembered, however old; costs nothing | `known` | `entry` |
+| fresh, and any while the vehicle is lost: for programs | `get` | `find` |
+| listed since a moment: before something is changed or believed | `ask` | `current` |
 """
 
 from __future__ import annotations
@@ -133,7 +141,7 @@ class Directories:
         clock: Callable[[], float],
         nursery: trio.Nursery | None = None,
     ) -> None:
-        """`clock`: seconds, monotonic. With a nursery a listing outlives who asked for it."""
+        """`clock`: seconds, monotonic. With a nursery a listing outlives its caller."""
         self._store = store
         self._options = options
         self.clock = clock
@@ -165,10 +173,9 @@ class Directories:
             self._known.move_to_end(path)
         return directory
 
-    def fresh(self, path: bytes) -> Directory | None:
-        """Return the directory's listing if it still proves something."""
-        directory = self.known(path)
-        return directory if directory is not None and self.clock() < directory.fresh_until else None
+    def _is_fresh(self, directory: Directory) -> bool:
+        """Return whether a listing still proves something."""
+        return self.clock() < directory.fresh_until
 
     def left(self, directory: Directory) -> float:
         """Return for how many seconds a listing is the newest that can be had: while the vehicle is lost,
@@ -311,8 +318,8 @@ class Directories:
         for _ in range(SWEEP_TRIES):
             sweep = self._sweeps.get(path)
             if sweep is None or sweep.void or sweep.began < since:
-                known = self.fresh(path)
-                if began is not None and known is not None and known.listed_at >= began:
+                known = None if began is None else self.known(path)
+                if known is not None and known.listed_at >= since and self._is_fresh(known):
                     return known
                 self.expire(path)
             directory = await self._list(path)
@@ -331,7 +338,7 @@ class Directories:
         if directory is None:
             self.require_heard()
             return await self._list(path)
-        if self.clock() < directory.fresh_until or self._store.why_lost() is not None:
+        if self._is_fresh(directory) or self._store.why_lost() is not None:
             return directory
         try:
             return await self._list(path, until_lost=self._sweeping.outlives_callers)
@@ -379,8 +386,8 @@ class Directories:
         """
         path = ROOT
         for part in () if self._root_proven else self._options.root.split(b"/")[1:]:
-            directory = self.fresh(path)
-            if directory is None:
+            directory = self.known(path)
+            if directory is None or not self._is_fresh(directory):
                 directory = await self._sweeping.run(path, partial(self._sweep, path))
             entry = directory.entries.get(part)
             path = join(path, part)

@@ -84,9 +84,10 @@ class Files:
         proof_time: float,
         directories: Directories,
         invalidate: Callable[[bytes], None],
+        kept: KeptCache | None = None,
     ) -> None:
         """`proof_time`: seconds that what is known of a file holds."""
-        self.kept: KeptCache | None = None
+        self.kept = kept
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
         self.cache = cache
@@ -101,7 +102,6 @@ class Files:
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self.reopening: SingleFlight[Version, None] = SingleFlight()
         directories.on_listed.append(self._on_listed)
-        cache.on_dropped = self._on_dropped
 
     # --- opening
 
@@ -120,7 +120,7 @@ class Files:
         for other in self.open_versions:
             if other.path == path and other is not version:
                 direct_io |= not other.replaced or other.lost
-        version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
+        version.shown = not direct_io  # the kernel may fetch pages for programs that read an older version
         version.handles += 1
         self.open_versions[version] = None
         return VersionHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
@@ -134,7 +134,7 @@ class Files:
             return version, True
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
         if kept is not None:
-            version = Version(self.cache, path, kept.key.size, entry.mtime)
+            version = self._version(path, kept.key.size, entry.mtime)
             version.kept = kept
             self._replace(version)
         else:
@@ -142,6 +142,9 @@ class Files:
             if fresh and self.kept is not None:
                 self.kept.keep(version, entry)
         return version, False
+
+    def _version(self, path: bytes, size: int = 0, mtime: int | None = None) -> Version:
+        return Version(self.cache, path, size, mtime, on_dropped=self._on_dropped)
 
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
@@ -158,7 +161,7 @@ class Files:
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         self._directories.require_heard()
-        version = Version(self.cache, path)
+        version = self._version(path)
         reader = await self._store.open_reader(path, version)
         try:
             if reader.size < entry.size and not self.is_changing(path):
@@ -195,7 +198,7 @@ class Files:
         return entry
 
     async def open_reader(self, version: Version) -> None:
-        """Give a version a reader; run by `reopening`, once for all who want one. In doubt the file is opened
+        """Give a version a reader; run by `reopening`, once for all handles. In doubt the file is opened
         anew at once, else when bytes are wanted.
 
         Raises:
@@ -269,7 +272,7 @@ class Files:
             return
         async with self.paths.steady(version) as present:
             if present != path or self.is_changing(path):
-                return  # who reads on has it compared under its new name
+                return  # it is compared under its new name, by the next read
         took = directory.ended_at - directory.listed_at
         version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
         self._compare_listed(version, directory)
@@ -299,7 +302,7 @@ class Files:
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
-        """The path is another file now: none of those that were opened there up to this version."""
+        """The file was replaced: this version, and all older ones of its path, are dead."""
         lost = not self.is_changing(version.path)
         newest = self._current.get(version.path) is version
         older = [v for v in self.open_versions if newest and v.path == version.path]
@@ -345,13 +348,13 @@ class Files:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self.open_versions)
 
-    def end(self, path: bytes) -> None:
-        """What we are about to write there must not be given to who has another file open."""
+    def kill_all(self, path: bytes) -> None:
+        """Programs that have a file of that path open must not read what we are about to write there."""
         for version in [v for v in self.open_versions if v.path == path and not v.replaced]:
             self.kill(version)
 
     def on_changed(self, path: bytes) -> None:
-        """We wrote or removed what has the path: who has the old file open opens the path anew."""
+        """We wrote or removed what has the path: programs that have the old file open open the path anew."""
         for version in self._at_or_below(path):
             if self._current.get(version.path) is version:
                 del self._current[version.path]
@@ -362,7 +365,7 @@ class Files:
         self.on_changed(path)
         if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
-        version = Version(self.cache, path, size)
+        version = self._version(path, size)
         version.known_at, version.shown = proven_at, True
         version.ours = version.given = True
         self._replace(version)

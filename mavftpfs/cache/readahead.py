@@ -57,7 +57,7 @@ class Readahead:
             if self._size <= small:
                 self._asked = self._size
                 return Plan(min(stop, self._size), self._size)
-            if stop < FIRST_WINDOW:  # who begins with more at once reads on
+            if stop < FIRST_WINDOW:  # a program that begins with more at once reads on
                 return NOTHING
         self._used += stop - start
         if self._window == 0:

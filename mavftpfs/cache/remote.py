@@ -30,7 +30,7 @@ class ReadSink(Protocol):
         ...
 
     def on_batch(self, count: int) -> None:
-        """A batch of on_data calls with so many bytes in all ended: wake whoever waits. Called once per
+        """A batch of on_data calls with so many bytes in all ended: wake the reads that wait. Called once per
         batch, never per packet."""
         ...
 
@@ -168,7 +168,7 @@ class Upload(Protocol):
 class VehicleStore(RemoteStore, Protocol):
     """The vehicle's files, and how the caches change them.
 
-    Nothing below checks types or targets: who calls did. These raise FtpNak, RequestTimeout,
+    Nothing below checks types or targets: the caller did. These raise FtpNak, RequestTimeout,
     VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change did not happen. Only
     OutcomeUnknown says that nobody knows: a request was not answered, and no listing could tell.
     """

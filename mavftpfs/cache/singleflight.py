@@ -1,4 +1,4 @@
-"""Concurrent callers who want the same thing share one execution. Layer: cache."""
+"""Concurrent callers that want the same thing share one execution. Layer: cache."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Call(Generic[T]):
 
 
 class SingleFlight(Generic[K, T]):
-    """Runs at most one piece of work per key at a time; who comes meanwhile gets the same result or error.
+    """Runs at most one piece of work per key at a time; callers that come meanwhile get its result or error.
 
     With a nursery the work outlives the caller that started it: listing a large directory over a radio may
     take longer than one system call may wait, and the retry finds it done. Without one the first caller runs
@@ -39,11 +39,11 @@ class SingleFlight(Generic[K, T]):
     async def run(self, key: K, work: Callable[[], Awaitable[T]], *, again: bool = False) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
 
-        A time-out of work that was under way before is not shared: who joined late starts anew, unless the
+        A time-out of work that was under way before is not shared: a late caller starts anew, unless the
         caller waited for it before (`again`).
 
         Raises:
-            Exception: what the work raised; all who share it get the same object.
+            Exception: what the work raised; all its callers get the same object.
         """
         joined = key in self._running and not again
         while True:
@@ -66,7 +66,7 @@ class SingleFlight(Generic[K, T]):
     async def _run(self, key: K, call: _Call[T], work: Callable[[], Awaitable[T]]) -> None:
         try:
             call.results.append(await work())
-        except Exception as error:  # handed to everyone who waits, not swallowed
+        except Exception as error:  # handed to every caller that waits, not swallowed
             call.error = error
         finally:
             del self._running[key]

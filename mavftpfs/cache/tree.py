@@ -1,6 +1,6 @@
 """The remote tree as the FUSE layer sees it. Layer: cache.
 
-`Tree` decides who answers: remembered listings (`directories`), blocks of regular files (`files`), what is
+`Tree` decides what answers: remembered listings (`directories`), blocks of regular files (`files`), what is
 written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
 (`localfiles`). It translates paths: callers name them below the mount's root, the modules behind it name them
 as the vehicle does.
@@ -73,7 +73,7 @@ class Tree:
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
-        With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
+        With a nursery, listings and snapshots under way survive the cancellation of their callers, and
         written bytes go to the vehicle while the program still writes.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
         `keep` makes the cache on the local disk, which needs a nursery.
@@ -84,16 +84,18 @@ class Tree:
         self._store = store
         self._directories = Directories(store, options, clock=clock, nursery=nursery)
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
+        self._kept: KeptCache | None = None
+        if keep is not None and nursery is not None:
+            self._kept = keep(self._directories, self._blocks)
+            nursery.start_soon(self._kept.run)
         self._files = Files(
             store,
             self._blocks,
             proof_time=options.proof_time,
             directories=self._directories,
             invalidate=self._invalidate,
+            kept=self._kept,
         )
-        if keep is not None and nursery is not None:
-            self._files.kept = keep(self._directories, self._blocks)
-            nursery.start_soon(self._files.kept.run)
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )
@@ -339,7 +341,7 @@ class Tree:
         await self._writing.namespace.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
-        """Remove a file; who has it open goes on reading it.
+        """Remove a file; programs that have it open go on reading it.
 
         Raises:
             NotFound, IsADirectory, Armed, FileBusy.
@@ -401,8 +403,8 @@ class Tree:
 
     async def keep_whole_files(self) -> None:
         """Keep what was read whole for the next mount, as this one ends (with `keep`)."""
-        if self._files.kept is not None:
-            await self._files.kept.keep_whole_files()
+        if self._kept is not None:
+            await self._kept.keep_whole_files()
 
     def armed_changed(self, armed: bool) -> None:
         """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""

@@ -3,15 +3,15 @@
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
 one version share its bytes and its remote reader. When the file turns out to have become another one the
 version is REPLACED: its handles get FileChanged, and later opens start a new version. If somebody else
-replaced it the version is `lost`: its handles never get what has the path now, whoever wrote that.
+replaced it the version is `lost`: its handles never get what has the path now, even if we wrote that.
 
-A version is the sink that its reader fills; those who wait for bytes are woken once per batch. `BlockCache`
+A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
 atomic (trio); nothing here awaits while state is half changed.
 
 Doubtful bytes (promise 1). Servers share session ids between clients, so perfectly matching replies can carry
 another file. When the session layer notices that this may have happened (`on_suspect`), every byte is
-dropped, and what still comes from the present reader is ignored: who wants bytes opens a new one.
+dropped, and what still comes from the present reader is ignored: the next read opens a new one.
 """
 
 from __future__ import annotations
@@ -82,11 +82,7 @@ class RateMeter:
 
 
 class BlockCache:
-    """The budget that all files share.
-
-    Attributes:
-        on_dropped: called when bytes of a version are dropped in doubt: the kernel may hold copies.
-    """
+    """The budget that all files share."""
 
     def __init__(self, budget: int, *, clock: Callable[[], float], patience: float) -> None:
         """Take the budget in bytes, and after how many seconds without progress a read gives up."""
@@ -94,11 +90,10 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
-        self.on_dropped: Callable[[Version], None] = lambda version: None
         self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
-        """Held by who waits for a piece: what is waited for is not evicted, and takes at most half. A lock:
-        see `pathlocks`. Who holds a path alone must not wait for it."""
+        """Held by each read that waits for a piece: its piece is not evicted, and all pieces take at most
+        half. A lock: see `pathlocks`. A task that holds a path alone must not wait for it."""
         self.bytes_cached = 0
         self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
 
@@ -174,7 +169,16 @@ class Version:
         drops: how often all bytes were dropped because they were in doubt, or another file's.
     """
 
-    def __init__(self, cache: BlockCache, path: bytes, size: int = 0, mtime: int | None = None) -> None:
+    def __init__(
+        self,
+        cache: BlockCache,
+        path: bytes,
+        size: int = 0,
+        mtime: int | None = None,
+        *,
+        on_dropped: Callable[[Version], None] = lambda version: None,
+    ) -> None:
+        """`on_dropped` is called when its bytes are dropped in doubt: the kernel may hold copies."""
         self.path = path
         self.size = size
         self.mtime = mtime
@@ -187,6 +191,7 @@ class Version:
         self.kept: Kept | None = None
         self.drops = 0
         self._why = ""
+        self._on_dropped = on_dropped
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
@@ -273,12 +278,12 @@ class Version:
             waiter.missing = missing
 
     def on_queued(self) -> None:
-        """The reader waits for its turn while the queue before it moves: those who wait get more time."""
+        """The reader waits for its turn while the queue before it moves: reads that wait get more time."""
         for waiter in self._waiters:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
 
     def on_suspect(self, reason: str) -> None:
-        """Drop every byte, given out or not; whoever waits asks again."""
+        """Drop every byte, given out or not; reads that wait ask again."""
         if self.doubted:
             return
         self.doubted = True
@@ -286,17 +291,17 @@ class Version:
         for index in list(self._blocks):
             self.evict(index)
         self.ask_again()
-        self._cache.on_dropped(self)
+        self._on_dropped(self)
 
     def on_failed(self, error: Exception) -> None:
-        """Those who wait get the error; later reads ask again."""
+        """Reads that wait get the error; later ones ask again."""
         for waiter in self._waiters:
             if not waiter.done.is_set():
                 waiter.error = error
                 waiter.done.set()
 
     def ask_again(self) -> None:
-        """Those who wait look again, and ask anew for what is missing: their reader is gone."""
+        """Reads that wait look again, and ask anew for what is missing: their reader is gone."""
         for waiter in self._waiters:
             waiter.done.set()
 

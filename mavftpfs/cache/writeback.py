@@ -139,7 +139,7 @@ class Writeback:
                 if made and node.handles:
                     # A program has a file open that others removed: it must not read the one made now.
                     context.nodes.replaced(node)
-                    context.files.end(path)
+                    context.files.kill_all(path)
                     node = context.nodes.need(path)
                 if made:
                     node.begin_draft(context.spool, None, context.clock())

@@ -182,7 +182,7 @@ class _Life:
         self._started = time.time()
 
     def fail(self, error: MavftpfsError) -> None:
-        """The vehicle failed: tell whoever waits for the mount, or else the log."""
+        """The vehicle failed: tell the command that waits for the mount, or else the log."""
         self.code = exit_code_for(error)
         if self.mounted:
             log.error("unmounted: %s", error)
@@ -224,7 +224,7 @@ class _Life:
             nursery.start_soon(invalidator.run)
             gc.collect()
             gc.freeze()  # a full collection would look through all that was imported, in mid-transfer
-            # Said by a mount that then failed, it would be lost: what was moved is not found a second time.
+            # Move old files only now. If mounting failed afterwards, nobody would hear where they are.
             self.report(0, notice())
             with trio.CancelScope() as self._loop_scope:
                 if not self._stop_asked:

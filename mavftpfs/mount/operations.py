@@ -6,7 +6,7 @@ killed; trio.Cancelled passes.
 
 Inodes are touched only between awaits: reserve, reply and count form one atomic step.
 
-flush is called for every closed descriptor, whoever wrote (pyfuse3 tells no owner), so it asks the handle:
+flush is called for every closed descriptor, also of programs that wrote nothing, so it asks the handle:
 one that was opened for reading has nothing to say. fsync is asked for by name, and is about the file: any
 handle will do (`sync FILE` opens for reading). release cannot report; what it finds undelivered stays with
 the tree. A mount with `ro` is refused changes by the kernel, and by the tree.
@@ -439,7 +439,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def unlink(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
-        """Remove a file; who has it open keeps it."""
+        """Remove a file; programs that have it open keep it."""
         path = self._child(parent_inode, name)
         await self._tree.unlink(path)
         self._gone(path)

@@ -13,6 +13,7 @@ from mavftpfs.session.scheduler import RECENT, Scheduler, SessionUser
 from mavftpfs.session.serversession import OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 
 STALL = 2.0
 """Seconds without any reply during a read after which the server's session is no longer believed in."""
@@ -176,10 +177,11 @@ class FileStream(SessionUser):
         awaited = self._wants_open
         if session is None or not self.goes_on(session):
             session = await server.open(self.path)
-        if session.size is None or (self.opened.is_set() and session.size < self.size):
+        if session.size is None:
             await server.close_quietly()
-            if session.size is None:
-                raise RemoteProtocolError("the vehicle's open reply holds no size")
+            raise RemoteProtocolError("the vehicle's open reply holds no size")
+        if self.opened.is_set() and compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
+            await server.close_quietly()
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
         self._wants_open = False
         if not self.opened.is_set():

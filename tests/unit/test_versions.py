@@ -192,8 +192,7 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
 async def test_all_bytes_are_dropped_in_doubt_and_none_taken_before_a_new_reader_is_there() -> None:
     cache = make_cache()
     told: list[Version] = []
-    blocks = Version(cache, b"/f", 3 * BLOCK_SIZE)
-    cache.on_dropped = told.append
+    blocks = Version(cache, b"/f", 3 * BLOCK_SIZE, on_dropped=told.append)
     deliver(blocks, 0, content(2 * BLOCK_SIZE))
     old = blocks.get(0, 20)
     assert old is not None
