@@ -35,7 +35,8 @@ BEAT_PERIOD = 0.5
 MEMORY = 60.0
 """Seconds for which a place that fell silent still gets what goes to all."""
 _MOST_PLACES = 64
-_MOST_SENDERS = 256
+_MOST_SENDERS = 64
+"""Of one side."""
 _MOST_PLANS = 4096
 
 
@@ -154,7 +155,8 @@ class Router:
             if not frame.proven:
                 return before == where
             if not book.accepts(sender, where, now):
-                self.doubles[sender] = where
+                if len(self.doubles) < _MOST_SENDERS:
+                    self.doubles[sender] = where
                 return False
             if before != where:
                 self._plans.clear()
@@ -165,11 +167,26 @@ class Router:
         if places is not None and place in places:
             places[place] = now
             return True
-        if not frame.proven or len(self._elsewhere) >= _MOST_SENDERS:
+        if not frame.proven:
             return False
+        self._make_room(place.side)
         self._elsewhere.setdefault(sender, {})[place] = now
         self._plans.clear()
         return True
+
+    def _make_room(self, side: int) -> None:
+        """Forget the sender that was silent for longest, where a side has too many: it makes them up."""
+        heard = [
+            (at, sender, place)
+            for sender, places in self._elsewhere.items()
+            for place, at in places.items()
+            if place.side == side
+        ]
+        if len(heard) >= _MOST_SENDERS:
+            _, sender, place = min(heard, key=lambda one: one[0])
+            del self._elsewhere[sender][place]
+            if not self._elsewhere[sender]:
+                del self._elsewhere[sender]
 
     def _welcome(self, address: NetAddress | None, side: _Side, now: float) -> None:
         """Note a new address of a side, and forget those that fell silent."""
@@ -247,7 +264,7 @@ class Router:
     def _is_beat_due(self, sender: Address, now: float) -> bool:
         if now - self._beats.get(sender, float("-inf")) < BEAT_PERIOD:
             return False
-        if len(self._beats) >= _MOST_SENDERS:
+        if len(self._beats) >= _MOST_PLANS:
             self._beats.clear()
         self._beats[sender] = now
         return True

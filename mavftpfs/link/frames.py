@@ -1,15 +1,15 @@
 """Whole frames and what their headers say, for programs that pass them on. Layer: link; pure.
 
 A frame is passed on as it came, byte for byte. What is read of it: its bounds, its sender, its target and its
-kind. Frames of unknown dialects pass, too. A frame with a wrong CRC may be one of another dialect: it passes,
-but nothing is learned from it.
+kind. Frames of other dialects have a CRC that cannot be checked, or that is wrong by ours. They pass, but
+nothing is learned from them: rubbish looks the same.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from mavftpfs.link.framing import TARGETS, Verdict, frame_at
+from mavftpfs.link.framing import TARGETS, Verdict, frame_at, is_known
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_MODE_FLAG_SAFETY_ARMED, Address
 
 HEARTBEAT_ID = 0
@@ -21,7 +21,7 @@ EVERYBODY = Address(0, 0)
 class Frame(NamedTuple):
     """One frame.
 
-    target: EVERYBODY where it names none. proven: its CRC fits, or none is known for its kind.
+    target: EVERYBODY where it names none. proven: its CRC fits.
     """
 
     data: bytes
@@ -80,7 +80,8 @@ class Splitter:
             if verdict is Verdict.GARBAGE:
                 self.garbage += stop - position
             else:
-                out.append(_frame(data[position:stop], message_id, proven=verdict is Verdict.WHOLE))
+                proven = verdict is Verdict.WHOLE and is_known(message_id)
+                out.append(_frame(data[position:stop], message_id, proven=proven))
             position = stop
         self._tail = data[position:]
         self.waiting = self._stream and bool(self._tail)

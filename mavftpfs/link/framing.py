@@ -85,6 +85,11 @@ TARGETS = _target_offsets()
 """Of each message that is for somebody: where in its payload the system and the component stand."""
 
 
+def is_known(message_id: int) -> bool:
+    """Return whether the CRC of a message's frames can be checked: it is in the dialect."""
+    return message_id in _CRC_EXTRA
+
+
 class Verdict(Enum):
     """What begins at a place in what was received."""
 

@@ -33,7 +33,7 @@ from mavftpfs.mount.handles import InodeTable
 from mavftpfs.mount.kernel import Invalidator, MountRequest, fuse_loop, kernel_mount, presentation
 from mavftpfs.mount.root import RootOperations
 from mavftpfs.mount.roster import Member, Roster, State
-from mavftpfs.session.connection import connected
+from mavftpfs.session.connection import connected, signing_now
 from mavftpfs.shared.errors import ExitCode, FtpNak, MavftpfsError, MountFailed, exit_code_for
 from mavftpfs.shared.model import ROOT
 
@@ -57,7 +57,9 @@ def run_all(request: MountRequest, command: Command, report: Report) -> int:
 
 class _Supervisor:
     def __init__(self, request: MountRequest, command: Command, report: Report) -> None:
-        self._request = request
+        # The root refuses by itself; fusermount3 mounts only where the user may write.
+        client = replace(request.options.client, read_only=False)
+        self._request = replace(request, options=replace(request.options, client=client))
         self._command = command
         self._report = report
         self._roster = Roster()
@@ -121,7 +123,9 @@ class _Supervisor:
         """Note who is there. Our own heartbeats are for bridges that answer only whoever speaks."""
         options = self._request.options.client
         own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
-        framer = Framer(own, stream=False)
+        key = connect_options(options).signing_key
+        framer = Framer(own, stream=False, signing_key=key, signing_clock=signing_now)
+        framer.link_id = 0 if link.seat is None else link.seat.number
 
         async def beat() -> None:
             while options.heartbeat != "none":

@@ -134,7 +134,7 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
         assert flown.stop() == 0
         heard = recorded(station.record, "<")
         sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
-        assert_passed_on(sent, heard, 300)
+        assert_passed_on(sent, heard, 50)
         said = recorded(station.record, ">")
         came = [frame for frame in recorded(flown.record, "<") if frame.source.system != OURS]
         assert [frame.data for frame in said] == [frame.data for frame in came]
@@ -175,7 +175,7 @@ def test_signed_frames_pass_unchanged(field: Field) -> None:
         assert len(links) == 2
         assert len(set(links.values())) == 2, "each of ours has a link id of its own"
         sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
-        assert_passed_on(sent, recorded(station.record, "<"), 200)
+        assert_passed_on(sent, recorded(station.record, "<"), 50)
 
 
 # -- stations that do harm --------------------------------------------------------------------------

@@ -248,6 +248,24 @@ def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
     assert not net.router.taken(Address(77, 1), net.now)
 
 
+def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
+    for number in range(500):
+        net.send(attitude(Address(10 + number % 200, 1 + number // 200)), WEST, ("127.0.0.1", 40))
+        net.now += 0.001
+    assert net.router.taken(STATION, net.now)
+    assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None)}
+    late = Address(255, 77)
+    net.send(beat(late, autopilot=8), EAST)
+    assert net.send(ftp(ONE, late), PORT, AT_ONE) >= {Place(EAST, None)}
+
+
+def test_what_cannot_be_proven_makes_nobody_known(net: Net) -> None:
+    rubbish = parsed(foreign(Address(99, 1), 54_321))
+    assert net.sides(rubbish, WEST, ("127.0.0.1", 40)) == set()
+    assert not net.router.taken(Address(99, 1), net.now)
+    assert EAST in net.sides(parsed(foreign(ONE, 54_321)), PORT, AT_ONE), "the vehicle itself is known"
+
+
 def test_who_left_is_forgotten(net: Net) -> None:
     net.router.remove(EAST)
     assert net.sides(ftp(ONE, STATION), PORT, AT_ONE) == {MOUNT}
