@@ -29,6 +29,7 @@ _PLACES = {
     "locals": _FILE,
     "local": _DIRECTORY,
     "to": _FILE,
+    **dict.fromkeys(("load", "save", "diff"), _FILE),
     "directory": _DIRECTORY,
     "options": _LIST,
 }

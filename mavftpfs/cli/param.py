@@ -134,7 +134,11 @@ async def _save(args: Args, session: Session) -> int:
 
 
 async def _diff(args: Args, lines: Sequence[Line], session: Session) -> int:
-    found = client.compare(lines, await client.read_parameters(session))
+    current = await client.read_parameters(session)
+    lines, others = await client.split_by_component(session, lines)
+    if others:
+        verbs.say(f"left out: {_of_others(others)}")
+    found = client.compare(lines, current)
     if args.json:
         facts = [{"name": one.name, "vehicle": one.vehicle, "file": one.file} for one in found]
         print(json.dumps(facts, indent=2))
@@ -142,6 +146,11 @@ async def _diff(args: Args, lines: Sequence[Line], session: Session) -> int:
         for line in _difference_lines(found):
             print(line)
     return ExitCode.USAGE if found else ExitCode.OK
+
+
+def _of_others(lines: Sequence[Line]) -> str:
+    components = ", ".join(sorted({str(line.component) for line in lines}))
+    return f"{len(lines)} line(s) of component {components}"
 
 
 def _difference_lines(found: Sequence[Difference]) -> list[str]:
@@ -212,7 +221,12 @@ class _Setting:
         self.bar.begin("reading the parameters", 0)
         with drawing.shown(self.bar):
             current = await client.read_parameters(session)
-        return client.wish(self.lines, current, self.name, meant=self.meant)
+            lines, others = await client.split_by_component(session, self.lines)
+        if others and not self.args.skip_unknown:
+            raise InvalidText(f"{_of_others(others)}; --skip-unknown leaves them out")
+        if others and not self.done:
+            verbs.say(f"left out: {_of_others(others)}")
+        return client.wish(lines, current, self.name, meant=self.meant)
 
     def _require_known(self, wish: Wish) -> None:
         """Say which names the vehicle does not have.

@@ -95,6 +95,23 @@ async def _read(session: Session, name: bytes) -> bytes:
         raise NotFound(f"this vehicle has no parameters in MAVLink FTP{part}") from exc
 
 
+async def split_by_component(
+    session: Session, lines: Sequence[Line]
+) -> tuple[Sequence[Line], Sequence[Line]]:
+    """Return the lines that are of this vehicle's component, and those of others: QGroundControl saves all in
+    one file, and names may be the same.
+
+    Raises:
+        As read_text.
+    """
+    if all(line.component is None for line in lines):
+        return lines, []
+    told = next(iter(parse(await read_text(session, QGC))[0]), None)
+    component = None if told is None else told.component
+    others = [line for line in lines if line.component not in (None, component)]
+    return [line for line in lines if line not in others], others
+
+
 def matching(parameters: Sequence[Parameter], patterns: Sequence[str]) -> list[Parameter]:
     """Return those whose names match a pattern, in whichever case; all if there is no pattern.
 

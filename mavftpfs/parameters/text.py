@@ -29,14 +29,15 @@ _QGC_FIELDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line that sets a parameter. number: of the line, from 1. system: of a QGroundControl line, else
-    None.
+    """A line that sets a parameter. number: of the line, from 1. system, component: of a QGroundControl line,
+    else None.
     """
 
     number: int
     name: str
     value: Number
     system: int | None = None
+    component: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,7 @@ def _parse_line(number: int, content: str, component: int | None) -> Line:
             raise BadValue(f"{name} is a parameter of component {of}, and this is component {component}")
         if not kind.isdecimal():
             raise BadValue(f"{kind!r} is not a type")
-        return Line(number, name, parse_number(value), int(system))
+        return Line(number, name, parse_number(value), int(system), int(of))
     fields = _BETWEEN.split(content)
     if len(fields) != 2:
         raise BadValue(f"{content!r} is not NAME,VALUE")

@@ -114,6 +114,14 @@ def test_bad_lines_of_a_file_are_all_named(source: str, tmp_path: Path) -> None:
     assert [line.partition("bad.parm")[2][:4] for line in lines] == [":1: ", ":3: "]
 
 
+def test_lines_of_other_components_are_left_out_or_an_error(source: str, tmp_path: Path) -> None:
+    file = tmp_path / "both.params"
+    file.write_text("1\t1\tRTL_ALT\t1500\t6\n1\t154\tRTL_ALT\t99\t6\n".replace("\t99\t6", "\t1500\t6"))
+    assert "1 line(s) of component 154" in said(source, "--load", file, code=1)
+    assert "left out: 1 line(s) of component 154" in said(source, "--load", file, "--skip-unknown")
+    assert param(source, "--diff", file) == []
+
+
 @pytest.mark.parametrize(("answer", "code"), [("y\r", 0), ("n\r", 1), ("\r", 1)])
 def test_on_a_terminal_it_asks_before_it_sets_several(source: str, answer: str, code: int) -> None:
     words = ["RTL_ALT=1800", "WPNAV_SPEED=800"]
