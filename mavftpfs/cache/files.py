@@ -119,7 +119,7 @@ class Files:
         keep_cache, direct_io = same and version.shown, False
         for other in self.open_versions:
             if other.path == path and other is not version:
-                direct_io |= not other.replaced or other.lost
+                direct_io |= not other.replaced or other.by_others
         version.shown = not direct_io  # the kernel may fetch pages for programs that read an older version
         version.handles += 1
         self.open_versions[version] = None
@@ -302,13 +302,13 @@ class Files:
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
-        """The file was replaced: this version, and all older ones of its path, are dead."""
-        lost = not self.is_changing(version.path)
+        """The file was replaced: so are this version and all older ones of its path."""
+        by_others = not self.is_changing(version.path)
         newest = self._current.get(version.path) is version
         older = [v for v in self.open_versions if newest and v.path == version.path]
         for one in dict.fromkeys((version, *older)):
             if not one.replaced:
-                one.lost = lost
+                one.by_others = by_others
                 one.replace(f"{one.path!r} changed on the vehicle after it was opened")
                 self._invalidate(one.path)
 
@@ -341,12 +341,12 @@ class Files:
         version = self._current.get(path)
         if version is None or version.replaced or not version.complete:
             return None
-        alone = all(v is version or v.lost for v in self.open_versions if v.path == path)
+        alone = all(v is version or v.by_others for v in self.open_versions if v.path == path)
         return version if alone and self._is_sure(version) else None
 
-    def was_lost(self, path: bytes) -> bool:
+    def others_replaced(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
-        return any(v.path == path and v.lost for v in self.open_versions)
+        return any(v.path == path and v.by_others for v in self.open_versions)
 
     def kill_all(self, path: bytes) -> None:
         """Programs that have a file of that path open must not read what we are about to write there."""
@@ -465,9 +465,9 @@ class VersionHandle(OpenFile):
                 await trio.sleep(pause)
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
-    def require_not_lost(self) -> None:
+    def require_not_replaced_by_others(self) -> None:
         """Raise FileChanged if the file became another one by somebody else's doing."""
-        if self._version.lost:
+        if self._version.by_others:
             self._version.require_not_replaced()
 
     def close(self) -> None:

@@ -135,7 +135,7 @@ class Tree:
             return await (self._virtual.stat(remote) if texts is None else texts.stat(split(remote)[1]))
         if self._local.owns(remote):
             return self._local.stat(remote)
-        self._require_not_hidden(remote)
+        self._require_not_reserved(remote)
         node = self._context.nodes.get(remote)
         if node is not None and node.draft is not None:
             return self._draft_stat(remote, node.draft)
@@ -227,7 +227,7 @@ class Tree:
             return await self._writing.open(remote, truncate=truncate)
         if remote == self._options.root:
             raise IsADirectory("the mount's root is a directory")
-        self._require_not_hidden(remote)
+        self._require_not_reserved(remote)
         return await self._writing.open_reader(remote)
 
     async def crc32(self, path: bytes) -> int:
@@ -480,7 +480,7 @@ class Tree:
     def _texts_of(self, remote: bytes) -> Texts[Any] | None:
         return next((texts for texts in self._texts if texts.owns(remote)), None)
 
-    def _require_not_hidden(self, remote: bytes) -> None:
+    def _require_not_reserved(self, remote: bytes) -> None:
         if is_reserved(split(remote)[1]) and not self._options.read_only:
             raise NotFound(f"{remote!r} is a name of our own")
 

@@ -2,8 +2,8 @@
 
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
 one version share its bytes and its remote reader. When the file turns out to have become another one the
-version is REPLACED: its handles get FileChanged, and later opens start a new version. If somebody else
-replaced it the version is `lost`: its handles never get what has the path now, even if we wrote that.
+version is REPLACED: its handles get FileChanged, and later opens start a new version. If it was
+replaced by others, its handles never get what has the path now, even if we wrote that.
 
 A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
@@ -162,7 +162,7 @@ class Version:
         known_at: when the path was last known to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the session that bytes come from now.
         compare_after: no listing is asked for before, only to compare.
-        lost: somebody else replaced it.
+        by_others: somebody else replaced it.
         reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
             local disk, if it may have one. shown: the kernel may hold pages of it, and all of them are good.
         doubted: what comes from the present reader is ignored, until a new one is opened.
@@ -187,7 +187,7 @@ class Version:
         self.state = VersionState.CURRENT
         self.known_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
-        self.ours = self.given = self.lost = self.shown = self.doubted = False
+        self.ours = self.given = self.by_others = self.shown = self.doubted = False
         self.kept: Kept | None = None
         self.drops = 0
         self._why = ""

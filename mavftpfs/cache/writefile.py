@@ -68,7 +68,7 @@ class ReadFile(OpenFile):
     def direct_io(self) -> bool:
         """Whether the kernel's pages could come from, or go to, who has another file of the path open."""
         path = self._node.path
-        if self._context.nodes.has_another(path) or self._context.files.was_lost(path):
+        if self._context.nodes.has_another(path) or self._context.files.others_replaced(path):
             return True
         return self._node.draft is None and self._handle is not None and self._handle.direct_io
 
@@ -153,7 +153,7 @@ class ReadFile(OpenFile):
         node = self._node
         handle = self._handle
         if handle is not None:
-            handle.require_not_lost()
+            handle.require_not_replaced_by_others()
         if node.draft is not None:
             return await self._read_draft(node.draft, offset, offset + size)
         if handle is not None:
