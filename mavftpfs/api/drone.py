@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
 from mavftpfs.api import vehicle
 from mavftpfs.api.errors import NotDelivered, UsageError
+from mavftpfs.api.params import Params
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
 from mavftpfs.api.vehicle import Entry, PathLike
@@ -129,6 +130,21 @@ class Drone:
     def refresh(self) -> None:
         """Have the vehicle asked again for what is remembered of it; others may have changed it."""
         self._loop.call(self._drone.refresh)
+
+    # --- parameters
+
+    @property
+    def params(self) -> Params:
+        """The vehicle's parameters, a mapping: `drone.params["MPC_XY_CRUISE"] = 4.5`."""
+        return Params(self.get_params, self.set_params)
+
+    def get_params(self) -> dict[str, int | float]:
+        """Return all parameters, in the vehicle's order."""
+        return self._loop.call(self._drone.get_params)
+
+    def set_params(self, values: Mapping[str, int | float]) -> None:
+        """Set parameters; each is read back."""
+        self._loop.call(self._drone.set_params, values)
 
     # --- changing names
 

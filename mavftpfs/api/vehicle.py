@@ -13,6 +13,7 @@ from typing import Any
 
 import trio
 
+from mavftpfs.api import params
 from mavftpfs.api.errors import os_error, translated
 from mavftpfs.api.opened import Opened
 from mavftpfs.api.portal import TaskPortal
@@ -180,6 +181,22 @@ class Drone:
     async def refresh(self) -> None:
         """Have the vehicle asked again for what is remembered of it; others may have changed it."""
         self._files.forget_caches()
+
+    # --- parameters
+
+    async def get_params(self) -> dict[str, int | float]:
+        """Return all parameters, in the vehicle's order.
+
+        Raises:
+            FileNotFoundError: it does not show them by MAVLink FTP.
+        """
+        with translated():
+            return await params.get_values(self._session)
+
+    async def set_params(self, values: Mapping[str, int | float]) -> None:
+        """Set parameters; each is read back. See api.params.Params.update."""
+        with translated():
+            await params.set_values(self._session, values)
 
     # --- changing names
 
@@ -394,7 +411,7 @@ class Drone:
 
 async def _opened_or_made(files: Files, path: bytes) -> File:
     try:
-        return await files.open(path, write=True)
+        return await files.open(path, write=True, append=True)
     except NotFound:
         return await files.create(path, exclusive=False)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy
 import pytest
 
 import mavftpfs
@@ -222,6 +223,31 @@ def test_a_second_vehicle_beside(shared: mavftpfs.Drone, card: Path, field: Fiel
         shared.write_bytes(f"/{card.name}/f", b"one")
         assert (second.read_bytes("/APM/f"), shared.read_bytes(f"{card.name}/f")) == (b"two", b"one")
         assert second.status()["vehicle"]["autopilot"] == "ArduPilot"
+
+
+@pytest.mark.parametrize("profile", ["px4-2026", "ardupilot"])
+def test_parameters(field: Field, profile: str) -> None:
+    with mavftpfs.connect(field.sim(field.local("card"), profile).source) as drone:
+        before = dict(drone.params)
+        assert len(drone.params) == len(before) > 20
+        name = next(name for name, value in before.items() if isinstance(value, float) and 1 < value < 5000)
+        other = next(name for name, value in before.items() if isinstance(value, int) and 1 < value < 5000)
+        drone.params[name] = before[name] + 0.5
+        drone.params.update({name: numpy.float64(before[name] + 0.1), other: before[other] + 1})
+        assert drone.params[name] == round(before[name] + 0.1, 6)
+        assert drone.params[other] == before[other] + 1
+        for bad in ({"NO_SUCH": 1}, {name: "much"}, {name: True}):
+            with pytest.raises(ValueError, match=r"NO_SUCH|is a number"):
+                drone.set_params(bad)  # type: ignore[arg-type]
+        with pytest.raises(OSError, match=r"fit|whole"):
+            drone.params[other] = 0.5
+        with pytest.raises(KeyError):
+            drone.params["NO_SUCH"]
+
+
+def test_a_vehicle_without_parameters_in_ftp(shared: mavftpfs.Drone) -> None:
+    with pytest.raises(FileNotFoundError, match="no parameters in MAVLink FTP"):
+        dict(shared.params)
 
 
 # -- connecting -----------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ LAYERS: dict[str, set[str]] = {
     "cli": {
         *("shared", "protocol", "link", "parameters", "cache", "session", "client", "mount", "hub", "sim")
     },
-    "api": {"shared", "protocol", "link", "cache", "session", "client"},
+    "api": {"shared", "protocol", "link", "parameters", "cache", "session", "client"},
     "__init__": {"api"},
     "trio": {"api"},
 }

@@ -1,0 +1,104 @@
+"""A vehicle's parameters for programs: a mapping of names to numbers. Layer: api."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, ValuesView
+from numbers import Integral, Real
+
+from mavftpfs.client import parameters as client
+from mavftpfs.client.files import Session
+from mavftpfs.client.progress import Progress
+from mavftpfs.parameters.values import Kind, Parameter
+from mavftpfs.shared.errors import NotTaken, UsageError
+
+Number = int | float
+
+
+async def get_values(session: Session) -> dict[str, Number]:
+    """Return all parameters, in the vehicle's order.
+
+    Raises:
+        As client.parameters.read_parameters.
+    """
+    return {one.name: _number(one) for one in await client.read_parameters(session)}
+
+
+def _number(one: Parameter) -> Number:
+    """Return a value; of a 32-bit float the shortest decimal that gives it: 0.1, not 0.10000000149."""
+    text = client.value_text(one)
+    return float(text) if one.kind is Kind.FLOAT else int(text)
+
+
+def _text(name: str, value: Number) -> str:
+    """Return a number as text, also one of numpy's."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise UsageError(f"{name} is a number, not {value!r}")
+    return repr(int(value) if isinstance(value, Integral) else float(value))
+
+
+async def set_values(session: Session, values: Mapping[str, Number]) -> None:
+    """Set parameters; each is read back. Those that hold already are not sent.
+
+    Raises:
+        UsageError: a name that the vehicle does not have, or a value that is no number: nothing is set.
+        InvalidText: one that does not fit: likewise. NotTaken: some do not hold; the text names them.
+    """
+    lines = client.assignments([f"{name}={_text(name, value)}" for name, value in values.items()])
+    wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
+    if wish.unknown:
+        raise UsageError(f"no parameter is called {', '.join(line.name for line in wish.unknown)}")
+    if not wish.changes:
+        return
+    try:
+        await client.set_values(session, wish.changes, Progress())
+    except NotTaken as exc:
+        told = [line.removeprefix("# ") for line in await client.last_error(session)]
+        raise NotTaken("; ".join([str(exc), *told])) from exc
+
+
+class Params(Mapping[str, Number]):
+    """The parameters of a Drone. Each look at one asks for all, which takes a moment: `dict(drone.params)` is
+    for many. Setting one, or several by `update`, is back when the vehicle has it, read back."""
+
+    def __init__(
+        self, read: Callable[[], dict[str, Number]], write: Callable[[Mapping[str, Number]], None]
+    ) -> None:
+        self._read = read
+        self._write = write
+
+    def __getitem__(self, name: str) -> Number:
+        """Return a value. Raises KeyError."""
+        return self._read()[name]
+
+    def __setitem__(self, name: str, value: Number) -> None:
+        """Set a value; see update."""
+        self._write({name: value})
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names, in the vehicle's order."""
+        return iter(self._read())
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._read())
+
+    def keys(self) -> KeysView[str]:
+        """Return the names, by one look."""
+        return self._read().keys()
+
+    def items(self) -> ItemsView[str, Number]:
+        """Return names and values, by one look."""
+        return self._read().items()
+
+    def values(self) -> ValuesView[Number]:
+        """Return the values, by one look."""
+        return self._read().values()
+
+    def update(self, values: Mapping[str, Number]) -> None:
+        """Set several at once.
+
+        Raises:
+            UsageError (a ValueError), OSError of EINVAL: a name or value cannot be, and nothing is set.
+            OSError: some do not hold on the vehicle, and the text names them; EROFS: it is armed.
+        """
+        self._write(values)
