@@ -173,7 +173,7 @@ def umount(args: argparse.Namespace) -> int:
             raise MountFailed(f"no vehicle is mounted on {place}") from exc
         codes = [_umount_below(path, args) for path in mountpoint.ours_below(place)]
         mountpoint.unmount(place, lazy=args.lazy)
-        return max(*codes, _after_a_killed_mount(), key=int)
+        return max([*codes, _after_a_killed_mount()])
     except KeyboardInterrupt:
         print("mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status", file=sys.stderr)
         return ExitCode.INTERRUPTED

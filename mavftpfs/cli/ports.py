@@ -80,7 +80,9 @@ def status_lines(facts: Status) -> Iterator[str]:
     """Yield the lines of one hub."""
     armed = facts["armed"]
     flying = f", ARMED: {', '.join(map(str, armed))}" if armed else ""
-    yield f"{facts['source']}: shared by {len(facts['clients'])}{flying}"
+    count = len(facts["clients"])
+    shared = f"shared by {count}" if count else "kept for a ground station"
+    yield f"{facts['source']}: {shared}{flying}"
     for client in facts["clients"]:
         system, component = client["address"]
         yield f"  {client['name'] or 'a program'} as {system}/{component}"

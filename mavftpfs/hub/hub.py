@@ -53,7 +53,7 @@ _RETRY = 2.0
 _MESSAGES = 64
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
-_NO_UART = "/dev/ttyACM"
+_USB = "/dev/ttyACM"
 _MOST_SPLITTERS = 64
 
 
@@ -105,8 +105,9 @@ class Hub:
         self._came = trio.Event()
         self._work = trio.Event()
         serial = spec.kind is LinkKind.SERIAL
-        baud = spec.baud if serial and not spec.device.startswith(_NO_UART) else None
-        self._line = Line(baud)
+        # The baud rate of a USB port means nothing; its symbolic links are under /dev/serial.
+        is_line = serial and not os.path.realpath(spec.device).startswith(_USB)
+        self._line = Line(spec.baud if is_line else None)
         self._outbox = Outbox(max(_LEAST_OUTBOX, spec.baud // 10) if serial else _OUTBOX)
         self._said_doubles: set[Address] = set()
 
@@ -339,9 +340,9 @@ class Hub:
                     splitter = splitters[key] = Splitter(stream=False)
                 place = Place(side, address)
                 frames += [(place, frame) for frame in splitter.feed(chunk)]
-            if frames:
+            if any(frame.proven for _, frame in frames):
                 link.keep_peer()
-                self._pass_on(frames, forwarded=forwarded)
+            self._pass_on(frames, forwarded=forwarded)
 
     def _on_reopened(self, side: int, splitters: dict[NetAddress | None, Splitter]) -> None:
         for splitter in splitters.values():
