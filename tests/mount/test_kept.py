@@ -49,8 +49,9 @@ def read_and_keep(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path
 def check_cost(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path, **expected: int) -> Mount:
     """Compare all files with the card in a new mount; return it. expected: how many files it has to open for
     that, and so on; more only where it repeated requests, because the machine was too busy to answer."""
-    mark = vehicle.asked()
     mount = field.mount(vehicle.source, f"cache_dir={cache}")
+    Counting(vehicle, mount).settle()  # it looks once whether there are parameters
+    mark = vehicle.asked()
     read_all(mount, logs)
     counts = vehicle.cost_since(mark).counts
     asked = Counter({name: counts[name] for name in ("open", "read", "burst", "crc") if counts[name]})

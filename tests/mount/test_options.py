@@ -94,7 +94,8 @@ def test_every_payload_is_printed_and_recorded_decoded(
     assert sorted(times) == times
     assert abs((datetime.now(UTC) - times[0]).total_seconds()) < 600
     opened = [record for record in records if record["opcode"] == "OPEN_FILE_RO"]
-    assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin"}
+    looked_for = b"@PARAM/param.pck"  # once, by the mount
+    assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin", looked_for}
     answered = {record.get("req_opcode") for record in records if record["dir"] == "reply"}
     assert {"LIST_DIRECTORY", "OPEN_FILE_RO", "READ_FILE", "TERMINATE_SESSION"} <= answered
 
