@@ -14,6 +14,7 @@ from typing import IO, Any
 
 from mavftpfs.api import vehicle
 from mavftpfs.api.errors import NotDelivered, UsageError
+from mavftpfs.api.opened import Opened
 from mavftpfs.api.params import Params
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
@@ -200,9 +201,19 @@ class Drone:
         Raises:
             FileNotFoundError, FileExistsError, IsADirectoryError ... ValueError: of the mode.
         """
-        how = Mode(mode)
-        opened = self._loop.call(self._drone.open_raw, path, how.plain)
-        return python_file(opened, self._loop, how, buffering, encoding, errors, newline)
+        how = Mode(mode, buffering, encoding, errors, newline)
+        opened: list[Opened] = []
+
+        async def work() -> None:
+            opened.append(await self._drone.open_raw(path, how.plain))
+
+        try:
+            self._loop.call(work)
+        except BaseException:  # Ctrl-C may come when it is open already
+            for one in opened:
+                self._loop.post(one.abandon)
+            raise
+        return python_file(opened[0], self._loop, how, owner=self)
 
     def read_bytes(self, path: PathLike) -> bytes:
         """Return a file's content."""

@@ -7,6 +7,7 @@ without having been closed: the raw file posts that it is to be abandoned, and s
 
 from __future__ import annotations
 
+import codecs
 import errno
 import io
 import logging
@@ -26,26 +27,37 @@ WRITE_BUFFER = 128 * 1024
 
 
 class Mode:
-    """A mode of open(), taken apart.
+    """The arguments of open(), checked before anything is opened.
 
     Attributes:
         plain: r, w, a or x, and perhaps +. text: whether it is opened as text.
     """
 
-    def __init__(self, mode: str) -> None:
-        """Raises: ValueError: it is none."""
+    def __init__(
+        self,
+        mode: str,
+        buffering: int = -1,
+        encoding: str | None = None,
+        errors: str | None = None,
+        newline: str | None = None,
+    ) -> None:
+        """Raises: ValueError, LookupError: they cannot be, or contradict one another."""
         letters = set(mode)
-        self.plain = "".join(letter for letter in mode if letter in "rwax+")
         kinds = letters & set("rwax")
-        if (
-            len(letters) != len(mode)
-            or not letters <= set("rwaxbt+")
-            or len(kinds) != 1
-            or {"b", "t"} <= letters
-        ):
+        known = len(letters) == len(mode) and letters <= set("rwaxbt+")
+        if not known or len(kinds) != 1 or {"b", "t"} <= letters:
             raise ValueError(f"invalid mode: {mode!r}")
         self.plain = kinds.pop() + ("+" if "+" in letters else "")
         self.text = "b" not in letters
+        if not self.text and (encoding, errors, newline) != (None, None, None):
+            raise ValueError("binary mode takes no encoding, errors or newline argument")
+        if self.text and buffering == 0:
+            raise ValueError("can't have unbuffered text I/O")
+        if newline not in (None, "", "\n", "\r", "\r\n"):
+            raise ValueError(f"illegal newline value: {newline!r}")
+        self.encoding = encoding or "utf-8"
+        codecs.lookup(self.encoding)
+        self.buffering, self.errors, self.newline = buffering, errors, newline
 
     @property
     def reads(self) -> bool:
@@ -78,8 +90,10 @@ class RawFile(_Ending, io.RawIOBase):
         name, mode: as of io.FileIO.
     """
 
-    def __init__(self, opened: Opened, portal: Portal, mode: Mode) -> None:
+    def __init__(self, opened: Opened, portal: Portal, mode: Mode, owner: object = None) -> None:
+        """`owner` lives as long as this file."""
         super().__init__()
+        self._owner = owner
         self.name = opened.name
         self.mode = mode.plain + "b"
         self._opened = opened
@@ -206,33 +220,16 @@ class _Text(_Ending, io.TextIOWrapper):
         """As RawFile's, which follows: Python's would deliver, and wait."""
 
 
-def python_file(
-    opened: Opened,
-    portal: Portal,
-    mode: Mode,
-    buffering: int = -1,
-    encoding: str | None = None,
-    errors: str | None = None,
-    newline: str | None = None,
-) -> IO[Any]:
-    """Return what the builtin open() would.
-
-    Raises:
-        ValueError: the arguments contradict one another.
-    """
-    if not mode.text and (encoding, errors, newline) != (None, None, None):
-        raise ValueError("binary mode takes no encoding, errors or newline argument")
-    if mode.text and buffering == 0:
-        raise ValueError("can't have unbuffered text I/O")
-    raw: Any = RawFile(opened, portal, mode)
-    if buffering == 0:
+def python_file(opened: Opened, portal: Portal, mode: Mode, *, owner: object = None) -> IO[Any]:
+    """Return what the builtin open() would; `owner` lives as long as it."""
+    raw: Any = RawFile(opened, portal, mode, owner)
+    if mode.buffering == 0:
         return raw  # type: ignore[no-any-return]
-    lines = buffering == 1 and mode.text
-    size = buffering if buffering > 1 else WRITE_BUFFER if mode.writes else READ_BUFFER
+    size = mode.buffering if mode.buffering > 1 else WRITE_BUFFER if mode.writes else READ_BUFFER
     kind = _Random if mode.reads and mode.writes else _Writer if mode.writes else _Reader
     buffered: Any = kind(raw, size)
     if not mode.text:
         return buffered  # type: ignore[no-any-return]
-    text = _Text(buffered, encoding or "utf-8", errors, newline, lines)
+    text = _Text(buffered, mode.encoding, mode.errors, mode.newline, mode.buffering == 1)
     text.mode = mode.plain  # type: ignore[misc]
     return text

@@ -377,12 +377,9 @@ class Drone:
         Raises:
             FileNotFoundError, FileExistsError, IsADirectoryError ... ValueError: of the mode.
         """
-        how = Mode(mode)
+        how = Mode(mode, buffering, encoding, errors, newline)
         opened = await self.open_raw(path, how.plain)
-        build = partial(
-            python_file, opened, TaskPortal(self._nursery), how, buffering, encoding, errors, newline
-        )
-        return AsyncFile(await trio.to_thread.run_sync(build), opened)
+        return AsyncFile(python_file(opened, TaskPortal(self._nursery), how), opened)
 
     async def open_raw(self, path: PathLike, mode: str) -> Opened:
         """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""

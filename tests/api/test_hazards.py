@@ -203,6 +203,17 @@ def test_a_drone_may_be_collected(sim: SimVehicle) -> None:
     wait_until("its thread ended", lambda: threading.active_count() == before)
 
 
+def test_a_file_keeps_its_connection(sim: SimVehicle) -> None:
+    file = mavftpfs.connect(sim.source).open("/f", "rb")
+    gc.collect()
+    assert file.read() == OLD
+    file.close()
+    holder = [file]
+    del file
+    with pytest.warns(ResourceWarning, match="was not closed"):
+        holder.clear()
+
+
 def program(sim: SimVehicle, code: str) -> subprocess.CompletedProcess[str]:
     """Run a program of its own with the vehicle as `drone`."""
     head = f"import mavftpfs, os, sys\ndrone = mavftpfs.connect({sim.source!r})\n"

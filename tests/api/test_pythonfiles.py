@@ -61,7 +61,7 @@ def outcome(opened: Callable[[], Any], call: Call) -> object:
     try:
         with opened() as file:
             return call(file)
-    except (OSError, ValueError, TypeError) as exc:
+    except (OSError, ValueError, TypeError, LookupError) as exc:
         return type(exc).__name__, getattr(exc, "errno", None)
 
 
@@ -115,6 +115,8 @@ def test_text(shared: mavftpfs.Drone, card: Path, tmp_path: Path, mode: str) -> 
         ("rb", -1, "utf-8"),
         ("rb", -1, None, "strict"),
         ("rb", -1, None, None, "\n"),
+        ("w", -1, "no-such-code"),
+        ("w", -1, None, None, "x"),
     ],
 )
 def test_bad_arguments(shared: mavftpfs.Drone, card: Path, tmp_path: Path, args: tuple[Any, ...]) -> None:
