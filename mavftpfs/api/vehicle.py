@@ -429,6 +429,9 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
         opened. UsageError (a ValueError): of source or options, which it names.
     """
+    caches = logging.getLogger("mavftpfs.cache")
+    if caches.level == logging.NOTSET:
+        caches.setLevel(logging.ERROR)  # what they warn of is raised, too
     with translated():
         target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))
         if target.mount is not None and not use_mount:
