@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import signal
 import tempfile
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import pytest
+import trio
 import trio._core._run as scheduler
 from hypothesis import HealthCheck, settings
+
+from mavftpfs.cache.pathlocks import PathLocks
+from mavftpfs.session.serversession import ServerSession
 
 TIERS = ("unit", "property", "sim", "ops", "conformance", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
@@ -61,6 +68,31 @@ def order_of_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     is for hypothesis alone."""
     monkeypatch.setattr(scheduler, "_ALLOW_DETERMINISTIC_SCHEDULING", True)
     scheduler._r.seed(0)
+
+
+@pytest.fixture(autouse=True)
+def nobody_waits_in_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Assert that no task that has the session waits for a path, a node or memory for reads: whoever has one
+    of these may wait for the session."""
+    holders: weakref.WeakSet[ServerSession] = weakref.WeakSet()
+    note = ServerSession.note_turn
+
+    def noting(server: ServerSession, *turn: Any) -> None:
+        holders.add(server)
+        note(server, *turn)
+
+    def guarded(wait: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(wait)
+        def waiting(*args: Any, **kwargs: Any) -> Any:
+            for server in list(holders):
+                server.assert_no_turn()
+            return wait(*args, **kwargs)
+
+        return waiting
+
+    monkeypatch.setattr(ServerSession, "note_turn", noting)
+    for owner, name in ((PathLocks, "hold"), (trio.Lock, "acquire"), (trio.Semaphore, "acquire")):
+        monkeypatch.setattr(owner, name, guarded(getattr(owner, name)))
 
 
 @pytest.fixture(autouse=True)

@@ -317,6 +317,7 @@ async def connected(
         tasks = [serving, _Task(nursery, connection.driver.pump), _Task(nursery, connection._beat)]
         tasks.append(_Task(nursery, connection._ask_about_vehicle))
         try:
+            await connection.scheduler.serving.wait()
             yield connection
         except Exception as error:  # raised again outside, so that it is not wrapped in a group
             failure = error

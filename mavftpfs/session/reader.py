@@ -9,7 +9,7 @@ import trio
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.reading import ReadTransfer
-from mavftpfs.session.scheduler import RECENT, Scheduler, SessionUser
+from mavftpfs.session.scheduler import RECENT, Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
@@ -34,29 +34,29 @@ class FileStream(SessionUser):
     expected_size: in bytes, if the file need not be opened to know it.
 
     Attributes:
-        size: by the first open ACK, in bytes; 0 before that.
-        opened: set when that came, or open_error.
+        size: by the first open ACK, in bytes; 0 before that. opened: that came, or the file cannot be opened.
         closed: nothing goes to the sink any more, but that what it got is in doubt.
     """
 
     def __init__(self, path: bytes, sink: ReadSink, expected_size: int | None, scheduler: Scheduler) -> None:
-        super().__init__(path, scheduler)
+        super().__init__(path)
         self.size = expected_size or 0
         self.closed = False
         self._sink = sink
-        self._wants_open = expected_size is None  # somebody waits for that ACK
-        self.opened = trio.Event()
-        self.open_error: MavftpfsError | None = None
+        self._scheduler = scheduler
+        self._server = scheduler.server
+        self.opened = Future()
         self._demand, self._ahead = ExtentSet(), ExtentSet()
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # by that transfer
         self._last_data_at = -inf
         self._lost = 0  # how often the session was, without progress
-        if self._wants_open:
-            self.asked_at = scheduler.clock()
+        self._wanted = trio.Event()
+        if expected_size is not None:
+            self.opened.end()
         else:
-            self.opened.set()
+            self.asked_at = scheduler.clock()
 
     # --- the cache's side
 
@@ -73,8 +73,9 @@ class FileStream(SessionUser):
             wanted.add(gap_start, gap_stop)
         if self._transfer is not None:
             self._transfer.want(start, stop, demand)
-        if self.asked_at is None and self.due_at() < inf:
-            self.asked_at = self._scheduler.clock()
+        if self.asked_at is None and not self._demand.empty:
+            self._scheduler.renew(self)
+        self._wanted.set()
         self._server.wake()
 
     def drop_readahead(self) -> None:
@@ -89,14 +90,14 @@ class FileStream(SessionUser):
         self.drop_readahead()
         if self._transfer is not None:
             self._transfer.drop_wants()
-        elif not self._wants_open:
+        elif self.opened.done:
             self.asked_at = None
 
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True
         self._demand, self._ahead = ExtentSet(), ExtentSet()
-        self._wants_open = False
+        self._wanted.set()
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
         if self in self._scheduler.users:
@@ -108,95 +109,89 @@ class FileStream(SessionUser):
 
     # --- the scheduler's side
 
-    def due_at(self) -> float:
+    @property
+    def idle(self) -> bool:
         """See SessionUser."""
-        return 0.0 if self._wants_open or not self._demand.empty else inf
-
-    def prefetches(self) -> bool:
-        """See SessionUser."""
-        return not self._ahead.empty
+        return self.closed or (self.opened.done and self._demand.empty and self._ahead.empty)
 
     def goes_on(self, session: OpenSession) -> bool:
         """See SessionUser."""
-        return session.path == self.path and not session.writing and not self._wants_open
-
-    def fail(self, error: MavftpfsError) -> None:
-        """See SessionUser."""
-        self._wants_open = False
-        self._demand, self._ahead = ExtentSet(), ExtentSet()
-        if self.opened.is_set():
-            self._sink.on_failed(error)
-        else:
-            self.open_error = error
-            self.opened.set()
-
-    def on_queued(self) -> None:
-        """See SessionUser."""
-        self._sink.on_queued()
+        return session.path == self.path and not session.writing and self.opened.done
 
     def on_removed(self) -> None:
         """Nothing more of this file can be had, and of its successor nothing may."""
         self._removed = True
-        if self.due_at() < inf:
-            self.fail(FileChanged(f"{self.path!r} was removed or replaced"))
+        self._fail(FileChanged(f"{self.path!r} was removed or replaced"))
 
     def on_suspect(self, reason: str) -> None:
         """See SessionUser."""
         if self._transfer is not None or self._last_data_at > self._scheduler.clock() - RECENT:
             self._sink.on_suspect(reason)
 
-    # --- one turn
+    def _fail(self, error: MavftpfsError) -> None:
+        """What is wanted cannot be had now."""
+        self._demand, self._ahead = ExtentSet(), ExtentSet()
+        self.asked_at = None
+        if not self.opened.done:
+            self.opened.end(error)
+        elif not self.closed:
+            self._sink.on_failed(error)
 
-    async def turn(self) -> None:
-        """See SessionUser."""
+    # --- its task
+
+    async def run(self) -> None:
+        """Take turns, as long as it is open and something is wanted."""
         server = self._server
-        try:
-            server.vehicle.require(server.clock())
-            await self._open()
-            await self._read()
-        except SessionLost as error:  # the next turn goes on at the same offset (promise 5)
-            server.abandon()
-            if error.by_server:
-                server.doubt.raise_it(str(error))
-            self._lost += 1
-            if self._lost > REOPENS:
-                self.fail(error)
-        except MavftpfsError as error:
-            self.fail(error)
-        self.asked_at = server.clock() if self.due_at() < inf else None
+        while not self.closed:
+            if self.idle:
+                self._wanted = trio.Event()
+                await self._wanted.wait()
+                continue
+            try:
+                async with self._scheduler.turn(self, self._sink.on_queued) as turn:
+                    await self._open(turn)
+                    await self._read(turn)
+            except SessionLost as error:  # the next turn goes on at the same offset (promise 5)
+                server.abandon()
+                if error.by_server:
+                    server.doubt.raise_it(str(error))
+                self._lost += 1
+                if self._lost > REOPENS:
+                    self._fail(error)
+            except MavftpfsError as error:
+                self._fail(error)
+            self.asked_at = None if self._demand.empty else server.clock()
 
-    async def _open(self) -> None:
-        """Have the file open. Give who waited for that a moment to ask for its bytes, before another file
-        takes its turn.
+    async def _open(self, turn: Turn) -> None:
+        """Have the file open. Give the caller that waited for that a moment to ask for its bytes, before
+        another file takes its turn.
 
         Raises:
             FileChanged: it is smaller than what was opened. A larger one only grew: it is served at its
                 opened size.
         """
-        server, session = self._server, self._server.session
-        awaited = self._wants_open
+        server, session, first = self._server, self._server.session, not self.opened.done
         if session is None or not self.goes_on(session):
-            session = await server.open(self.path)
+            session = await turn.open(self.path)
         if session.size is None:
             await server.close_quietly()
             raise RemoteProtocolError("the vehicle's open reply holds no size")
-        if self.opened.is_set() and compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
+        if not first and compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
             await server.close_quietly()
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
-        self._wants_open = False
-        if not self.opened.is_set():
+        if first:
             self.size = session.size
-            self.opened.set()
+            self.opened.end()
         if not self.closed:
             self._sink.on_opened(session.opened_at)
-        if awaited:
+        if first:
             with trio.move_on_after(FIRST_WANT):
-                while not (self.due_at() < inf or self.prefetches() or self.closed):
+                while self.idle and not self.closed:
                     await server.sleep(FIRST_WANT)
 
-    async def _read(self) -> None:
+    async def _read(self, turn: Turn) -> None:
         server, session = self._server, self._server.session
-        if session is None or not (self.due_at() < inf or self.prefetches()):
+        if session is None or self.idle:
             return  # the vehicle restarted since it was opened, or nothing is wanted
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks)
@@ -212,10 +207,10 @@ class FileStream(SessionUser):
         try:
             await driver.start(transfer, server.wake)
             while not (transfer.done or transfer.idle or self.closed or server.session is None):
-                rival = self._scheduler.rival_use(self)
+                rival = turn.rival
                 if rival is not None and self.gives_way(rival, began, server.clock(), engine.rtt):
                     break
-                if server.is_excluded(self.path) or (rival is not None and self.due_at() == inf):
+                if server.is_excluded(self.path) or (rival is not None and self._demand.empty):
                     break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
@@ -223,7 +218,6 @@ class FileStream(SessionUser):
                     transfer.by_requests = engine.in_flight > transfer.in_flight
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 driver.kick()
-                self._scheduler.expire_held()
                 await server.sleep(_OFTEN)
                 heard_at = max(driver.last_reply_at, transfer.progress_at)  # `bwlimit=` is no silence
                 limit = max(STALL, 4.0 * (engine.rtt or 0.0))

@@ -1,17 +1,21 @@
 """Gives the one server session to one user after another. Layer: session.
 
-One task (`serve`) gives turns; readers, uploads and single requests only say what they want and wake it.
+    async with scheduler.turn(user) as turn:
+        session = await turn.open(path)
 
-Whoever used little of it lately (an editor, `head`) goes before whoever used much (a copy), at once. Those
-who used much take turns of a second or more, since changing files costs round trips. Whoever waited for long
-goes first all the same: one small file after another slows a copy down, and does not stop it.
+One task (`serve`) grants the turns. Between them it closes what nobody needs open. Readers and uploads have a
+task each, single requests are made in the caller's own.
+
+A user that used little of the session lately (an editor, `head`) goes before one that used much (a copy), at
+once. Those that used much take turns of a second or more, since changing files costs round trips. A user that
+waited for long goes first all the same: one small file after another slows a copy down, and does not stop it.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
 from math import inf
 from typing import Literal
 
@@ -25,7 +29,14 @@ from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import OPENING, took_session
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
-from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    LocalProtocolError,
+    MavftpfsError,
+    RequestTimeout,
+    SessionBusy,
+    SessionLost,
+)
 from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
@@ -58,65 +69,71 @@ buffers and the 3 s after which ArduPilot gives the session away: so a session i
 
 _MAYBE_OPEN_RETRY = 5.0
 _OFTEN = 0.25
+_KEPT = "the vehicle's only session is kept by another transfer"
+_OTHERS = "another client of the vehicle may have a file open, which is not ended for ours"
 
-Action = Callable[[OpenSession], Awaitable[None]]
+
+class Future:
+    """The end of something that one task does and others wait for."""
+
+    def __init__(self) -> None:
+        self._ended = trio.Event()
+        self._error: MavftpfsError | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether it ended, well or not."""
+        return self._ended.is_set()
+
+    def end(self, error: MavftpfsError | None = None) -> None:
+        """Let those that wait go on, with an error where it failed; the first time counts."""
+        if not self.done:
+            self._error = error
+            self._ended.set()
+
+    async def wait(self) -> None:
+        """Wait for the end, and raise the error if there is one."""
+        await self._ended.wait()
+        if self._error is not None:
+            raise self._error.with_traceback(None)
 
 
-class SessionUser(ABC):
-    """Somebody who wants the session now and then: a reader, an upload, a single request.
+class SessionUser:
+    """A reader, an upload or a single request: what orders it among those that wait.
 
     Attributes:
         path: of the file it uses.
-        asked_at: when it began to wait for its turn; None while it wants nothing (an upload keeps its
-            last). It stays set in the turn.
+        asked_at: since when it waits for its turn; None if that is for readahead alone. It stays set in it.
+        writing: its turns are refused while nothing may be written.
     """
 
-    def __init__(self, path: bytes, scheduler: Scheduler, asked_at: float | None = None) -> None:
+    writing = False
+
+    def __init__(self, path: bytes, asked_at: float | None = None) -> None:
         self.path = path
         self.asked_at = asked_at
-        self._scheduler = scheduler
-        self._server = scheduler.server
         self._used = 0.0
         self._until = 0.0
-        scheduler.users[self] = None
-        scheduler.server.wake()
 
-    @abstractmethod
-    def due_at(self) -> float:
-        """Return when it can use the session: 0 for now, inf if nothing is wanted that somebody waits for."""
+    @property
+    def awaited(self) -> bool:
+        """Whether somebody waits for what it does, who is told if it gets no turn in time."""
+        return self.asked_at is not None
 
-    @abstractmethod
-    async def turn(self) -> None:
-        """Use the session now. What fails is told to whoever waits."""
-
-    @abstractmethod
-    def fail(self, error: MavftpfsError) -> None:
-        """Tell whoever waits that what it wants cannot be had now."""
-
-    def prefetches(self) -> bool:
-        """Return whether it wants something that nobody waits for."""
+    @property
+    def idle(self) -> bool:
+        """Whether it wants nothing, though it may be in the queue."""
         return False
 
     def goes_on(self, session: OpenSession) -> bool:
         """Return whether it uses what is open and opens nothing."""
         return False
 
-    def expire(self, error: MavftpfsError) -> None:
-        """It waited too long. Who asks again waits anew."""
-        self.asked_at = None
-        self.fail(error)
-
-    def on_queued(self) -> None:
-        """It waits for its turn, and the vehicle answered in another's."""
-        return
-
     def on_removed(self) -> None:
         """The file of its path was removed or replaced."""
-        return
 
     def on_suspect(self, reason: str) -> None:
         """What was read lately may be another file's."""
-        return
 
     def on_turn(self, began: float, now: float) -> None:
         """It had the session until now."""
@@ -148,52 +165,43 @@ class SessionUser(ABC):
         return slice_ >= min(MAX_TURN, max(MIN_TURN, TURN_TRIPS * (rtt or 0.0)))
 
 
-class _Job(SessionUser):
-    """One open, an action, one Terminate."""
+class Turn:
+    """The session, as long as it is one user's; before that, the user's place in the queue.
 
-    def __init__(self, path: bytes, scheduler: Scheduler, opcode: Opcode, action: Action | None) -> None:
-        super().__init__(path, scheduler, scheduler.clock())
-        self.session: OpenSession | None = None
+    Attributes:
+        task: the user's. called: it has the session, or `error` is why not. ended: it gave it back, or left
+            the queue. patience: how long it waits. on_moved: called when the vehicle answered in another's
+            turn.
+    """
+
+    def __init__(self, scheduler: Scheduler, on_moved: Callable[[], None]) -> None:
+        self.task = trio.lowlevel.current_task()
         self.error: MavftpfsError | None = None
-        self.finished = trio.Event()
-        self._opcode = opcode
-        self._action = action
+        self.called, self.ended = trio.Event(), trio.Event()
+        self.patience = trio.CancelScope()
+        self.on_moved = on_moved
+        self._scheduler = scheduler
 
-    def due_at(self) -> float:
-        """See SessionUser."""
-        return inf if self.finished.is_set() else 0.0
+    async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
+        """Close what is open and open another file; raises what ServerSession.open does."""
+        return await self._scheduler.server.open(path, opcode)
 
-    def fail(self, error: MavftpfsError) -> None:
-        """See SessionUser."""
-        self.error = error
-        self.finished.set()
-
-    async def turn(self) -> None:
-        """See SessionUser."""
-        server = self._server
-        try:
-            # It may have died, or been armed, while others had the session.
-            server.vehicle.require(server.clock(), writing=self._opcode != Opcode.OPEN_FILE_RO)
-            self.session = await server.open(self.path, self._opcode)
-            if self._action is not None:
-                await self._action(self.session)
-            await server.close()
-        except MavftpfsError as error:
-            self.error = error
-            await server.close_quietly()
-        finally:
-            self.finished.set()
+    @property
+    def rival(self) -> float | None:
+        """How much the lightest user that waits used lately, in seconds; None if nobody waits."""
+        now = self._scheduler.clock()
+        return min((user.used(now) for user in self._scheduler.waiting(now)), default=None)
 
 
 class Scheduler:
     """Serialises all use of the server session.
 
-    op_deadline: seconds after which who waits for the session is told that it is not to be had.
+    op_deadline: seconds in which a user gets the session, or is told that it is not to be had.
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
-        users: those who want the session, now or later. gone: those who read, and want nothing any more,
-            with the time since when.
+        users: the readers and uploads there are. gone: readers that were closed, with the time when.
+        serving: set once `serve` runs.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
 
@@ -212,27 +220,97 @@ class Scheduler:
         self.server = ServerSession(driver, self.doubt, clock, op_deadline)
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
+        self.serving = trio.Event()
         self.gone: deque[tuple[float, SessionUser]] = deque()
         self._driver = driver
-        self._op_deadline = op_deadline
+        self._patience = 1.02 * op_deadline  # if no request is answered, that is news before
+        self._queue: dict[SessionUser, Turn] = {}
+        self._nursery: trio.Nursery | None = None
         self._used_at = clock()
         self._touched_at = -inf
         driver.engine.on_unexplained = self._on_unexplained
 
-    # --- who wants the session
+    # --- turns
+
+    def add(self, user: SessionUser, run: Callable[[], Awaitable[None]]) -> None:
+        """Run the task of a reader or an upload, until it ends or the connection does."""
+        assert self._nursery is not None
+        self.users[user] = None
+        self._nursery.start_soon(run)
 
     def remove(self, user: SessionUser) -> None:
-        """It wants nothing any more; harmless if that is known."""
+        """It wants no turn any more; harmless if that is known."""
         self.users.pop(user, None)
+        self.refuse(user, LocalProtocolError("it was closed"))
+
+    def refuse(self, user: SessionUser, error: MavftpfsError) -> None:
+        """If it waits for a turn, raise an error there."""
+        turn = self._queue.pop(user, None)
+        if turn is not None:
+            turn.error = error
+            turn.called.set()
         self.server.wake()
 
+    def renew(self, user: SessionUser) -> None:
+        """From now on somebody waits for it, and for no longer than that."""
+        user.asked_at = self.clock()
+        self._be_patient(user)
+
+    def _be_patient(self, user: SessionUser) -> None:
+        if user.awaited and user in self._queue:
+            self._queue[user].patience.deadline = trio.current_time() + self._patience
+
+    @asynccontextmanager
+    async def turn(
+        self, user: SessionUser, on_moved: Callable[[], None] = lambda: None
+    ) -> AsyncIterator[Turn]:
+        """Wait for the session, and have it for the length of the body.
+
+        The body must not wait for a path, a node or memory for reads: others that have them may wait for the
+        session. If it is cancelled while it opens or closes, something may be open, which `serve` closes.
+
+        on_moved: called while it waits, when the vehicle answered in another user's turn.
+
+        Raises:
+            VehicleLost, Armed: it cannot be used now. RequestTimeout, SessionBusy: others keep it.
+        """
+        turn = self._queue[user] = Turn(self, on_moved)
+        self.server.wake()
+        try:
+            self._be_patient(user)
+            with turn.patience:
+                await turn.called.wait()
+            if not turn.called.is_set():
+                raise SessionBusy(_OTHERS) if self.clock() < self.held_until else RequestTimeout(_KEPT)
+            if turn.error is not None:
+                raise turn.error
+            self.server.vehicle.require(self.clock(), writing=user.writing)
+            yield turn
+        finally:
+            if self._queue.get(user) is turn:
+                del self._queue[user]
+            elif turn.error is None:
+                self.server.note_turn()
+            turn.ended.set()
+
     def waiting(self, now: float) -> list[SessionUser]:
-        """Return all who wait for the session and could use it now."""
-        waiting = []
-        for user in self.users:
-            if user.due_at() <= now and self._may_use(user, now):
-                waiting.append(user)
-        return waiting
+        """Return the users that somebody waits for, and that could use the session now."""
+        return [user for user in self._queue if user.asked_at is not None and self._may_use(user, now)]
+
+    def first(self) -> SessionUser | None:
+        """Return the user that is to have the session now. Readahead comes only if nothing waits, and that of
+        the open file first."""
+        now, rtt = self.clock(), self._driver.engine.rtt
+        if waiting := self.waiting(now):
+            return min(waiting, key=lambda user: user.rank(now, rtt))
+        session = self.server.session
+        first = None
+        for user in self._queue:
+            if not user.idle and self._may_use(user, now):
+                if session is not None and user.path == session.path:
+                    return user
+                first = first or user
+        return first
 
     def _may_use(self, user: SessionUser, now: float) -> bool:
         """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
@@ -247,73 +325,36 @@ class Scheduler:
         several = self._driver.engine.traits.several_sessions
         return -inf if several else self.server.others.file_open_until
 
-    def first(self) -> SessionUser | None:
-        """Return whoever is to use the session now. Readahead comes only if nobody waits for anything, and
-        that of the open file first."""
-        now, rtt = self.clock(), self._driver.engine.rtt
-        first, best = None, (True, inf)
-        for user in self.waiting(now):
-            rank = user.rank(now, rtt)
-            if first is None or rank < best:
-                first, best = user, rank
-        if first is not None:
-            return first
-        session = self.server.session
-        for user in self.users:
-            if user.prefetches() and self._may_use(user, now):
-                if session is not None and user.path == session.path:
-                    return user
-                first = first or user
-        return first
-
-    def rival_use(self, user: SessionUser) -> float | None:
-        """Return how much the lightest of the others who wait used lately (seconds); None if nobody waits."""
-        now = self.clock()
-        least: float | None = None
-        for other in self.waiting(now):
-            if other is not user and (least is None or other.used(now) < least):
-                least = other.used(now)
-        return least
-
-    def expire_waiters(self) -> None:
-        """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
-        now = self.clock()
-        error = RequestTimeout("the vehicle's only session is taken by an upload that cannot be interrupted")
-        for user in self.waiting(now):
-            if user.asked_at is not None and user.asked_at < now - self._op_deadline:
-                user.expire(error)
-
-    def expire_held(self) -> float:
-        """Tell the users that wait too long for another client's file to be closed; return when the next one
-        will have done so."""
-        now, next_at = self.clock(), inf
-        if now >= self.held_until:
-            return next_at
-        error = SessionBusy("another client of the vehicle may have a file open, which is not ended for ours")
-        for user in list(self.users):  # who is told may end
-            if user.due_at() > now or user.asked_at is None or self._may_use(user, now):
-                continue
-            expires_at = user.asked_at + self._op_deadline
-            if now >= expires_at:
-                user.expire(error)
-            else:
-                user.on_queued()
-                next_at = min(next_at, expires_at)
-        return next_at
-
     # --- what others ask for
+
+    @asynccontextmanager
+    async def opened(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> AsyncIterator[OpenSession]:
+        """Have a file open for the length of the body, in a turn; then terminate.
+
+        Raises:
+            What `turn`, opening or closing fail with.
+        """
+        user = SessionUser(path, self.clock())
+        user.writing = opcode != Opcode.OPEN_FILE_RO
+        self.server.vehicle.require(self.clock(), writing=user.writing)
+        async with self.turn(user) as turn:
+            yield await turn.open(path, opcode)
+            await self.server.close()
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
         """Read a file to EOF whatever its size claims; once more if the session was lost or in doubt.
 
         Raises:
             DataUnproven: another FTP client may have used the session each time, so that the bytes may be
-                another file's. Else as use_session.
+                another file's. Else as `opened`.
         """
-        data = b""
+        try:
+            return await self._read_whole(path, limit)
+        except (SessionLost, DataUnproven):
+            return await self._read_whole(path, limit)
 
-        async def read(session: OpenSession) -> None:
-            nonlocal data
+    async def _read_whole(self, path: bytes, limit: int) -> bytes:
+        async with self.opened(path) as session:
             began = self.clock()
             operation = ReadToEof(session.id, self.read_chunks.size, limit)
             await self._driver.run(operation)
@@ -321,21 +362,14 @@ class Scheduler:
                 raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
             if self.doubt.reads_arose_since(began):
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
-            data = operation.data
-
-        try:
-            await self.use_session(path, Opcode.OPEN_FILE_RO, read)
-        except (SessionLost, DataUnproven):
-            await self.use_session(path, Opcode.OPEN_FILE_RO, read)
-        return data
+            return operation.data
 
     async def write_whole(
         self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
     ) -> None:
         """See cache.remote.VehicleStore."""
         server, size = self.server, min(self.read_chunks.size, self.write_chunks.size)
-
-        async def write(session: OpenSession) -> None:
+        async with self.opened(path, Opcode.CREATE_FILE) as session:
             transfer = WriteTransfer(
                 session.id, Pieces(pieces, progress), ChunkSize(size), in_flight=1, on_starved=server.wake
             )
@@ -353,32 +387,13 @@ class Scheduler:
                 transfer.finish()
                 self._driver.cancel(transfer)
 
-        await self.use_session(path, Opcode.CREATE_FILE, write)
-
-    async def use_session(self, path: bytes, opcode: Opcode, action: Action | None = None) -> OpenSession:
-        """Open a file, do something, terminate; returns what the open ACK said.
-
-        Raises:
-            VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
-        """
-        self.server.vehicle.require(self.clock())
-        job = _Job(path, self, opcode, action)
-        try:
-            await job.finished.wait()
-        finally:
-            self.remove(job)
-        if job.error is not None:
-            raise job.error
-        assert job.session is not None
-        return job.session
-
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path. What
         had the new name cannot be read any more."""
         for user in list(self.users):  # who is told may close it
             if user.path == new:
                 user.on_removed()
-            elif not isinstance(user, _Job):
+            else:
                 user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
@@ -428,52 +443,53 @@ class Scheduler:
     # --- the one task
 
     async def serve(self) -> None:
-        """Run until cancelled."""
+        """Grant turns until cancelled, and run the tasks of readers and uploads."""
         server = self.server
-        while True:
-            await trio.lowlevel.checkpoint()
-            await server.close_excluded()
-            user, session, began = self.first(), server.session, self.clock()
-            try:
+        async with trio.open_nursery() as self._nursery:
+            self.serving.set()
+            while True:
+                await trio.lowlevel.checkpoint()
+                await server.close_excluded()
+                user, session = self.first(), server.session
                 if user is None:
-                    await self._idle(began)
-                    continue
-                if session is not None and session.path != user.path and not session.writing:
-                    await server.close_quietly()
-                    continue  # somebody may have come meanwhile who goes first
-                await user.turn()
-            except MavftpfsError:
-                # Closing the previous file failed; whoever wants something is asked again.
-                server.abandon()
-            self._used_at = self.clock()
-            if self._driver.last_reply_at >= began:
-                # The vehicle answered in this turn: who waits for a later one is not timed out.
-                for other in list(self.users):
-                    if other is not user and other.due_at() < inf:
-                        other.on_queued()
+                    await self._idle(self.clock())
+                elif session is not None and session.path != user.path:
+                    await server.close_quietly()  # a user may have come meanwhile that goes first
+                else:
+                    await self._grant(user)
+
+    async def _grant(self, user: SessionUser) -> None:
+        """Give it the session, and wait until it is given back. If the vehicle answered meanwhile, those that
+        wait for a later turn have not waited in vain."""
+        turn, began = self._queue.pop(user), self.clock()
+        self.server.note_turn(turn.task, user.path)
+        turn.called.set()
+        await turn.ended.wait()
+        self._used_at = self.clock()
+        if self._driver.last_reply_at >= began:
+            for user, other in list(self._queue.items()):
+                self._be_patient(user)
+                other.on_moved()
 
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
-        server = self.server
-        expires_at = self.expire_held()
-        if expires_at < inf:
+        server, news_in = self.server, inf
+        if self._queue and now < self.held_until:
             await server.find_out_sessions()
-        until_due = expires_at - now
-        for user in self.users:
-            due = max(user.due_at(), self.held_until)
-            if now < due:
-                until_due = min(until_due, due - now)
+            for turn in self._queue.values():
+                turn.on_moved()
+            news_in = max(0.0, self.held_until - now)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now)
-            if not await server.sleep(min(left, until_due)) and self.first() is None:
-                await server.close()
+            if not await server.sleep(min(left, news_in)) and self.first() is None:
+                await server.close_quietly()
         elif server.state is State.MAYBE_OPEN and not server.vehicle.lost(now):
             # An open or a Terminate that was never answered: leave no orphan over there.
-            if not await server.sleep(min(_MAYBE_OPEN_RETRY, until_due)):
+            if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)):
                 await server.close_maybe_open()
         else:
-            await server.sleep(until_due)
+            await server.sleep(news_in)
 
     async def close(self) -> None:
         """Terminate the session, best effort: a server forgets it by itself, sooner or later. The caller

@@ -202,7 +202,8 @@ class ServerSession:
         self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
-        self._opening: bytes | None = None
+        self._holder: trio.lowlevel.Task | None = None  # the task that has the turn, and the path it is for
+        self._turn_on: bytes | None = None
         self._excluded: list[_Excluded] = []
         self._news = trio.Event()
         self._changed = trio.lowlevel.ParkingLot()  # the state did
@@ -239,30 +240,23 @@ class ServerSession:
         """Close what is open and open another file, by OpenFileRO, OpenFileWO or CreateFile.
 
         Raises:
-            FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout. What `close`
-                raises of a file that was written to; that a file which was only read could not be closed is
-                no news to whoever opens the next.
+            FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout. That the other
+                file could not be closed is no news to its user.
         """
-        self._opening = path  # from now on nobody may change that name, also while the other file is closed
+        await self.close_quietly()
+        self._enter(State.OPENING)
         try:
-            if self.session is not None and self.session.writing:
-                await self.close()
-            elif self.session is not None:
-                await self.close_quietly()
-            self._enter(State.OPENING)
-            try:
-                if self.maybe_open:
-                    await self._close_what_may_be_ours()
-                session = await self._open_past_others(path, opcode)
-            except BaseException:
-                self._enter(State.CLOSED)
-                raise
-            self.engine.session = session.id
-            self._enter(State.OPEN, session)
+            if self.maybe_open:
+                await self._close_what_may_be_ours()
+            session = await self._open_past_others(path, opcode)
+        except BaseException:
+            self._enter(State.CLOSED)
+            raise
         finally:
-            self._opening = None
             if opcode == Opcode.CREATE_FILE:
                 self.doubt.late.on_made(path, self.clock())
+        self.engine.session = session.id
+        self._enter(State.OPEN, session)
         return session
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
@@ -470,6 +464,15 @@ class ServerSession:
 
     # --- paths that are about to change
 
+    def assert_no_turn(self) -> None:
+        """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
+        assert self._holder is not trio.lowlevel.current_task(), "not in a turn"
+
+    def note_turn(self, task: trio.lowlevel.Task | None = None, path: bytes | None = None) -> None:
+        """A user of this path has the session now, and may open it at any time; or none has."""
+        self._holder, self._turn_on = task, path
+        self._changed.unpark_all()
+
     def is_excluded(self, path: bytes) -> bool:
         """Return whether somebody changes this path now."""
         return bool(self._excluded) and any(excluded.covers(path) for excluded in self._excluded)
@@ -481,6 +484,7 @@ class ServerSession:
         Raises:
             RequestTimeout: it could not be closed in time.
         """
+        self.assert_no_turn()
         excluded = _Excluded(paths, below)
         self._excluded.append(excluded)
         try:
@@ -489,8 +493,8 @@ class ServerSession:
                     used = list(self.maybe_open.values())
                     if self.session is not None:
                         used.append(self.session.path)
-                    if self._opening is not None:
-                        used.append(self._opening)
+                    if self._turn_on is not None:
+                        used.append(self._turn_on)
                     if not any(map(excluded.covers, used)):
                         break
                     self.wake()

@@ -161,10 +161,9 @@ class Store:
         if expected_size is None:
             self._vehicle.require(self._clock())
         stream = FileStream(path, sink, expected_size, self._scheduler)
+        self._scheduler.add(stream, stream.run)
         try:
             await stream.opened.wait()
-            if stream.open_error is not None:
-                raise stream.open_error
         except BaseException:
             stream.close()
             raise
@@ -173,14 +172,16 @@ class Store:
     async def stat_size(self, path: bytes) -> int:
         """Open a file to know its size (see RemoteStore)."""
         wire_path(path)
-        session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
-        if session.size is None:
+        async with self._scheduler.opened(path) as session:
+            size = session.size
+        if size is None:
             raise RemoteProtocolError("the vehicle's open reply holds no size")
-        return session.size
+        return size
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         """Ask for a checksum (see RemoteStore); size: of the file, if known: the question is not repeated
         before so much can have been read."""
+        self._server.assert_no_turn()
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
         server_time, patience = CRC_TIME, CRC_PATIENCE
@@ -229,14 +230,17 @@ class Store:
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
         await self._rest(path)
-        return Upload(path, source, self._scheduler)
+        upload = Upload(path, source, self._scheduler)
+        self._scheduler.add(upload, upload.run)
+        return upload
 
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
         await self._rest(path)
-        await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+        async with self._scheduler.opened(path, Opcode.CREATE_FILE):
+            pass
 
     async def settle(self, path: bytes) -> None:
         """Wait as long as a copy of the CreateFile of this name may come (see VehicleStore)."""

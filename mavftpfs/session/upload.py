@@ -22,7 +22,7 @@ import trio
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
-from mavftpfs.session.scheduler import LIGHT_USE, Scheduler, SessionUser
+from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -79,282 +79,241 @@ class Stop(Enum):
     ABORTED = "aborted"
 
 
+_LOOK_AGAIN = 1.0
 _ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
-
-
-class UploadState(Enum):
-    """What becomes of an upload next.
-
-    IDLE: the card has all that was given, or nothing was. QUEUED: it wants the session, now or later.
-    SENDING: it has the session. HELD: only `finish` goes on with it: it was refused, or to go on means to
-    send the whole file again. ENDING: its owner gave it up, and it still has the session. ENDED: it was
-    given up.
-    """
-
-    IDLE = "idle"
-    QUEUED = "queued"
-    SENDING = "sending"
-    HELD = "held"
-    ENDING = "ending"
-    ENDED = "ended"
-
-
-UPLOAD_NEXT: dict[UploadState, frozenset[UploadState]] = {
-    UploadState.IDLE: frozenset((UploadState.QUEUED, UploadState.ENDED)),
-    UploadState.QUEUED: frozenset((UploadState.QUEUED, UploadState.SENDING, UploadState.ENDED)),
-    UploadState.SENDING: frozenset(
-        (UploadState.IDLE, UploadState.QUEUED, UploadState.HELD, UploadState.ENDING)
-    ),
-    UploadState.HELD: frozenset((UploadState.QUEUED, UploadState.ENDED)),
-    UploadState.ENDING: frozenset((UploadState.ENDED,)),
-    UploadState.ENDED: frozenset(),
-}
-"""All transitions there are."""
 
 
 class Upload(SessionUser):
     """Implements cache.remote.Upload. Nothing is sent before the source has something.
 
     Attributes:
-        state: see UploadState. error: why the last attempt failed; None while it goes well.
         begun, resent: see cache.remote.Upload.
     """
 
+    writing = True
+
     def __init__(self, path: bytes, source: Sending, scheduler: Scheduler) -> None:
-        super().__init__(path, scheduler, scheduler.clock())
+        super().__init__(path)
         self._source = source
-        self.state = UploadState.QUEUED
         self.begun = self.resent = False
-        self.error: MavftpfsError | None = None
-        self._transfer: WriteTransfer | None = None  # what sends its bytes now
-        self._reboots = scheduler.server.vehicle.reboots  # when its file was opened last
-        self._refused_at: int | None = None  # where a write was refused last as if the session were lost
-        # Counted when a turn begins, and when all that the source had is out and the file is to be closed.
-        # What was given before is in that file: who called `finish` until then is told by `_complete`.
-        self._endings = 0
-        self._completed = 0  # the last of them that was ACKed
-        self._awaited = 0  # the last of them that `finish` waits for
+        self._scheduler = scheduler
+        self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
         self._driver = scheduler.server.driver
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
+        self._finishers: list[Future] = []  # of those that wait for the end
+        self._held = False  # only `finish` goes on: it was refused, or all is to be sent again
+        self._ended = False  # given up by its owner
+        self._over = trio.Event()  # and its task has seen that
         self._retry_at = 0.0  # not to be touched before
+        self._changed = trio.lowlevel.ParkingLot()
+        self._transfer: WriteTransfer | None = None  # what sends its bytes now
+        self._reboots = scheduler.server.vehicle.reboots  # when its file was opened last
+        self._refused_at: int | None = None  # where a write was refused last as if the session were lost
         self._failures = 0
         self._furthest = 0  # in the file, when the session was lost the last time
-        self._changed = trio.lowlevel.ParkingLot()
-
-    def _enter(self, state: UploadState) -> None:
-        assert state in UPLOAD_NEXT[self.state], f"{self.state} does not become {state}"
-        self.state = state
-        self._changed.unpark_all()
-
-    def _queue_up(self, at: float) -> None:
-        self._enter(UploadState.QUEUED)
-        self._retry_at = self.asked_at = at
 
     # --- the owner's side
 
     def wake(self) -> None:
         """The source has more."""
-        if self.state is UploadState.IDLE:
-            self._queue_up(self._clock())
+        self._changed.unpark_all()
         if self._transfer is not None:
             self._transfer.wake()
         self._server.wake()
 
     async def finish(self) -> None:
         """See cache.remote.Upload."""
-        if self.state in (UploadState.ENDING, UploadState.ENDED):
+        if self._ended:
             raise LocalProtocolError("the upload was ended")
-        self._vehicle.require(now := self._clock(), writing=True)
-        if self.error is not None:
-            self.error, self._refused_at, self._failures = None, None, 0
-        if not self.finishing:
-            self.asked_at = now
-        self._retry_at = 0.0
-        if self.state in (UploadState.IDLE, UploadState.HELD):
-            self._enter(UploadState.QUEUED)
-        awaited = self._awaited = self._endings + 1
+        self._vehicle.require(self._clock(), writing=True)
+        self._held, self._refused_at, self._failures, self._retry_at = False, None, 0, 0.0
+        first, finisher = not self.awaited, Future()
+        self._finishers.append(finisher)
+        if first:
+            self._scheduler.renew(self)
         self.wake()
-        while awaited > self._completed:
-            if self.error is not None:
-                raise self.error
-            await self._changed.park()
+        try:
+            await finisher.wait()
+        finally:
+            self._finishers.remove(finisher)
 
     async def end(self) -> None:
         """See cache.remote.Upload."""
-        self.error = LocalProtocolError("the upload was ended")
-        if self.state is UploadState.SENDING:
-            self._enter(UploadState.ENDING)
-        elif self.state not in (UploadState.ENDING, UploadState.ENDED):
-            self._enter(UploadState.ENDED)
-        self._server.wake()
-        try:
-            while self.state is UploadState.ENDING:
-                await self._changed.park()
-        finally:
-            self._scheduler.remove(self)
+        self._ended = True
+        self._fail(LocalProtocolError("the upload was ended"))
+        self._scheduler.remove(self)
+        self._changed.unpark_all()
+        await self._over.wait()
 
     def status(self) -> dict[str, object]:
         """Return facts for people and scripts; JSON-able."""
         return {
             "path": self.path.decode("utf-8", "replace"),
-            "running": self.state is UploadState.SENDING,
+            "running": self._transfer is not None,
             "reached": self._source.reached,
             "unproven": self._source.acked.total,
-            "error": None if self.error is None else str(self.error),
         }
 
-    # --- the scheduler's side
-
     @property
-    def finishing(self) -> bool:
+    def awaited(self) -> bool:
         """Whether somebody waits for the end."""
-        return self._awaited > self._completed
-
-    def due_at(self) -> float:
-        """See SessionUser. A silent vehicle is only tried while somebody waits."""
-        if self.state is not UploadState.QUEUED or not self._vehicle.may_write:
-            return inf
-        if not self.finishing and self._vehicle.lost(self._clock()):
-            return inf
-        return self._retry_at
-
-    def expire(self, error: MavftpfsError) -> None:
-        """Tell whoever waits; it keeps its place if nobody does."""
-        if self.finishing:
-            self.fail(error)
+        return not all(finisher.done for finisher in self._finishers)
 
     def on_armed_changed(self) -> None:
-        """Whoever waits for an upload is told now; the running one ends itself. On disarming it goes on."""
-        if self.state is UploadState.QUEUED:
-            if self._vehicle.may_write:
-                self._queue_up(self._clock())
-            elif self.finishing:
-                self.fail(Armed("the vehicle was armed"))
-
-    def fail(self, error: MavftpfsError, *, refused: bool = False) -> None:
-        """Tell whoever waits, and try again in the background; refused: that is of no use before `finish`."""
-        self.error = error
-        self._failures += 1
-        self._awaited = self._completed
-        if self.state is UploadState.ENDING:
-            self._changed.unpark_all()
-        elif refused:
-            self._enter(UploadState.HELD)
+        """What waits for an upload is told at once; a running one ends itself. On disarming it goes on."""
+        if self._vehicle.may_write:
+            self._retry_at = 0.0
         else:
-            self._queue_up(self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5)))
+            self._scheduler.refuse(self, Armed("the vehicle was armed"))
+        self._changed.unpark_all()
 
-    # --- one turn
+    # --- its task
 
-    async def turn(self) -> None:
-        """See SessionUser."""
-        began, source = self._clock(), self._source
-        self._enter(UploadState.SENDING)
-        self._endings += 1
+    async def run(self) -> None:
+        """Take a turn whenever there is something to send, until it is given up. What fails is tried again in
+        the background."""
         try:
-            # An empty file has to be made, too, once.
-            if source.has_more() or not source.acked.empty or (self.finishing and not source.closed):
-                self._vehicle.require(began, writing=True)
-                session = await self._open()
-                await self._close(await self._write(session))
-            else:
-                self._complete()
+            while not self._ended:
+                try:
+                    if self.awaited:
+                        self._vehicle.require(self._clock(), writing=True)
+                    if (pause := self._due_in()) > 0.0:
+                        with trio.move_on_after(pause):
+                            await self._changed.park()
+                    elif not self._has_work():
+                        self._complete(list(self._finishers))
+                    else:
+                        self.asked_at = self.asked_at or self._clock()
+                        async with self._scheduler.turn(self) as turn:
+                            await self._use(turn)
+                except MavftpfsError as error:
+                    self._fail(error)
+        finally:
+            self._over.set()
+
+    def _due_in(self) -> float:
+        """Return in how many seconds it wants a turn, unless it is woken before. A silent vehicle is only
+        tried while somebody waits for the end."""
+        now = self._clock()
+        wanted = self.awaited or (not self._held and self._has_work())
+        if not wanted or not self._vehicle.may_write:
+            return inf
+        silent = not self.awaited and self._vehicle.lost(now)
+        return max(self._retry_at - now, _LOOK_AGAIN if silent else 0.0)
+
+    def _has_work(self) -> bool:
+        """Whether there is something to send or to close. An empty file has to be made, too, once."""
+        source = self._source
+        return source.has_more() or not source.acked.empty or (self.awaited and not source.closed)
+
+    def _fail(self, error: MavftpfsError) -> None:
+        """Tell those that wait, and try again later; after a refusal only when somebody waits again."""
+        for finisher in self._finishers:
+            finisher.end(error)
+        self._failures += 1
+        self._held = isinstance(error, REFUSALS)
+        self._retry_at = self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5))
+
+    async def _use(self, turn: Turn) -> None:
+        """Have a turn."""
+        began = self._clock()
+        try:
+            session = await self._open(turn)
+            stop = await self._write(turn, session)
+            # All that was given by now is in the file that is closed next; what comes later is not.
+            finishers = list(self._finishers)
+            await self._close(stop)
+            if stop in (Stop.FINISHED, Stop.STARVED):
+                self._complete(finishers)
         except SessionLost as lost:  # begin again from what is proven, a bounded number of times
-            self._server.abandon()
-            if lost.by_server:
-                self._server.doubt.raise_it(str(lost))
-            self._roll_back()
-            cause = lost.__cause__
-            if self._source.furthest > self._furthest:
-                self._furthest, self._failures = self._source.furthest, 0
-            self._failures += 1
-            if self._failures > REOPENS:
-                self.fail(cause if isinstance(cause, MavftpfsError) else lost)
-            elif self.state is UploadState.SENDING:
-                self._queue_up(self._clock() + (self._failures - 1) * 0.5)
+            self._on_lost(lost)
         except MavftpfsError as error:
             await self._clean_up(error)
-            self.fail(error, refused=isinstance(error, REFUSALS))
+            raise
         finally:
             self._end_transfer()
-            now = self._clock()
-            self.on_turn(began, now)
-            if self.state is UploadState.ENDING:
-                self._enter(UploadState.ENDED)
-            elif self.state is UploadState.SENDING:
-                self._queue_up(now)
-            self.asked_at = max(now, self._retry_at)
-            if self.state is UploadState.QUEUED and self.finishing and not self._vehicle.may_write:
-                self.fail(Armed("the vehicle was armed"))  # perhaps while its file was opened or closed
+            self.on_turn(began, self._clock())
+            self.asked_at = None
+
+    def _on_lost(self, lost: SessionLost) -> None:
+        """Begin again from what is proven.
+
+        Raises:
+            MavftpfsError: it was lost again and again, without getting further.
+        """
+        self._server.abandon()
+        if lost.by_server:
+            self._server.doubt.raise_it(str(lost))
+        self._roll_back()
+        if self._source.furthest > self._furthest:
+            self._furthest, self._failures = self._source.furthest, 0
+        self._failures += 1
+        if self._failures > REOPENS:
+            raise lost.__cause__ if isinstance(lost.__cause__, MavftpfsError) else lost
+        self._retry_at = self._clock() + (self._failures - 1) * 0.5
 
     def _resumable(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
         truncates = self._engine.traits.wo_truncates
         return truncates is False or (truncates is None and self._source.reached > 0)
 
-    def _complete(self) -> None:
-        """Everything given until `endings` was counted is ACKed, and the file was closed. Where it cannot be
-        written on, more costs the whole file once more, so it is held until somebody waits for it.
+    def _complete(self, finishers: list[Future]) -> None:
+        """Everything that was given before these began to wait is ACKed, and the file was closed. Where it
+        cannot be written on, more costs the whole file once more, so it is held until somebody waits for it.
 
         Raises:
             MavftpfsError: the source fails.
         """
-        more, resumable = self._source.has_more(), self._resumable()
-        self._completed = self._endings
-        self.error = None
+        self._source.has_more()
+        for finisher in finishers:
+            finisher.end()
         self._failures = 0
-        if self.state is UploadState.ENDING:
-            return
-        if self.finishing or (more and resumable):
-            self._queue_up(self._clock())
-        elif self._source.closed and not resumable:
-            self._enter(UploadState.HELD)
-        else:
-            self._enter(UploadState.IDLE)
+        self._held = self._source.closed and not self._resumable()
 
     # --- opening
 
-    async def _open(self) -> OpenSession:
+    async def _open(self, turn: Turn) -> OpenSession:
         """Open the upload's file: to go on with it where that is possible, else to begin it."""
-        source, server = self._source, self._server
+        source = self._source
         if self._reboots != self._vehicle.reboots:  # what was proven may not be there any more
             source.roll_back(everything=True)
         self._reboots = self._vehicle.reboots
         unknown = self._engine.traits.wo_truncates is None and source.reached
         if source.closed and (unknown or self._engine.traits.wo_truncates is False):
-            session = await self._reopen()
+            session = await self._reopen(turn)
             if session is not None:
                 return session
         source.roll_back(everything=True)
-        if self.state is UploadState.ENDING:  # its owner was told that nothing was begun
+        if self._ended:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
         self.resent |= self.begun
         self.begun = True  # what is there from now on may be ours
         try:
-            session = await server.open(self.path, Opcode.CREATE_FILE)
+            session = await turn.open(self.path, Opcode.CREATE_FILE)
         except FtpNak as nak:
             self.resent |= nak.retransmitted
             raise
         self.resent |= session.resent
         return session
 
-    async def _reopen(self) -> OpenSession | None:
+    async def _reopen(self, turn: Turn) -> OpenSession | None:
         """Open an interrupted file to go on with it; None if it does not have what was proven.
 
         The first time in a mount that finds out what OpenFileWO does (docs/servers.md 8): the size tells,
         asked afterwards, since the reply to OpenFileWO may say what it was before. What is not seen to keep
         the file passes for emptying it.
         """
-        server, traits, reached = self._server, self._engine.traits, self._source.reached
+        traits, reached = self._engine.traits, self._source.reached
         try:
-            session = await server.open(self.path, Opcode.OPEN_FILE_WO)
+            session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
             if traits.wo_truncates is None:
-                size = (await server.open(self.path)).size
+                size = (await turn.open(self.path)).size
                 traits.wo_truncates = size is None or size < reached
                 if traits.wo_truncates:
                     return None
-                session = await server.open(self.path, Opcode.OPEN_FILE_WO)
+                session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:  # somebody removed the file
                 return None
@@ -364,12 +323,12 @@ class Upload(SessionUser):
             return None
         if session.size is None or session.size >= reached:
             return session
-        await server.close()
+        await self._server.close()
         return None
 
     # --- writing
 
-    async def _write(self, session: OpenSession) -> Stop:
+    async def _write(self, turn: Turn, session: OpenSession) -> Stop:
         """Write until there is a reason to stop. The session is open then, and what is in flight waits for
         nothing but its answers: `_end_transfer` follows when the session is closed.
 
@@ -383,7 +342,7 @@ class Upload(SessionUser):
             while True:
                 # While a light user waits, a short queue is half filled: the Terminate finds a place in it,
                 # and is not behind as many writes.
-                rival = self._scheduler.rival_use(self)
+                rival = turn.rival
                 queue = traits.queue_limit
                 most = queue // 2 if queue and rival is not None and rival < LIGHT_USE else None
                 chunks = self._scheduler.write_chunks
@@ -394,7 +353,7 @@ class Upload(SessionUser):
                 self._driver.on_batch = self._on_batch
                 try:
                     await self._driver.start(transfer, server.wake)
-                    stop = await self._watch(session, transfer)
+                    stop = await self._watch(turn, session, transfer)
                 finally:
                     self._driver.on_batch = None
                     if not transfer.trailing:
@@ -421,7 +380,7 @@ class Upload(SessionUser):
         if transfer is not None and (transfer.idle or transfer.done):
             self._server.wake()
 
-    async def _watch(self, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
+    async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
         """Return the reason to let go; None if the transfer ended by itself."""
         server, driver, gate, clock = self._server, self._driver, self._server.path_gate, self._server.clock
         stop: Stop | None = None
@@ -431,7 +390,7 @@ class Upload(SessionUser):
                 raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
             if not transfer.starved:
                 fed_at = clock()
-            rival = self._scheduler.rival_use(self)
+            rival = turn.rival
             stop = stop or self._reason_to_stop(session, transfer, fed_at, rival)
             limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
             if not transfer.idle and clock() - max(driver.last_reply_at, transfer.progress_at) > limit:
@@ -442,7 +401,6 @@ class Upload(SessionUser):
             if stop is not None:
                 transfer.paused = True
                 if transfer.idle or stop in _ABRUPT or self._let_trail(stop, transfer):
-                    self._endings += 1
                     return stop
             elif gate.shut and gate.waiting:
                 transfer.paused = True
@@ -453,8 +411,6 @@ class Upload(SessionUser):
             else:
                 transfer.paused = False
             driver.kick()
-            self._scheduler.expire_waiters()
-            self._scheduler.expire_held()
             pressed = transfer.starved and rival is not None
             await server.sleep(BRIEF_STARVE if pressed else _OFTEN)
         return None
@@ -462,8 +418,8 @@ class Upload(SessionUser):
     def _reason_to_stop(
         self, session: OpenSession, transfer: WriteTransfer, fed_at: float, rival: float | None
     ) -> Stop | None:
-        """fed_at: when there was something to send the last time. rival: see Scheduler.rival_use."""
-        if self.state is UploadState.ENDING:
+        """fed_at: when there was something to send the last time. rival: see Turn.rival."""
+        if self._ended:
             return Stop.ABORTED
         if not self._vehicle.may_write:
             return Stop.ARMED
@@ -471,7 +427,7 @@ class Upload(SessionUser):
             return Stop.YIELD
         now, resumable = self._clock(), self._resumable()
         if transfer.starved:
-            if self.finishing:
+            if self.awaited:
                 return Stop.FINISHED
             patience = STARVE
             if rival is not None and resumable:
@@ -562,10 +518,6 @@ class Upload(SessionUser):
         self._source.check_point()
         if isinstance(last, REFUSALS) and not is_disarmed(last):
             raise last
-        if stop is Stop.ARMED:
-            self.fail(Armed("the vehicle was armed"))
-        elif stop in (Stop.FINISHED, Stop.STARVED):
-            self._complete()
 
     async def _clean_up(self, error: MavftpfsError) -> None:
         """Close what can be closed, and roll back what is not proven."""

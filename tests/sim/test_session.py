@@ -218,10 +218,41 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     async with here.connection() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
         async with scheduler.server.excluded(b"/changing"):
-            nursery.start_soon(scheduler.use_session, b"/changing", Opcode.OPEN_FILE_RO)
+            nursery.start_soon(connection.store.stat_size, b"/changing")
             await trio.sleep(0.1)
             assert await read_file(connection, b"/big") == content(20_000)
     assert rounds < 100
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(
+    profile: str, autojump: MockClock
+) -> None:
+    """In the queue, between its call and its first step, while it opens, reads or closes."""
+    here = world(profile, LinkSettings(delay=0.02), f=content(3000), g=b"g")
+    async with here.connection() as connection:
+        for step in range(60):
+            with trio.move_on_after(step * 0.01):
+                async with trio.open_nursery() as nursery:
+                    nursery.start_soon(connection.store.stat_size, path(profile, "g"))
+                    await connection.store.read_whole(path(profile, "f"), 10_000)
+            began = trio.current_time()
+            assert await read_file(connection, path(profile, "g")) == b"g"
+            assert trio.current_time() - began < 1.0
+        await trio.sleep(10)
+        assert here.vehicle.server.open_sessions == 0
+
+
+async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn(autojump: MockClock) -> None:
+    """It would wait for itself: a change waits until the session is off its path."""
+    here = world("px4", LINK, f=DATA)
+    async with here.connection() as connection:
+        async with connection.scheduler.opened(b"/d/f"):
+            with pytest.raises(AssertionError):
+                await connection.store.crc32(b"/d/f")
+            with pytest.raises(AssertionError):
+                await connection.store.remove(b"/d/f")
+        await connection.store.remove(b"/d/f")
 
 
 @pytest.mark.holds("fault overlap")

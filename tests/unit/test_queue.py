@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from math import inf
 from types import SimpleNamespace
 from typing import cast
 
@@ -25,7 +24,6 @@ from mavftpfs.session.scheduler import (
     SessionUser,
 )
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.extents import ExtentSet
 from tests.support.worlds import MemorySink
 
@@ -41,21 +39,8 @@ def scheduler() -> Scheduler:
     return Scheduler(cast(Driver, NoLink()), clock=lambda: 0.0)
 
 
-class User(SessionUser):
-    """Wants the session always."""
-
-    def due_at(self) -> float:
-        return 0.0
-
-    async def turn(self) -> None:
-        raise NotImplementedError
-
-    def fail(self, error: MavftpfsError) -> None:
-        raise error
-
-
-def heavy(seconds: float = 5.0) -> User:
-    user = User(b"/f", scheduler())
+def heavy(seconds: float = 5.0) -> SessionUser:
+    user = SessionUser(b"/f")
     user.on_turn(100.0 - seconds, 100.0)
     return user
 
@@ -73,7 +58,7 @@ def test_use_fades_but_not_while_it_waits() -> None:
 
 
 def test_who_used_little_goes_first_until_another_waited_long() -> None:
-    busy, light = heavy(), User(b"/g", scheduler())
+    busy, light = heavy(), SessionUser(b"/g")
     busy.asked_at = 100.0
     light.asked_at = 101.0
     assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)
@@ -123,21 +108,21 @@ def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> Non
     stream.want(0, 600, demand=True)
     stream.want(600, 900, demand=False)
     for offset, size in ((0, 600), (600, 300)):
-        assert stream.prefetches()
+        assert not stream.idle
         sink.on_data(offset, bytes(size))
         transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
         stream._transfer = cast(ReadTransfer, transfer)
         stream._on_batch(0.0)
         sink.have = ExtentSet()  # evicted
-        assert stream.due_at() == inf
-    assert not stream.prefetches()
+        assert stream._demand.empty
+    assert stream.idle
 
 
 def test_only_what_the_cache_lacks_is_wanted() -> None:
     stream, sink = make()
     sink.on_data(100, bytes(100))
     stream.want(100, 200, demand=True)
-    assert stream.due_at() == inf
+    assert stream._demand.empty
     stream.want(0, 300, demand=True)
     assert list(stream._demand) == [(0, 100), (200, 300)]
 
@@ -147,4 +132,4 @@ def test_a_closed_stream_wants_nothing() -> None:
     stream.want(0, 100, demand=True)
     stream.close()
     stream.want(0, 100, demand=True)
-    assert stream.due_at() == inf
+    assert stream._demand.empty
