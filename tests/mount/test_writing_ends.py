@@ -24,7 +24,7 @@ from tests.support.trees import content
 from tests.support.vehicles import Process, SimVehicle
 
 QUICK = ("op_deadline=6",)
-RECOVERED = re.compile(r"did not reach the vehicle; they are (?:kept )?in (.+)")
+RECOVERED = re.compile(r"did not reach the vehicle; they are (?:kept )?in (.+?); put them back by: ")
 
 WRITER = """
 import errno, os, sys, time
@@ -148,7 +148,7 @@ def recovered(text: str) -> Path:
     """Return the directory that a message names."""
     match = RECOVERED.search(text)
     assert match is not None, text
-    return Path(match[1].strip())
+    return Path(match[1])
 
 
 def told(process: Process) -> Path:
