@@ -14,6 +14,7 @@ from mavftpfs.cache.attributes import SECOND
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, problems_refused, require_found
 from mavftpfs.cache.virtual import PARAM_FILE, VirtualTrees
+from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import Download, pack_upload, unpack
 from mavftpfs.parameters.saving import Values, Verdict, judge, make_plan, pick_base, unchanged
 from mavftpfs.parameters.text import (
@@ -124,13 +125,19 @@ class Parameters(Texts[Values]):
             return _complete(unpack(await self._virtual.content(PARAM_FILE, reread=True)))
 
     def _take(self, raw: bytes, download: Download) -> None:
-        """A download came. Where it says what the last one said, the texts are those of the last one."""
-        values = {one.name: one for one in download.parameters}
-        if self._snapshot is not None and self._snapshot.values == values:
-            self._snapshot = replace(self._snapshot, raw=raw)
-        else:
-            self._snapshot = Snapshot(raw, download.parameters, values, int(self._wall() * SECOND))
-            self._rendered.clear()
+        """A download came. Where it says what the last one said, the texts are those of the last one.
+
+        What the vehicle sets by itself gives the texts no new time: an editor would warn at each save.
+        """
+        before, values = self._snapshot, {one.name: one for one in download.parameters}
+        if before is not None and before.values == values:
+            self._snapshot = replace(before, raw=raw)
+            return
+        since = int(self._wall() * SECOND)
+        if before is not None and _without_own(before.values) == _without_own(values):
+            since = before.since_ns
+        self._snapshot = Snapshot(raw, download.parameters, values, since)
+        self._rendered.clear()
 
     async def _differing(self, snapshot: Snapshot) -> list[Parameter] | None:
         """Return what differs from its default; None where the vehicle tells no defaults."""
@@ -226,6 +233,10 @@ class Parameters(Texts[Values]):
             why = NotTaken(verdict.missed[0] + more) if refused or failure is None else failure
             raise Refused(why, _said(verdict, failure), known)
         return verdict
+
+
+def _without_own(values: Values) -> dict[str, Parameter]:
+    return {name: one for name, one in values.items() if not is_own(name)}
 
 
 def _complete(download: Download) -> Download:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from mavftpfs.parameters.packed import unpack
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
 from tests.support.request_costs import PROGRAMS
+from tests.support.terminal import Terminal
 
 FLOAT_NAME = {"ardupilot5": "ATC_RAT_PIT_P", "px4-2026": "MC_PITCHRATE_P"}
 INT_NAME = {"ardupilot5": "RTL_ALT", "px4-2026": "PWM_MAIN_DIS1"}
@@ -87,6 +89,21 @@ def test_vim_that_changed_nothing_sets_nothing(texts: Texts, vim: str) -> None:
     texts.shell(f"{vim} {PAUSE} -c wq params.parm")
     assert texts.told(MOVING[texts.real]) > before
     assert texts.errors() == ""
+
+
+def test_vim_on_a_terminal_saves_without_a_question(texts: Texts) -> None:
+    """Though what the vehicle sets by itself moved between the listing, the open and the save."""
+    texts.shell("ls -l; sleep 2")
+    words = ["vim", "-N", "-i", "NONE", "-n", "-u", "NONE", "--cmd", "set backupskip=", str(texts.all)]
+    terminal = Terminal(words, 100, 30)
+    terminal.read_until(lambda shown: "params.parm" in shown.raw)
+    time.sleep(2)
+    terminal.type(f":%s/^{texts.real},.*/{texts.real},0.75/\r:w\r")
+    terminal.read_until(lambda shown: "written" in shown.raw or "WARNING" in shown.raw)
+    terminal.type(":q\r")
+    assert terminal.finish() == 0
+    assert "WARNING" not in terminal.raw
+    assert texts.told(texts.real) == 0.75
 
 
 def test_vim_hears_of_a_bad_line(texts: Texts) -> None:

@@ -164,6 +164,20 @@ async def test_size_and_time_stay_until_it_is_read_anew() -> None:
         assert (await tree.stat(ALL)).size == before.size + 2
 
 
+async def test_what_the_vehicle_sets_by_itself_gives_no_new_time() -> None:
+    """An editor that looks at the time before it saves would warn each time."""
+    clock = parameter("STAT_RUNTIME", INT32, 100, drift=1)
+    async with vehicle("ardupilot5", parameters=[clock, parameter("GAIN", FLOAT, 1)]) as (here, tree):
+        before = await tree.stat(ALL)
+        await trio.sleep(100)
+        assert b"STAT_RUNTIME,100" not in await read_file(tree, ALL)
+        assert (await tree.stat(ALL)).mtime_ns == before.mtime_ns
+        table_of(here).set(b"GAIN", 2, here.server.firmware.now)
+        await trio.sleep(2)
+        await read_file(tree, ALL)
+        assert (await tree.stat(ALL)).mtime_ns > before.mtime_ns
+
+
 async def test_a_vehicle_that_tells_no_defaults_has_no_changed_parm() -> None:
     async with vehicle("ardupilot5") as (here, tree):
         here.faults.refuse(Opcode.OPEN_FILE_RO, NakCode.FILE_NOT_FOUND, nth=2)
