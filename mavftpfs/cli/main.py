@@ -247,7 +247,11 @@ def _add_verify(parser: Parser) -> None:
 
 
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Fetch files, and verify them; PATH may be a pattern, as '/log/*.ulg'.")
+    parser = _paths_parser(
+        name,
+        "Fetch files, and verify them; PATH may be a pattern, as '/log/*/*.ulg': its matches go into LOCAL "
+        "with their directories from the first * on.",
+    )
     parser.add_argument(
         "--to",
         metavar="LOCAL",
@@ -276,7 +280,7 @@ def _put_parser(name: str) -> Parser:
     parser.add_argument(
         "path",
         metavar="PATH",
-        help="a directory of the vehicle, or the new name of one LOCAL or stdin; or mftp://",
+        help="a directory of the vehicle, or the new name of one LOCAL or stdin; PATH/ is a directory",
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
     return parser

@@ -315,13 +315,14 @@ def parse_date(text: str) -> float:
 def put(args: Args) -> int:
     """Put files on the vehicle."""
     (path,), component = names.parse_paths([args.path])
+    into = args.path.endswith("/")
     if Path(STDIN) in args.locals:
         if len(args.locals) > 1 or args.recursive:
             raise UsageError("what comes from stdin is put alone; leave out -r and the other files")
         with _spooled_stdin() as local:
-            return _put(args, component, partial(upload.put_alone, local=local, path=path))
+            return _put(args, component, partial(upload.put_alone, local=local, path=path, into=into))
     batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
-    return _put(args, component, partial(upload.put_paths, batches=batches, path=path))
+    return _put(args, component, partial(upload.put_paths, batches=batches, path=path, into=into))
 
 
 @contextmanager
@@ -382,7 +383,12 @@ def rmdir(args: Args) -> int:
 def mv(args: Args) -> int:
     """Rename or move."""
     (*wanted, to), component = names.parse_paths([*args.paths, args.target])
-    with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
+    with_session(
+        args,
+        partial(names.move_paths, paths=wanted, to=to, into=args.target.endswith("/")),
+        component,
+        writing=True,
+    )
     return ExitCode.OK
 
 

@@ -26,7 +26,7 @@ from mavftpfs.client.fetch import (
     part_of,
 )
 from mavftpfs.client.files import Found, Session, Unlisted, walk
-from mavftpfs.client.names import matching
+from mavftpfs.client.names import fixed_part, matching
 from mavftpfs.client.proof import BY_CRC32, Proof, Verify, ask_crc32, local_crc32, proof_needed
 from mavftpfs.shared.errors import (
     IsADirectory,
@@ -228,10 +228,12 @@ class Downloads:
         """Fetch files, and with `recursive` directories; names may be patterns.
 
         Where things go depends on what is asked for only, but for one file: it goes into `local` if that is a
-        directory, else under that name. All else goes into `local`, which is made.
+        directory, else under that name. All else goes into `local`, which is made. What a pattern matches
+        goes there with its directories, from the first wildcard on.
 
         Raises:
-            As Fetcher.fetch where only one file is asked for, else as `sync`.
+            UsageError: two files would get one local name; nothing was fetched. Else as Fetcher.fetch where
+            only one file is asked for, else as `sync`.
         """
         alone = len(paths) == 1
         found: list[Wanted] = []
@@ -239,25 +241,31 @@ class Downloads:
             try:
                 names = await matching(self.fetcher.session.files, path)
                 alone = alone and names == [path]
+                top = split(path)[0] if names == [path] else fixed_part(path)
                 for name in names:
-                    found += await self._found(name, local, into=into or not alone, recursive=recursive)
+                    found += await self._found(name, top, local, into=into or not alone, recursive=recursive)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=alone)
+        found = list(dict.fromkeys(found))
+        _require_apart(found)
         self.outcome.wanted = _apart(found)
         await self._fetch_all(alone=alone and [one.remote for one in found] == [*paths])
 
-    async def _found(self, path: bytes, local: Path, *, into: bool, recursive: bool) -> list[Wanted]:
-        """Return the files of a path, for which there are directories then."""
-        stat = await self.fetcher.session.files.stat(path)
-        name = os.fsdecode(split(path)[1])
+    async def _found(
+        self, path: bytes, top: bytes, local: Path, *, into: bool, recursive: bool
+    ) -> list[Wanted]:
+        """Return the files of a path, for which there are directories then; `local` stands for `top`."""
+        session = self.fetcher.session
+        stat = await session.files.stat(path)
+        name = os.fsdecode(path.removeprefix(top).lstrip(b"/"))
         if stat.kind is EntryKind.FILE:
-            return [_wanted(path, _place(local, name, into=into), path, stat)]
+            return [_wanted(path, _place(local, name, into=into), session.on_vehicle(path), stat)]
         if not recursive:
             raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
-        below, unlisted = await walk(self.fetcher.session.files, path)
+        below, unlisted = await walk(session.files, path)
         for unreadable, error in unlisted:
             self.fail(unreadable, error)
-        return _made(path, local / name, below)
+        return _made(session, path, local / name, below)
 
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
         """Hand on the bytes of files, one behind the other.
@@ -314,11 +322,23 @@ def _place(local: Path, name: str, *, into: bool) -> Path:
     """Return where one file goes."""
     if into:
         with local_disk(local):
-            local.mkdir(parents=True, exist_ok=True)
+            (local / name).parent.mkdir(parents=True, exist_ok=True)
     return local / name if local.is_dir() else local
 
 
-def _made(path: bytes, place: Path, found: Found) -> list[Wanted]:
+def _require_apart(wanted: Iterable[Wanted]) -> None:
+    """Check that no file would overwrite another one of the same run."""
+    names: dict[Path, str] = {}
+    for one in wanted:
+        if one.local in names:
+            raise UsageError(
+                f"{names[one.local]} and {one.name} would both become {one.local}; nothing was fetched: "
+                "get each into a directory of its own"
+            )
+        names[one.local] = one.name
+
+
+def _made(session: Session, path: bytes, place: Path, found: Found) -> list[Wanted]:
     """Make the directories below a directory, and return its files."""
     files = []
     with local_disk(place):
@@ -326,7 +346,7 @@ def _made(path: bytes, place: Path, found: Found) -> list[Wanted]:
         for below, stat in found:
             remote, local = join(path, below), place / os.fsdecode(below)
             if stat.kind is EntryKind.FILE:
-                files.append(_wanted(remote, local, remote, stat))
+                files.append(_wanted(remote, local, session.on_vehicle(remote), stat))
             else:
                 local.mkdir(exist_ok=True)
     return files

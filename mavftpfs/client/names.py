@@ -56,6 +56,16 @@ def is_pattern(name: bytes) -> bool:
     return re.search(rb"[*?[]", name) is not None
 
 
+def fixed_part(pattern: bytes) -> bytes:
+    """Return the directory above the first part of a pattern that has what stands for other characters."""
+    fixed = ROOT
+    for part in pattern.strip(b"/").split(b"/"):
+        if is_pattern(part):
+            break
+        fixed = join(fixed, part)
+    return fixed
+
+
 async def matching(files: Files, path: bytes) -> list[bytes]:
     """Return the paths that match a pattern as in a shell, sorted; a path that is there, or is none, itself.
 
@@ -300,17 +310,36 @@ async def _remove(files: Files, path: bytes, kind: EntryKind) -> None:
     await files.rmdir(path)
 
 
-async def move_paths(session: Session, paths: Sequence[bytes], to: bytes) -> None:
-    """Move things into the directory `to`, or one thing to that name.
+async def require_directory(files: Files, path: bytes) -> None:
+    """Check that a path, written with a `/` at its end, is a directory.
 
     Raises:
-        NotADirectory: several things, and `to` is no directory. Else as Files.rename.
+        NotADirectory, NotFound: it is not.
     """
-    into = await is_directory(session.files, to)
-    if not into and len(paths) > 1:
+    try:
+        kind = (await files.stat(path)).kind
+    except NotFound:
+        raise NotFound(f"{name_text(path)}/: there is no such directory") from None
+    if kind is not EntryKind.DIRECTORY:
+        raise NotADirectory(f"{name_text(path)}/ is no directory")
+
+
+async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, into: bool = False) -> None:
+    """Move things into the directory `to`, or one thing to that name.
+
+    into: `to` was written with a `/` at its end: a file goes into that directory only.
+
+    Raises:
+        NotADirectory: several things, or a file is to go into it, and `to` is no directory; NotFound: it is
+        not there. Else as Files.rename.
+    """
+    inside = await is_directory(session.files, to)
+    if not inside and len(paths) > 1:
         raise NotADirectory(f"{name_text(to)} is no directory, so only one thing can be moved there")
+    if into and not inside and not await is_directory(session.files, paths[0]):
+        await require_directory(session.files, to)
     for path in paths:
-        await move(session.files, path, join(to, split(path)[1]) if into else to)
+        await move(session.files, path, join(to, split(path)[1]) if inside else to)
 
 
 async def move(files: Files, old: bytes, new: bytes) -> None:

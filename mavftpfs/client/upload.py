@@ -18,7 +18,7 @@ import trio
 
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import READ_SIZE, WITHDRAWAL_TIME, File, Session, is_directory, written
-from mavftpfs.client.names import emptied, make_directory
+from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
 from mavftpfs.shared.errors import (
     CrossDevice,
@@ -75,42 +75,73 @@ async def put_paths(
     path: bytes,
     progress: Progress,
     tell: Callable[[bytes, int], None],
+    *,
+    into: bool = False,
 ) -> None:
     """Put what `collect` found to `path`: an existing directory, or a new name for one thing.
 
-    `tell` hears name and size of each file that is on the vehicle.
+    `tell` hears the vehicle's name and the size of each file that is there. into: `path` was written with a
+    `/` at its end: a file goes into that directory only.
 
     Raises:
-        NotADirectory: several things, and `path` is no directory. UsageError: of what is local.
-        NotDelivered: a file did not get to the vehicle; what was told before is there.
+        NotADirectory: several things, or a file is to go into it, and `path` is no directory; NotFound: it is
+        not there. UsageError: of what is local, or two files would get one name. All that before anything is
+        sent. NotDelivered: a file did not get to the vehicle; what was told before is there.
     """
-    into = await is_directory(session.files, path)
-    if not into and len(batches) > 1:
+    inside = await is_directory(session.files, path)
+    if not inside and len(batches) > 1:
         raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
-    sizes = [one.stat().st_size for _, found in batches for one in found if not one.is_dir()]
+    if into and not inside and not batches[0][0].is_dir():
+        await require_directory(session.files, path)
+    plan = _placed(batches, path, inside=inside)
+    sizes = [one.stat().st_size for one in plan.values() if not one.is_dir()]
     progress.plan(len(sizes), sum(sizes))
+    for remote, one in plan.items():
+        if one.is_dir():
+            await make_directory(session.files, remote, may_exist=True)
+        else:
+            tell(session.on_vehicle(remote), await put_file(session, one, remote, progress))
+
+
+def _placed(
+    batches: Sequence[tuple[Path, Sequence[Path]]], path: bytes, *, inside: bool
+) -> dict[bytes, Path]:
+    """Return what becomes what on the vehicle, parents first; directories of one name become one.
+
+    Raises:
+        UsageError: two would get one name.
+    """
+    plan: dict[bytes, Path] = {}
     for local, found in batches:
-        place = join(path, os.fsencode(local.absolute().name)) if into else path
+        place = join(path, os.fsencode(local.absolute().name)) if inside else path
         for one in found:
             remote = normalise(join(place, os.fsencode(one.relative_to(local))))
-            if one.is_dir():
-                await make_directory(session.files, remote, may_exist=True)
-            else:
-                tell(remote, await put_file(session, one, remote, progress))
+            other = plan.setdefault(remote, one)
+            if other != one and not (other.is_dir() and one.is_dir()):
+                raise UsageError(f"{other} and {one} would both become {name_text(remote)}; nothing was sent")
+    return plan
 
 
 async def put_alone(
-    session: Session, local: Path, path: bytes, progress: Progress, tell: Callable[[bytes, int], None]
+    session: Session,
+    local: Path,
+    path: bytes,
+    progress: Progress,
+    tell: Callable[[bytes, int], None],
+    *,
+    into: bool = False,
 ) -> None:
     """Put one file under a name that its own does not tell, as of what came from stdin; else as `put_paths`.
 
     Raises:
-        IsADirectory: the path is a directory.
+        IsADirectory: the path is a directory, or is written as one.
     """
-    if await is_directory(session.files, path):
-        raise IsADirectory(f"{name_text(path)} is a directory; name the file that stdin is to become")
+    if into or await is_directory(session.files, path):
+        raise IsADirectory(
+            f"{name_text(path)}{'/' * into} is a directory; name the file that stdin is to become"
+        )
     progress.plan(1, os.stat(local).st_size)
-    tell(path, await put_file(session, local, path, progress))
+    tell(session.on_vehicle(path), await put_file(session, local, path, progress))
 
 
 async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> int:
@@ -122,14 +153,16 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
     try:
         with local.open("rb") as source:
             planned = os.fstat(source.fileno()).st_size
-            progress.begin(name_text(remote), planned)
+            progress.begin(name_text(session.on_vehicle(remote)), planned)
             size = await _send(session, source, remote, progress)
     except OSError as exc:
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
-        name = name_text(remote)
+        name = name_text(session.on_vehicle(remote))
         # What is written beside has a name that only we know.
-        reason = re.sub(_BESIDE, lambda _: name_text(split(remote)[1]), str(exc)).removeprefix(f"{name}: ")
+        reason = re.sub(_BESIDE, lambda _: name_text(split(remote)[1]), str(exc)).removeprefix(
+            f"{name_text(remote)}: "
+        )
         done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
         told = f"{name} was not delivered: {reason}{done}"
         if isinstance(exc, NotFound | NotADirectory):

@@ -382,9 +382,9 @@ async def test_what_is_made_anew_at_each_opening_is_never_skipped(tmp_path: Path
     [
         (b"/l/*.ulg", ["a.ulg", "b.ulg"]),
         (b"/l/[b-c].*", ["b.ulg"]),
-        (b"/?/a.ulg", ["a.ulg"]),
+        (b"/?/a.ulg", ["l/a.ulg"]),
         (b"/l/*", ["[odd]", "a.ulg", "b.ulg"]),
-        (b"/*/.*", [".x"]),
+        (b"/*/.*", ["l/.x"]),
         (b"/l/[odd]", ["[odd]"]),
     ],
 )
@@ -392,8 +392,48 @@ async def test_patterns(tmp_path: Path, pattern: bytes, come: list[str]) -> None
     files = {b"/l/a.ulg": b"1", b"/l/b.ulg": b"2", b"/l/.x": b"3", b"/l/[odd]": b"4", b"/f": b"5"}
     for _ in range(2):
         outcome, _ = await get_all(SpoiltTree(dict(files)), pattern, to=tmp_path / "new", into=True)
-    assert names_in(tmp_path / "new") == come
+    new = tmp_path / "new"
+    assert sorted(str(path.relative_to(new)) for path in new.rglob("*") if path.is_file()) == come
     assert len(outcome.here) == len(come)
+
+
+TWINS = {b"/fs/log/1/a.ulg": b"one", b"/fs/log/2/a.ulg": b"two", b"/fs/log/2/b.ulg": b"three"}
+
+
+@pytest.mark.parametrize("pattern", [b"/fs/log/*/*.ulg", b"/fs/log/*", b"/fs/l*"])
+async def test_a_pattern_keeps_the_directories_from_its_first_wildcard_on(
+    tmp_path: Path, pattern: bytes
+) -> None:
+    """Logs of two days often have one name."""
+    await get_all(SpoiltTree(dict(TWINS)), pattern, to=tmp_path / "logs")
+    top = tmp_path / "logs" / ("log" if pattern.endswith(b"l*") else "")
+    assert [(top / name).read_bytes() for name in ("1/a.ulg", "2/a.ulg", "2/b.ulg")] == [*TWINS.values()]
+
+
+@pytest.mark.parametrize(
+    "paths", [(b"/fs/log/1/a.ulg", b"/fs/log/2/a.ulg"), (b"/fs/log/1/*", b"/fs/log/2/*")]
+)
+async def test_two_files_of_one_local_name_are_refused_before_anything_is_fetched(
+    tmp_path: Path, paths: tuple[bytes, ...]
+) -> None:
+    with pytest.raises(
+        UsageError, match=r"/fs/log/1/a\.ulg and /fs/log/2/a\.ulg would both become .*/a\.ulg"
+    ):
+        await get_all(SpoiltTree(dict(TWINS)), *paths, to=tmp_path)
+    assert names_in(tmp_path) == []
+
+
+async def test_a_file_that_is_named_twice_comes_once(tmp_path: Path) -> None:
+    outcome, _ = await get_all(SpoiltTree(dict(TWINS)), b"/fs/log/2/*", b"/fs/log/2/b.ulg", to=tmp_path)
+    assert (len(outcome.fetched), names_in(tmp_path)) == (2, ["a.ulg", "b.ulg"])
+
+
+async def test_files_have_the_vehicle_s_names_below_a_directory_of_a_mount(tmp_path: Path) -> None:
+    outcome = Outcome()
+    fetcher = fetcher_of(SpoiltTree({b"/a": b"1", b"/d/b": b"2"}), root=b"/fs/etc")
+    downloads = Downloads(fetcher, outcome, lambda _: None, print)
+    await downloads.get([b"/a", b"/d"], tmp_path, into=False, recursive=True)
+    assert [one.wanted.name for one in outcome.fetched] == ["/fs/etc/a", "/fs/etc/d/b"]
 
 
 async def test_a_pattern_for_one_file_means_a_directory_all_the_same(tmp_path: Path) -> None:

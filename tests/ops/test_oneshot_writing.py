@@ -20,6 +20,7 @@ from mavftpfs.shared.errors import (
     ExitCode,
     IsADirectory,
     MavftpfsError,
+    NotADirectory,
     NotDelivered,
     NotFound,
     ReadOnly,
@@ -74,11 +75,13 @@ def local(tmp_path: Path) -> Path:
     return root
 
 
-async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) -> list[bytes]:
+async def put(
+    tree: Card, *locals_: Path, to: bytes, recursive: bool = False, into: bool = False
+) -> list[bytes]:
     told: list[bytes] = []
     batches = [(local, collect(local, recursive=recursive)) for local in locals_]
     progress = Progress()
-    await put_paths(session_of(tree), batches, to, progress, lambda remote, _: told.append(remote))
+    await put_paths(session_of(tree), batches, to, progress, lambda remote, _: told.append(remote), into=into)
     assert (progress.files_done, progress.name, progress.done) == (len(told), "", progress.total)
     assert all(file.closed for file in tree.opened)
     return told
@@ -92,6 +95,36 @@ async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) 
     assert tree.files == expected
     assert place + b"/e/f" in tree.directories
     assert set(told) == expected.keys()
+
+
+async def test_two_files_of_one_name_are_refused_before_anything_is_sent(local: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    (other / "d").mkdir(parents=True)
+    (other / "d" / "a").write_bytes(b"another")
+    tree = Card({}, {b"/there"})
+    for locals_ in ((local / "a", other / "d" / "a"), (local, other / "d")):
+        with pytest.raises(UsageError, match=f"{local}/a and {other}/d/a would both become /there/"):
+            await put(tree, *locals_, to=b"/there", recursive=True)
+    assert (tree.files, tree.directories - {b"/"}) == ({}, {b"/there"})
+    (other / "d" / "a").rename(other / "d" / "b")
+    told = await put(tree, local, other / "d", local, to=b"/there", recursive=True)
+    assert {b"/there/d/a", b"/there/d/b"} < set(told)
+
+
+@pytest.mark.parametrize(("to", "error"), [(b"/f", NotADirectory), (b"/none", NotFound)])
+async def test_a_path_that_ends_in_a_slash_is_a_directory(
+    local: Path, to: bytes, error: type[MavftpfsError]
+) -> None:
+    tree = Card({b"/f": b"old", b"/x": b"x"}, {b"/there"})
+    with pytest.raises(error, match=f"{to.decode()}/"):
+        await put(tree, local / "a", to=to, into=True)
+    with pytest.raises(error, match=f"{to.decode()}/"):
+        await names.move_paths(session_of(tree), [b"/x"], to, into=True)
+    with pytest.raises(IsADirectory, match="stdin"):
+        await put_alone(session_of(tree), local / "a", to, Progress(), print, into=True)
+    assert tree.files == {b"/f": b"old", b"/x": b"x"}
+    assert await put(tree, local / "a", to=b"/there", into=True) == [b"/there/a"]
+    assert len(await put(tree, local, to=b"/new", recursive=True, into=True)) == 3
 
 
 @pytest.mark.parametrize("what", ["directory", "missing", "fifo", "link to a directory"])
