@@ -178,8 +178,12 @@ class Hub:
             except (MavftpfsError, KeyError, TypeError, ValueError) as exc:
                 sock.send(pack_facts({"refused": str(exc)}))
             else:
-                sock.send(pack_facts({"own": client.own, "number": client.number}))
                 self._came.set()
+                try:
+                    sock.send(pack_facts({"own": client.own, "number": client.number}))
+                except OSError:
+                    self._leave(client)  # it was gone before it was let in
+                    raise
                 return client
         elif "status" in hello:
             sock.send(pack_facts(self.status()))
