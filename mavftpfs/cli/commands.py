@@ -49,6 +49,9 @@ def mount(args: argparse.Namespace) -> int:
         mountpoint.check_mountpoint(place)
     except DeadMount as exc:
         raise DeadMount("; ".join(filter(None, (str(exc), left_by_killed_mounts_line())))) from exc
+    inside = None if args.member else mountpoint.enclosing_mount(os.path.dirname(place))
+    if inside is not None:
+        raise MountFailed(f"{place} lies in the mount on {inside[0]}; mount on a directory of this computer")
     work = partial(_serve, args, options, spec, place)
     if args.foreground or args.debug or args.member:
         return work(_report_in_foreground)
@@ -62,6 +65,8 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
         UsageError: one of them is wrong.
     """
     options = parse_options(args.options)
+    if os.path.isdir(args.source) and ":" in getattr(args, "mountpoint", ""):
+        raise UsageError(f"SOURCE comes first, then the directory: {args.mountpoint} {args.source}")
     spec = parse_source(args.source)
     client = with_root(options.client, spec.subtree)
     return replace(options, client=client), spec if client.baud is None else replace(spec, baud=client.baud)
@@ -88,6 +93,8 @@ def _serve(
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
     with open_sinks(options.client, debug=args.debug, tell=say) as sinks:
+        if not args.member and os.listdir(place):
+            say(f"{place} is not empty: what is in it is hidden until it is unmounted")
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         if options.all:
             from mavftpfs.mount.supervisor import run_all

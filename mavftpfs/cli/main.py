@@ -7,6 +7,7 @@ the simulator in memory.
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -94,8 +95,16 @@ def _run(words: list[str]) -> int:
     except UsageError:
         if name.startswith("-") or ":" in name or "/" in name:
             raise
-        raise UsageError(f"{name!r} is no command and no SOURCE; try: {parser.prog} --help") from None
+        raise _no_command(name) from None
+    if not any(mark in args.source for mark in ":/"):
+        raise _no_command(args.source)
     return commands.mount(args)
+
+
+def _no_command(word: str) -> UsageError:
+    near = difflib.get_close_matches(word, _COMMANDS, 1)
+    hint = f"did you mean {near[0]}?" if near else "try: mavftpfs --help"
+    return UsageError(f"{word!r} is no command and no SOURCE; {hint}")
 
 
 # -- parsers --------------------------------------------------------------------------------------

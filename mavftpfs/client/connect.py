@@ -30,7 +30,8 @@ from mavftpfs.client.status import Watcher, holder_of, snapshot
 from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
-from mavftpfs.link.messages import Address
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.link.peers import describe_peer
 from mavftpfs.link.rendezvous import same_link
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
@@ -237,9 +238,11 @@ async def with_tree(
     keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
     async with plain_nursery() as nursery:
         with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
-            notice: Callable[[], str] = str
-            if spool is not None and rescue_for is not None:
-                notice = partial(rescue, spool, rescue_for)
+
+            def notice() -> str:
+                left = rescue(spool, rescue_for) if spool is not None and rescue_for is not None else ""
+                return "; ".join(filter(None, (others_heard(connection, options), left)))
+
             tree = Tree(
                 connection.store,
                 caches,
@@ -260,9 +263,28 @@ async def with_tree(
                     spool.discard()
 
 
+def others_heard(connection: Connection, options: Options) -> str:
+    """Return a line on vehicles that are heard beside the one that was taken because it came first, or ""."""
+    vehicle = connection.vehicle
+    if options.target_system or vehicle.address is None:
+        return ""
+    mine = vehicle.address.system
+    others = [
+        heartbeat
+        for heartbeat in vehicle.heard.values()
+        if heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.source.system != mine
+    ]
+    if not others:
+        return ""
+    names = ", ".join(f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in others)
+    first = f"{mine}/{vehicle.address.component}"
+    return f"this is {first}; {names} is heard, too: -o target_system={others[0].source.system}, or -o all"
+
+
 def process_name() -> str:
     """Return what a hub shows people of this program: its words, and its number."""
-    return f"{' '.join(sys.argv[1:4])} (process {os.getpid()})"
+    words = [word for word in sys.argv[1:4] if not word.startswith("-")]
+    return f"{' '.join(words)} (process {os.getpid()})"
 
 
 @asynccontextmanager

@@ -143,7 +143,9 @@ async def put_back(
     """
     for kept in wanted:
         if kept.hindrance:
-            raise UsageError(f"{kept.file}: {kept.hindrance}; look at it, and use `mavftpfs put`")
+            raise UsageError(
+                f"{kept.file}: {kept.hindrance}; look at it, use `mavftpfs put`, and delete it here"
+            )
     progress.plan(len(wanted), sum(kept.size for kept in wanted))
     for kept in wanted:
         path = _in_session(session, kept)

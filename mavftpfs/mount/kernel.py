@@ -295,12 +295,12 @@ class _Life:
     # -- signals ----------------------------------------------------------------------------------
 
     async def watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Unmount on the first signal, stop waiting for anybody on the second."""
+        """Unmount on the first signal; stop waiting for anybody on the second, or once the mount is gone."""
         with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
             task_status.started()
             async for number in signals:
                 log.info("signal %s", signal.Signals(number).name)
-                if self._stop_asked or not self.mounted:
+                if self._stop_asked or self._let_go or not self.mounted:
                     self.scope.cancel()
                 else:
                     self._stop_gently()

@@ -8,6 +8,7 @@ words, so that a line of /etc/fstab can be given to them.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -158,7 +159,8 @@ def _refusal(name: str, word: str) -> str:
         return "option remount is not supported: unmount, and mount with the new options"
     if name == "max_read":
         return "option max_read is not supported: the FUSE binding cannot start with it"
-    return f"unknown option {word!r}"
+    near = difflib.get_close_matches(name, [*VALUES, *FLAGS], 1)
+    return f"unknown option {word!r}" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _replace_word(word: str, words: list[str]) -> None:

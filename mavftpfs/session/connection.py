@@ -113,10 +113,11 @@ class Connection:
         with trio.move_on_after(soon):
             await self._first_heartbeat.wait()
             return
-        on_wait()
-        with trio.move_on_after(timeout - soon):
-            await self._first_heartbeat.wait()
-            return
+        if timeout > soon:
+            on_wait()
+            with trio.move_on_after(timeout - soon):
+                await self._first_heartbeat.wait()
+                return
         raise self.nobody(timeout)
 
     def nobody(self, timeout: float) -> VehicleLost:
@@ -186,7 +187,8 @@ class Connection:
         if not heard and bad_signatures:
             return f": heard only {bad_signatures} frames with no or a bad signature; check signing_key"
         if not heard:
-            return ": no heartbeat heard at all; check SOURCE, cable, baud rate and port"
+            what = "cable and baud rate" if self.link.is_serial else "address, port and firewall"
+            return f": no heartbeat heard at all; check SOURCE: {what}"
         names = ", ".join(
             f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in heard
         )

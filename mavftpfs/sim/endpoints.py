@@ -307,7 +307,9 @@ async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, o
             # The vehicle was built before its link: only now is it known whether it hears a stream.
             vehicle.set_stream(link.is_stream)
             endpoint = Endpoint(vehicle, link, model)
-            _say(out, f"mavftpfs {client_source(link)} MOUNTPOINT")
+            system = vehicle.address.system
+            target = "" if system == AUTOPILOT.system else f" -o target_system={system}"
+            _say(out, f"mavftpfs {client_source(link)} MOUNTPOINT{target}")
             async with trio.open_nursery() as nursery:
                 nursery.start_soon(endpoint.run)
                 async for number in arriving:

@@ -47,6 +47,18 @@ def test_a_missing_remote_root_is_named(field: Field, small_tree: Path, mountpoi
     assert "/no/such" in complaint(f"{source}#/no/such", mountpoint, code=1)
 
 
+def test_a_mount_is_not_put_onto_a_vehicle_and_says_what_it_hides(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    mount = field.mount(vehicle.source)
+    inside = next(path for path in mount.path.iterdir() if path.is_dir())
+    assert f"lies in the mount on {mount.path}" in complaint(vehicle.source, inside, code=3)
+    full = field.local("full")
+    (full / "file").write_text("")
+    source = f"udpin:{HOST}:{free_udp_port()}"
+    said = mavftpfs(source, full, "-o", "connect_timeout=1", code=2)[1]
+    assert f"{full} is not empty: what is in it is hidden" in said
+
+
 def test_no_fuse_device_is_exit_3(mountpoint: Path) -> None:
     hide = 'mount -t tmpfs none /dev && exec "$@"'
     command = ["unshare", "--mount", "sh", "-c", hide, "sh", sys.executable, "-m", "mavftpfs"]

@@ -66,6 +66,23 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
+def test_a_signal_ends_the_delivery_of_a_mount_that_is_unmounted(
+    field: Field, data: Path, state: Path
+) -> None:
+    vehicle = field.sim(field.local("card"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process, mount.process = mount.alive(), None
+    with mount.started(*MAVFTPFS, "umount", mount.path) as child:
+        wait_until("it delivers before it ends", lambda: "delivering" in process.text())
+        process.send_signal(signal.SIGTERM)
+        _, errors = child.communicate(timeout=60)
+        assert child.returncode == ExitCode.UNDELIVERED
+    assert process.wait() == ExitCode.UNDELIVERED
+    assert f"1 file(s) did not reach the vehicle; they are kept in {state}" in errors
+
+
 def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
     """Have a mount end with a file that is not delivered; return it, a vehicle that answers, and its card."""
     card = field.local("card")

@@ -208,3 +208,16 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
     async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
         with pytest.raises(VehicleLost, match="compare the clocks"):
             await connection.ready(5)
+
+
+@pytest.mark.parametrize("target", [0, 1])
+async def test_another_vehicle_that_is_heard_is_said(target: int, autojump: MockClock) -> None:
+    options = Options(target_system=target)
+    async with world("px4").connection() as connection:
+        assert compose.others_heard(connection, options) == ""
+        other, station = Address(2, 1), Address(255, 190)
+        heard = connection.vehicle.heard
+        heard[other] = Heartbeat(other, 2, 3, armed=False)
+        heard[station] = Heartbeat(station, MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, armed=False)
+        said = "this is 1/1; 2/1 (ArduPilot quadrotor, disarmed) is heard, too: -o target_system=2, or -o all"
+        assert compose.others_heard(connection, options) == ("" if target else said)

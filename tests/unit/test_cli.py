@@ -76,6 +76,9 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
     [
         ((SOURCE,), "MOUNTPOINT"),
         (("lss", SOURCE, "/"), "'lss' is no command"),
+        (("lss", "/tmp"), "did you mean ls?"),
+        ((SOURCE, "/mnt", "-o", "dir_timout=3"), "did you mean dir_timeout?"),
+        (("/tmp", SOURCE), "SOURCE comes first"),
         (("ls",), "required: SOURCE; try"),
         ((SOURCE, "/mnt", "extra"), "extra"),
         ((SOURCE, "/mnt", "-o"), "-o"),
