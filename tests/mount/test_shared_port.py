@@ -14,7 +14,9 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.link.rendezvous import HUB, hubs
+from mavftpfs.link.hublink import PROTOCOL, pack_facts
+from mavftpfs.link.rendezvous import HUB, hubs, knock, port_name
+from mavftpfs.link.uri import parse_source
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 from tests.support.vehicles import HOST, free_udp_port
@@ -168,3 +170,17 @@ def test_scan_shows_all_vehicles_of_a_port_that_is_mounted(field: Field) -> None
     one = field.mount(source, "target_system=1")
     found = json.loads(command(one, "scan", "--json", source))
     assert {entry["system"] for entry in found if entry["answers"]} == {1, 2}
+
+
+def test_a_client_that_is_gone_before_it_is_let_in_keeps_no_hub_up(field: Field) -> None:
+    _, source = two_vehicles(field)
+    one = field.mount(source, "target_system=1")
+    two = field.mount(source, "target_system=2")
+    hello = {"protocol": PROTOCOL, "join": source, "own": [254, 191], "forward": []}
+    for _ in range(5):
+        sock = knock(port_name(parse_source(source)))
+        assert sock is not None
+        sock.send(pack_facts(hello))
+        sock.close()
+    assert [one.unmount(), two.unmount()] == [0, 0]
+    wait_until("the hub ended", lambda: hub_of(one, source) is None)
