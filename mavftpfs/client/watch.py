@@ -29,7 +29,7 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected
-from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound
+from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.shared.readable import readable_size
 
 REOPEN = 5.0
@@ -166,7 +166,7 @@ class Watch:
                     async with opened(target.spec, target.options) as link:
                         self._settled("link")
                         await self.run_on(link, target.spec, target.options, target.sinks)
-                except LinkError as exc:
+                except (LinkError, RequestTimeout) as exc:
                     self._complain("link", str(exc))
                 await trio.sleep(REOPEN)
 
