@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mavftpfs.cli.report import time_left
-from mavftpfs.client.progress import Progress
+from mavftpfs.client.progress import WAITING, Progress
 from mavftpfs.shared.readable import printable, readable_size
 
 _REFRESH = 5
@@ -28,6 +28,8 @@ def totals(progress: Progress) -> str:
     """Return the line of the total."""
     parts = [f"{progress.files_done}/{progress.files} files"] if progress.files > 1 else []
     parts.append(f"{readable_size(progress.done)} of {readable_size(progress.total)}")
+    if progress.lost:
+        return ", ".join([*parts, WAITING])
     if progress.rate is not None:
         parts.append(f"{readable_size(progress.rate)}/s")
     if progress.time_left is not None and progress.done < progress.total:
@@ -39,7 +41,7 @@ def current(progress: Progress, width: int) -> str:
     """Return the line of the file at work, cut to a width: the end of a name tells more than its start."""
     if not progress.name:
         return ""
-    state = progress.state
+    state = "" if progress.lost else progress.state  # the total says it
     if not state and progress.files > 1:
         state = f"{readable_size(progress.here)} of {readable_size(progress.size)}"
     name, room = printable(progress.name), width - len(state) - 2

@@ -30,7 +30,7 @@ from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory
-from mavftpfs.client.progress import Progress
+from mavftpfs.client.progress import Progress, noting_losses
 from mavftpfs.client.source import target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
@@ -243,7 +243,8 @@ def _download(
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify, getattr(args, "resume", True))
-        await function(download.Downloads(fetcher, outcome, tell, say))
+        async with noting_losses(session, bar):
+            await function(download.Downloads(fetcher, outcome, tell, say))
 
     with _on_interrupt(lambda: _here(outcome)), drawing.shown(bar):
         with_session(args, work, component)
@@ -343,7 +344,8 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
         print(f"{_name(remote)}: {readable_size(size)}, {how}", flush=True)
 
     async def work(session: Session) -> None:
-        await function(session, progress=bar, tell=tell)
+        async with noting_losses(session, bar):
+            await function(session, progress=bar, tell=tell)
 
     def stopped() -> str:
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"
@@ -414,7 +416,8 @@ def recover(args: Args) -> int:
         print(f"{_name(kept.path or b'')} {how}; the copy here is removed", flush=True)
 
     async def work(session: Session) -> None:
-        await recovering.put_back(session, wanted, bar, tell, force=args.force)
+        async with noting_losses(session, bar):
+            await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
     with drawing.shown(bar):
         with_session(args, work, writing=True)

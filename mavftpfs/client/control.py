@@ -248,7 +248,7 @@ def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], N
                 line = lines.readline(MAX_LINE)
         reply = json.loads(line)
     except (ConnectionError, FileNotFoundError) as exc:
-        raise NobodyThere(f"the mount's process is gone: {exc}") from exc
+        raise NobodyThere("the mount's process is gone") from exc
     except (OSError, ValueError) as exc:
         raise ControlError(f"no answer from the mount's process: {exc}") from exc
     if not isinstance(reply, dict) or not reply.get("ok"):

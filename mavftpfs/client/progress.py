@@ -7,11 +7,19 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+
+import trio
+
+from mavftpfs.client.connect import plain_nursery
+from mavftpfs.client.files import Session, mount_status
+from mavftpfs.shared.errors import LinkError
 
 RATE_SPAN = 10.0
 """Seconds over which the rate is measured."""
 _SAMPLE = 0.2
+WAITING = "waiting for the vehicle"
 
 
 class Progress:
@@ -25,6 +33,7 @@ class Progress:
         self.name = ""
         self.size = self.here = 0
         self.state = ""
+        self.lost = False
 
     def plan(self, files: int, total: int) -> None:
         """Say how much there is to do in all, from now on; no files: nothing."""
@@ -49,7 +58,13 @@ class Progress:
 
     def wait(self) -> None:
         """The vehicle is lost."""
-        self.state = "waiting for the vehicle"
+        self.state = WAITING
+
+    def note_lost(self, lost: bool) -> None:
+        """The vehicle is lost, or is heard again: how fast bytes moved before tells nothing any more."""
+        if lost or self.lost:
+            self._samples.clear()
+        self.lost = lost
 
     def end(self, planned: int) -> None:
         """The file is through, well or not; `planned`: its bytes in the plan."""
@@ -82,3 +97,27 @@ class Progress:
             self._samples.append((now, self._moved))
         while now - self._samples[0][0] > RATE_SPAN and len(self._samples) > 2:
             self._samples.popleft()
+
+
+LOOK_PERIOD = 0.5
+"""Seconds between two looks whether the vehicle is heard."""
+
+
+@asynccontextmanager
+async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[None]:
+    """Tell progress during the body whether the vehicle is lost, whoever waits for it: we, or a mount."""
+
+    async def lost() -> bool:
+        if session.mountpoint is None:
+            return session.silent()
+        return (await mount_status(session.mountpoint))["link"]["state"] in ("lost", "replaced")
+
+    async def watch() -> None:
+        while True:
+            with suppress(LinkError):  # of a mount that is gone the body hears
+                progress.note_lost(await lost())
+            await trio.sleep(LOOK_PERIOD)
+
+    async with plain_nursery() as nursery:
+        nursery.start_soon(watch)
+        yield

@@ -193,7 +193,10 @@ def status_of(mountpoint: str) -> Status:
         status = _status_of(mountpoint, mount)
         if status is not None:
             return status
-    return _ask(control.find_socket(mountpoint, control.own_directories()))
+    try:
+        return _ask(control.find_socket(mountpoint, control.own_directories()))
+    except NobodyThere:  # it may have left its socket
+        raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}") from None
 
 
 def told_by(mountpoint: str) -> Status | None:

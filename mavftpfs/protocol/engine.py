@@ -95,8 +95,9 @@ class Engine:
 
     @property
     def rtt(self) -> float | None:
-        """Smoothed round trip in seconds: of reads, else of any request; None before the first."""
-        for timer in self._timers.of.values():
+        """Smoothed round trip in seconds: of the reads or writes that came last, else of any request; None
+        before the first."""
+        for timer in (self._timers.moving, *self._timers.of.values()):
             if timer.samples:
                 return timer.smoothed
         return None

@@ -26,6 +26,7 @@ A mount begins with a listing, whose loss somebody waits for. Each transmission 
 it is repeated in vain its answer tells the round trip all the same, and a second execution changes nothing.
 """
 
+_MOVING = ("data", "write")
 _WORK = "work"
 _NO_WORK = 0.1
 """Seconds of work that count as none: what takes no longer times the way and the server's readiness."""
@@ -89,13 +90,15 @@ class RttEstimator:
 
 
 class Timers:
-    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first."""
+    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first; moving: that of
+    the data that moved last, read or written, if any did."""
 
     def __init__(self) -> None:
         self.of = {
             family: RttEstimator(floor, _FIRST_WAITS.get(family, INITIAL_RTO))
             for family, floor in FLOORS.items()
         }
+        self.moving = self.of["data"]
         self._at = self._sent_at = -inf
         self._manner: Manner | None = None
 
@@ -120,6 +123,8 @@ class Timers:
                 return now - sent_at  # most of it was work
             timer = self.of[request.manner.family]
             timer.sample(now - sent_at)
+            if request.manner.family in _MOVING:
+                self.moving = timer
             if timer.samples == 1:
                 # A family without samples would wait 1 s. Start it from another family's first sample, which
                 # allows for three round trips.

@@ -136,6 +136,24 @@ def test_a_dead_mount_is_said_to_be_dead(field: Field, small_tree: Path) -> None
         abort_mount(mount.path)
 
 
+def test_watching_a_mount_that_is_killed_and_cleared_ends_in_a_line(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source)
+    argv, pipe = [*STATUS, "--watch", str(mount.path)], subprocess.PIPE
+    with subprocess.Popen(argv, stdout=pipe, stderr=pipe, text=True, cwd=PROJECT) as watch:
+        assert watch.stdout is not None
+        assert watch.stderr is not None
+        assert "link fine" in watch.stdout.readline()
+        mount.kill()
+        try:
+            assert any("DEAD: its program is gone" in line for line in watch.stdout)
+        finally:
+            abort_mount(mount.path)
+        assert watch.wait(COMMAND_TIMEOUT) == ExitCode.MOUNT_FAILED
+        assert watch.stderr.read() == f"mavftpfs: no vehicle of yours is mounted on {mount.path}\n"
+
+
 def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
     field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,29 @@ def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
     assert totals(progress) == "920.0 kB of 1.0 MB, 10.0 kB/s, 8.0 s left"
 
 
+def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it() -> None:
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan(1, 1_000_000)
+    progress.begin("/a", 1_000_000)
+    for _ in range(3):
+        clock.now += 2
+        progress.at(progress.here + 20_000)
+    progress.note_lost(False)
+    assert totals(progress) == "60.0 kB of 1.0 MB, 10.0 kB/s, 1 min 34 s left"
+    progress.wait()
+    progress.note_lost(True)
+    assert totals(progress) == "60.0 kB of 1.0 MB, waiting for the vehicle"
+    assert current(progress, 80) == "/a"
+    clock.now += 60
+    progress.begin("/a", 1_000_000, 60_000)
+    progress.note_lost(False)
+    progress.at(60_000)
+    clock.now += 2
+    progress.at(80_000)
+    assert totals(progress) == "80.0 kB of 1.0 MB, 10.0 kB/s, 1 min 32 s left"
+
+
 def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
     progress = Progress(Clock())
     progress.plan(1, 1000)

@@ -146,3 +146,13 @@ def test_what_is_done_at_once_is_repeated_several_times_before_waits_double() ->
 def test_without_a_round_trip_known_waits_double_at_once() -> None:
     timers = Timers()
     assert [timers.wait(path(sends)) for sends in (1, 2, 3)] == [1.0, 2.0, 3.0]
+
+
+def test_the_round_trip_is_that_of_what_moved_last() -> None:
+    """A link may become slow while a program only writes."""
+    timers = Timers()
+    for opcode, rtt in ((Opcode.READ_FILE, 0.001), (Opcode.WRITE_FILE, 0.1), (Opcode.LIST_DIRECTORY, 9.0)):
+        answered(timers, opcode, rtt)
+    assert timers.moving.smoothed == pytest.approx(0.1)
+    answered(timers, Opcode.READ_FILE, 0.001)
+    assert timers.moving.smoothed == pytest.approx(0.001)
