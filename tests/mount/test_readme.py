@@ -165,7 +165,7 @@ def test_the_guide_names_the_keys_of_json(home: Home, field: Field) -> None:
     home.mountpoint.mkdir()
     home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
     status = json.loads(home.run("mavftpfs status --json ~/drone"))
-    assert told_keys("status") == set(status)
+    assert told_keys("status") - {"members", "vehicles"} == set(status)  # those two: of several mounts
     for group in ("vehicle", "link", "held"):
         assert inner_keys(group) == set(status[group])
     synced = json.loads(home.run("mavftpfs sync --json ~/drone ~/logs"))
