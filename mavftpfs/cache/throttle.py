@@ -110,10 +110,15 @@ class Throttle:
         self._limit.meter.on_bytes(count, self._context.clock())
         self.waiting.unpark_all()
 
+    @property
+    def speed(self) -> float | None:
+        """Bytes per second that are ACKed, as people are told; None while it is not known."""
+        return self._limit.meter.shown.at(self._context.clock())
+
     def transfers(self) -> list[dict[str, object]]:
         """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
         waiting = [node for node in self._context.nodes if node.undelivered]
-        rate, before, found = self._limit.meter.rate, 0, []
+        rate, before, found = self.speed, 0, []
         for node in sorted(waiting, key=lambda node: node.attempt is None):
             assert node.draft is not None
             before += node.draft.unacked

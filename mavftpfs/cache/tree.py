@@ -430,7 +430,7 @@ class Tree:
             **files.status(),
             "bytes_local": self._local.used,
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
-            "rate": blocks.meter.rate,
+            "rate": blocks.meter.shown.at(blocks.clock()),
             "listings_cached": len(self._directories),
             "entries_cached": self._directories.entry_count,
             "listings_asked": self._directories.sweeps,

@@ -29,6 +29,7 @@ from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errors import FileChanged, RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.sameness import Known
+from mavftpfs.shared.speed import Speed
 
 NEVER = float("-inf")
 
@@ -53,7 +54,8 @@ class RateMeter:
     """How many bytes per second come while some are wanted; pauses between requests are not counted.
 
     Attributes:
-        rate: bytes per second, None while too little was seen.
+        rate: bytes per second, None while too little was seen. shown: what people are told, which takes
+            longer to be known.
     """
 
     PAUSE = 1.0
@@ -62,12 +64,14 @@ class RateMeter:
 
     def __init__(self) -> None:
         self.rate: float | None = None
+        self.shown = Speed()
         self._last: float | None = None
         self._bytes = 0.0
         self._busy = 0.0
 
     def on_bytes(self, count: int, now: float) -> None:
         """Note that `count` bytes arrived."""
+        self.shown.on_bytes(count, now)
         elapsed = self.PAUSE if self._last is None else now - self._last
         self._last = now
         if elapsed >= self.PAUSE:

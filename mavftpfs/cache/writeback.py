@@ -283,7 +283,7 @@ class Writeback:
             "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
             "bytes_held_on_disk": self._context.spool.on_disk,
             "dirty_max": self._limit.bytes(),
-            "write_rate": self._limit.meter.rate,
+            "write_rate": self._throttle.speed,
             "files_undelivered": len(self.undelivered()),
             "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),

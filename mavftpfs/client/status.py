@@ -41,6 +41,8 @@ PERIOD = 0.25
 """Seconds between two looks at the connection: a heartbeat holds until the next, about a second."""
 RATE_SPAN = 20
 """Looks over which the traffic on the link is averaged."""
+LEAST_SPAN = 2.0
+"""Seconds that were seen before an average is said."""
 MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
 _TOLD = {"transfers", "errors", "reads"}
@@ -114,7 +116,7 @@ class Watcher:
         if len(self._bytes) < 2:
             return None
         (began, first), (ended, last) = self._bytes[0], self._bytes[-1]
-        return round((last - first) / (ended - began), 1) if ended > began else None
+        return round((last - first) / (ended - began), 1) if ended - began >= LEAST_SPAN else None
 
     async def run(self) -> None:
         """Look until cancelled."""

@@ -16,6 +16,7 @@ from mavftpfs.cache.readahead import (
 )
 from mavftpfs.cache.throttle import Throttle, WriteLimit
 from mavftpfs.cache.versions import SMALL_FILE, BlockCache, RateMeter
+from mavftpfs.shared.speed import Speed
 
 KIB = 1024
 BIG = 100 * 1024 * KIB
@@ -133,6 +134,31 @@ def test_a_glimpse_is_not_a_rate() -> None:
     assert meter.rate is None
 
 
+def test_people_are_told_a_rate_when_it_is_known() -> None:
+    """The first ACKs come at the speed of the buffers on the way, also after a link was frozen."""
+    speed, now = Speed(), 100.0
+
+    def carry(seconds: float, rate: int) -> list[float | None]:
+        nonlocal now
+        told = []
+        for _ in range(round(seconds * 10)):
+            now += 0.1
+            speed.on_bytes(rate // 10, now)
+            told.append(speed.at(now))
+        return told
+
+    speed.on_bytes(500_000, now)
+    assert carry(2.8, 60_000) == [None] * 28
+    assert carry(20.0, 60_000)[4:] == [pytest.approx(60_000, rel=0.01)] * 196
+    now += 9.0
+    assert speed.at(now) is None
+    speed.on_bytes(500_000, now)
+    after = carry(20.0, 60_000)
+    assert after[:28] == [None] * 28
+    assert after[32:] == [pytest.approx(60_000, rel=0.01)] * 168
+    assert carry(30.0, 6_000)[-1] == pytest.approx(6_000, rel=0.05)
+
+
 class Clock:
     """All that a throttle's meter asks of its context."""
 
@@ -150,3 +176,4 @@ def test_acked_bytes_are_measured_at_any_rate(rate: float) -> None:
         context.now += 239 / rate
         throttle.on_acked(239)
     assert limit.meter.rate == pytest.approx(rate, rel=0.02)
+    assert throttle.speed == pytest.approx(rate, rel=0.1)

@@ -130,6 +130,16 @@ async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(
     assert caplog.messages == ["vehicle 1/1 is armed", "vehicle 1/1 is disarmed"]
 
 
+def test_the_traffic_is_told_when_it_was_seen_for_some_seconds() -> None:
+    now = 0.0
+    watcher = Watcher(lambda: connection({"received_bytes": int(5000 * now)}), writing=False)
+    told = []
+    for now in (0.0, 1.0, 1.9, 2.5):
+        watcher.look(now)
+        told.append(watcher.traffic)
+    assert told == [None, None, None, 5000.0]
+
+
 def test_a_delivery_says_what_it_waits_for() -> None:
     cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_undelivered": 4096}
     assert delivery_line(status(None, cache)) == "delivering 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
