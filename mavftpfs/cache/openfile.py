@@ -78,7 +78,7 @@ class OpenFile:
         """Close, and take back what was written and is not on the vehicle: nothing of it is sent from now on.
 
         Returns whether the vehicle has the file as it was written; None if nobody can tell, or if others
-        write the same file, who deliver what was written here with theirs.
+        write the same file, and deliver what was written here with theirs.
         """
         self.close()
         return True

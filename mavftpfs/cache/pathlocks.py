@@ -1,14 +1,14 @@
 """Which paths are being changed: the second of three locks. Layer: cache.
 
 In the order in which they are taken:
-1. The *file lock*, `nodes.Node.lock`. Who writes or delivers a file has it, and who takes its name or content
-   away (`Node.claim`).
-2. The *path lock*, here. Who changes names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
-   Who opens or delivers a file holds its path `shared`: beside others that share it, and not during a change
-   of its name, or he would hold neither the old file nor the new one.
-3. `versions.BlockCache.reads`, which bounds the memory of who waits for a file's bytes. A delivery takes it
+1. The *file lock*, `nodes.Node.lock`. A writer or a delivery of a file has it, and a call that takes its name
+   or content away (`Node.claim`).
+2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
+   Opening or delivering a file holds its path `shared`: beside others that share it, and not during a change
+   of its name, or it would have neither the old file nor the new one.
+3. `versions.BlockCache.reads`, which bounds the memory of reads that wait for bytes. A delivery takes it
    below both, to fetch what its draft lies over. A reader that has it takes its path `shared`, to open the
-   file: that waits only for who holds the path alone, and he never reads through the cache.
+   file. That waits only for a call that holds the path alone, and such a call never reads through the cache.
 A listing may be asked for under any lock, and what it has mended (`repair`) takes none.
 
 Two changes concern one another if they name the same path, in any case, or one names a directory above the
@@ -37,8 +37,9 @@ class Named(Protocol):
 
 
 class PathLocks:
-    """Locks on sets of paths. Who shares one waits only for who holds it alone, not for who waits to: a
-    delivery opens the file it delivers. Others get their turn in the order in which they asked."""
+    """Locks on sets of paths. A call that shares one waits only for a call that holds it alone, not for one
+    that waits to: a delivery opens the file it delivers. Others get their turn in the order in which they
+    asked."""
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds to wait for a lock; with the change that follows SLACK more."""

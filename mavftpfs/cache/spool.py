@@ -295,6 +295,6 @@ def remove(data: Path) -> None:
 
 
 def disk_error(exc: OSError, path: Path | None) -> NoSpace | SpoolFailed:
-    """Return what a local disk's error means to whoever writes: it is full, or it fails."""
+    """Return what a local disk's error means to a writer: it is full, or it fails."""
     kind = NoSpace if exc.errno in _FULL else SpoolFailed
     return kind(f"cannot keep bytes in {path}: {exc}")

@@ -45,7 +45,7 @@ Program = Hashable
 
 @dataclass(frozen=True, slots=True)
 class Shown(Generic[B]):
-    """What a reader gets. base: the same, for who saves it later. since_ns: when it changed last."""
+    """What a reader gets. base: the same, for a later save. since_ns: when it changed last."""
 
     text: bytes
     base: B
@@ -173,7 +173,7 @@ class Texts(ABC, Generic[B]):
         found = {}
         with trio.move_on_after(patience) as scope:
             for name in self.names:
-                with suppress(MavftpfsError):  # it does not open; who opens it is told
+                with suppress(MavftpfsError):  # it does not open; the program that opens it is told
                     found[name] = await self.stat(name)
         if scope.cancelled_caught:
             unread = Stat(EntryKind.FILE, 0, 0, 0.0)
@@ -440,7 +440,7 @@ class TextHandle(OpenFile, Generic[B]):
         await self.flush()
 
     async def release(self) -> None:
-        """Let the text go, saved or not: whoever closed it was told."""
+        """Let the text go, saved or not: the program that closed it was told."""
 
     async def give_up(self) -> bool:
         """Let the text go; return whether the vehicle has it."""

@@ -201,7 +201,7 @@ class Tree:
     ) -> OpenFile:
         """Open a file; with `truncate` it is empty for everybody from now on, here at once, there later.
 
-        Of texts: append: whatever is written is an end. program: tells who opens it.
+        Of texts: append: whatever is written is an end. program: the one that opens it.
 
         Raises:
             NotFound, NotADirectory, IsADirectory, ReadOnly, Armed, FileBusy; else as RemoteStore.open_reader

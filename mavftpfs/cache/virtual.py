@@ -254,7 +254,7 @@ class VirtualTrees:
         return await self._read(path)
 
     def outdate(self, path: bytes) -> None:
-        """A file is about to change: whoever reads it from now on asks the vehicle."""
+        """A file is about to change: reads from now on ask the vehicle."""
         seen = self._look(path)
         if seen.data is not None:
             self._seen[path] = Seen(seen.data, -math.inf)

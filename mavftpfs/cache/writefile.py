@@ -66,7 +66,7 @@ class ReadFile(OpenFile):
 
     @property
     def direct_io(self) -> bool:
-        """Whether the kernel's pages could come from, or go to, who has another file of the path open."""
+        """Whether the kernel's pages could be those of another file that had the path."""
         path = self._node.path
         if self._context.nodes.has_another(path) or self._context.files.others_replaced(path):
             return True

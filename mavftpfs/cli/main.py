@@ -186,7 +186,7 @@ def _paths_parser(name: str, description: str, least: str = "+", *, short_help: 
 
 
 def _scan_parser(name: str) -> Parser:
-    parser = _source_parser(name, "Show who answers on a link.")
+    parser = _source_parser(name, "Show what answers on a link.")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
@@ -221,7 +221,7 @@ def _sync_parser(name: str) -> Parser:
     instead.add_argument(
         "--watch",
         action="store_true",
-        help="stay, and bring the new logs after each flight, of whoever comes",
+        help="stay, and bring the new logs after each flight, of each vehicle",
     )
     parser.add_argument(
         "--exec",

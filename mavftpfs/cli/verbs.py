@@ -198,7 +198,7 @@ def cat(args: Args) -> int:
         sys.stdout.buffer.flush()
 
     async def take(data: bytes | memoryview) -> None:
-        # In a thread: who reads may take its time, and the vehicle is to hear of us meanwhile.
+        # In a thread: the reader may take its time, and the vehicle is to hear of us meanwhile.
         await trio.to_thread.run_sync(write, bytes(data), abandon_on_cancel=True)
 
     async def work(session: Session) -> None:
@@ -223,7 +223,7 @@ def _tell(fetched: Fetched) -> None:
 
 
 def _ignore(fetched: Fetched) -> None:
-    """For who prints nothing of single files."""
+    """For verbs that print nothing of single files."""
 
 
 def _say_what_is_not_proven(outcome: download.Outcome) -> None:
@@ -479,7 +479,7 @@ def crc(args: Args) -> int:
 
 
 def scan(args: Args) -> int:
-    """Show who answers on a link."""
+    """Show what answers on a link."""
     found = run(args, scanning.scan)
     if args.json:
         print(json.dumps(found, indent=2, default=str))

@@ -73,7 +73,7 @@ class Space:
 class Attached:
     """A vehicle whose root was listed.
 
-    watcher: to be run by who stays. notice: moves what earlier mounts left; gives a line on it, or "".
+    watcher: to be run by a program that stays. notice: moves what earlier mounts left; gives a line, or "".
     """
 
     connection: Connection
@@ -146,7 +146,7 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other programs of ours.
 
-    beats: only to hear who is there; then it is shared from the beginning.
+    beats: only to hear what is there; then it is shared from the beginning.
 
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
@@ -183,7 +183,7 @@ def _had_by(spec: LinkSpec, status: Mapping[str, Any]) -> str:
 
 
 def waiting(spec: LinkSpec, options: Options) -> str:
-    """Return what a person is told who waits for a vehicle."""
+    """Return what a person is told while a vehicle is waited for."""
     return f"waiting for a heartbeat on {spec.description} ({options.connect_timeout:g} s)"
 
 
@@ -308,7 +308,7 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
             await tree.list(ROOT)
             return
     except ListingIncomplete:
-        return  # who lists it is told
+        return  # the program that lists it is told
     except (RequestTimeout, VehicleLost):
         pass  # the same to the user: no answer
     except SessionBusy:
@@ -425,7 +425,7 @@ _IDENTITY_POLL = 0.02
 
 
 async def kept_in(place: str, options: CacheOptions, connection: Connection) -> MakeKept:
-    """Return what makes a tree's kept cache in a directory; waits until the vehicle said who it is.
+    """Return what makes a tree's kept cache in a directory; waits until the vehicle told its unique id.
 
     Raises:
         UsageError: the directory cannot be used.

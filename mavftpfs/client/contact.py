@@ -1,4 +1,4 @@
-"""Ways to vehicles that come and go: who is heard, and the files of one of them. Layer: client."""
+"""Ways to vehicles that come and go: which are heard, and the files of one of them. Layer: client."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from mavftpfs.session.vehicle import Standing
 from mavftpfs.shared.errors import LinkError
 
 TICK = 1.0
-"""Seconds between two looks at who was heard. That the one whose files we have is armed is told at once."""
+"""Seconds between two looks at what was heard. That the one whose files we have is armed is told at once."""
 _POLL = 0.1
 MOUNT_TICK = 0.5
 """Seconds between two questions to a mount."""
 IDENTITY_PATIENCE = 5.0
-"""Seconds for a vehicle to say who it is."""
+"""Seconds for a vehicle to tell its unique id."""
 
 
 class Hearing(Protocol):

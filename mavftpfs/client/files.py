@@ -39,7 +39,7 @@ READ_SIZE = 128 * 1024
 class File(Protocol):
     """An open file: cache.openfile.OpenFile, or MountedFile. All calls raise only MavftpfsError.
 
-    Whoever wrote it ends by `written`, which delivers it or takes it back.
+    Its writer ends by `written`, which delivers it or takes it back.
     """
 
     @property
@@ -315,7 +315,7 @@ def session_on(status: Mapping[str, Any], root: bytes) -> Session:
 
 
 async def mount_status(mountpoint: str) -> Mapping[str, Any]:
-    """Return the status of a mount, as it tells it to who may read its files.
+    """Return the status of a mount, as it tells it to users that may read its files.
 
     Raises:
         LinkClosed: it does not answer.

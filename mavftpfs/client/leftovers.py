@@ -51,7 +51,7 @@ def left_by_killed_mounts() -> list[Path]:
     """Return what killed mounts of this user hold that no vehicle has; the next mount of each offers it."""
     try:
         slots = sorted((state_directory() / "spool").glob("*/slot*"))
-    except OSError:  # another user's, who left us his environment
+    except OSError:  # another user's: we run in his environment
         return []
     return [data for slot in slots for data in left_in(slot)]
 

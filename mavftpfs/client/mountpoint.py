@@ -110,7 +110,7 @@ def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """What the kernel's table says of a mount. uid: who mounted it, None if that is not told."""
+    """What the kernel's table says of a mount. uid: of the user that mounted it, None if that is not told."""
 
     type: str
     source: str

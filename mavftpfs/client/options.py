@@ -171,7 +171,7 @@ VALUES: Values = {
     "root": Value(remote_path, "mount this directory of the vehicle: /"),
     "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
     "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
-    "source_system": Value(number(1, 255), "who we are on the link: 254"),
+    "source_system": Value(number(1, 255), "our system id on the link: 254"),
     "source_component": Value(number(1, 255), "and which part: 191"),
     "heartbeat": Value(Choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
     "baud": Value(number(300, 12_000_000), "of a serial line: 57600"),

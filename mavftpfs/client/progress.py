@@ -105,7 +105,7 @@ LOOK_PERIOD = 0.5
 
 @asynccontextmanager
 async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[None]:
-    """Tell progress during the body whether the vehicle is lost, whoever waits for it: we, or a mount."""
+    """Tell progress during the body whether the vehicle is lost, for us or for the mount that is used."""
 
     async def lost() -> bool:
         if session.mountpoint is None:

@@ -1,4 +1,4 @@
-"""Who is on a link, and whose files can be had. Layer: client; prints nothing."""
+"""What is on a link, and whose files can be had. Layer: client; prints nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _TICK = 0.1
 
 
 async def scan(target: Target) -> list[Entry]:
-    """Return who sends heartbeats on a link, and who of them answers MAVLink FTP.
+    """Return what sends heartbeats on a link, and what of that answers MAVLink FTP.
 
     It ends within connect_timeout, or LEAST_PROBE for each component if they are many; sooner if all answer.
 
@@ -54,7 +54,7 @@ async def scan(target: Target) -> list[Entry]:
             found += await _ask_others(
                 link, target, {Address(one["system"], one["component"]) for one in found}
             )
-    except LinkClosed:  # the mount is another user's, who does not share the port
+    except LinkClosed:  # the mount is another user's, and does not share the port
         holder = await mount_with(target.spec)
         if holder is None:
             raise
@@ -63,7 +63,7 @@ async def scan(target: Target) -> list[Entry]:
 
 
 async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list[Entry]:
-    """Return who else is heard, and who of them answers MAVLink FTP."""
+    """Return what else is heard, and what of that answers MAVLink FTP."""
     assert target.spec is not None
     options = target.options
     deadline = trio.current_time() + options.connect_timeout
@@ -78,7 +78,7 @@ async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list
 
 
 async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
-    """Return who is heard in LISTEN_TIME after the first heartbeat, whoever sends it."""
+    """Return what is heard in LISTEN_TIME after the first heartbeat of anything."""
     anybody = replace(connect_options(options), target_system=0, target_component=0)
     async with connected(link, anybody) as connection:
         for tick in range(round(options.connect_timeout / _TICK)):

@@ -2,9 +2,9 @@
 
 A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys
 are those of `status --json`, which docs/guide.md describes. It is asked over its control socket. Where that
-cannot be reached (it is another user's) the extended attribute of its root says the same to whoever may read
-the mount; root may ask everybody's. Of a mount that cannot be asked only `mountpoint`, `source`, `state` and
-`problem` are known.
+cannot be reached (it is another user's) the extended attribute of its root says the same to users that may
+read the mount; root may ask everybody's. Of a mount that cannot be asked only `mountpoint`, `source`,
+`state` and `problem` are known.
 """
 
 from __future__ import annotations
@@ -339,7 +339,7 @@ def has_link(status: Status, spec: LinkSpec) -> bool:
 
 
 def holder_of(spec: LinkSpec) -> Status | None:
-    """Return the status of the mount that has a link, whoever may look into it; None if there is none."""
+    """Return the status of the mount that has a link, also of another user's; None if there is none."""
     return next((status for status in all_statuses() if has_link(status, spec)), None)
 
 

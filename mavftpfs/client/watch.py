@@ -53,7 +53,7 @@ class WatchWish:
 
 
 class Watch:
-    """Brings the logs of whoever comes, into a directory for each. say: hears of it, in lines for people.
+    """Brings the logs of each vehicle that comes, into a directory for each. say: gets lines for people.
 
     Raises:
         UsageError: of `begin`: the directory cannot be used.
@@ -89,7 +89,7 @@ class Watch:
             self._memory = Memory(self._local)
             self._memory.begin()
 
-    # --- who is heard (Hearing)
+    # --- what is heard (Hearing)
 
     def heard(self, system: int, *, armed: bool) -> None:
         """See contact.Hearing."""
@@ -171,7 +171,7 @@ class Watch:
                 await trio.sleep(REOPEN)
 
     async def run_on(self, link: Link, spec: LinkSpec, options: Options, sinks: Sinks = NO_SINKS) -> None:
-        """Serve whoever is heard on an open link.
+        """Serve each vehicle that is heard on an open link.
 
         Raises:
             LinkClosed: it was closed for good.

@@ -1,4 +1,4 @@
-"""What waits to go out over the port, and who is next. Layer: hub; pure.
+"""What waits to go out over the port, and which frame is next. Layer: hub; pure.
 
 Forwarded frames and frames of our own programs take turns, and so do the sides among them: a forwarded frame
 waits for at most one frame of ours, whatever else is queued. On a serial port no more is handed to the kernel

@@ -28,10 +28,10 @@ PORT = 0
 ALL = 0
 """The focus of a client that does not know its vehicle yet."""
 BEATS = -1
-"""The focus of a client that wants to know who is there, and no more."""
+"""The focus of a client that wants to know what is there, and no more."""
 
 BEAT_PERIOD = 0.5
-"""Seconds between two heartbeats of one sender that clients get who have another vehicle."""
+"""Seconds between two heartbeats of one sender that clients with another vehicle get."""
 MEMORY = 60.0
 """Seconds for which a place that fell silent still gets what goes to all."""
 _MOST_PLACES = 64
@@ -68,7 +68,7 @@ class _Side:
 
 
 class Router:
-    """Knows the sides, who was heard where, and where a frame goes.
+    """Knows the sides, what was heard where, and where a frame goes.
 
     Attributes:
         doubles: senders of the port that were heard at a second address, and where: two vehicles, or a fake.
@@ -92,7 +92,7 @@ class Router:
         self._plans.clear()
 
     def remove(self, side: int) -> None:
-        """A side is gone, and who was heard there."""
+        """A side is gone, and what was heard there."""
         del self._sides[side]
         for sender, places in list(self._elsewhere.items()):
             for place in [place for place in places if place.side == side]:
@@ -144,7 +144,7 @@ class Router:
         return plan
 
     def _is_believed(self, frame: Frame, place: Place, kind: Kind, now: float) -> bool:
-        """Return whether a frame counts that came from a place, and note who is there."""
+        """Return whether a frame counts that came from a place, and note its sender."""
         sender, book = frame.source, self._book
         if kind is Kind.PORT:
             others = self._elsewhere.get(sender)

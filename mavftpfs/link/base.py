@@ -34,7 +34,7 @@ class LinkStats:
 
 @dataclass(frozen=True, slots=True)
 class Seat:
-    """Who we are on a port that several of ours share: our MAVLink address there, and the link id that our
+    """Our place on a port that several of ours share: our MAVLink address there, and the link id that our
     signatures carry, so that the times in them do not collide."""
 
     own: Address
@@ -45,7 +45,7 @@ class Link(Protocol):
     """A byte or datagram pipe.
 
     Attributes:
-        seat: who we are there, where that is not ours to choose; it may change while the link is reopened.
+        seat: our place there, where that is not ours to choose; it may change while the link is reopened.
     """
 
     stats: LinkStats

@@ -97,8 +97,8 @@ def set_buffers(sock: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What a client wants of a port: who it would like to be, where else its frames are to go, who it is for
-    people. beats: only heartbeats, and not what they are about."""
+    """What a client wants of a port: the address that it would like, where else its frames are to go, its
+    name for people. beats: only heartbeats, and not what they are about."""
 
     own: Address
     forward: tuple[str, ...] = ()
@@ -171,7 +171,7 @@ class HubLink:
         self.tell({"answer": address})
 
     def keep_peer(self) -> None:
-        """The hub itself hears who is there."""
+        """The hub itself hears what is there."""
 
     def focus(self, system: int) -> None:
         """Have the hub leave out what concerns only other systems."""

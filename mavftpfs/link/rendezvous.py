@@ -2,7 +2,7 @@
 
 A program that has a port open also has its *door* open: a Unix socket in the user's private directory, named
 after the port. A second program that wants the port knocks there. A door is only a listening socket, so a hub
-that takes over inherits it with everybody who waits before it.
+that takes over inherits it with all that wait before it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mavftpfs.shared.private import own_directories, private_directory
 
 HUB = ".hub"
 ALONE = ".port"
-"""The end of a door's name tells who is behind it: a hub, or a program that has the port alone."""
+"""The end of a door's name tells what is behind it: a hub, or a program that has the port alone."""
 
 _QUEUE = 64
 _NETWORK = "/proc/self/ns/net"
@@ -111,7 +111,7 @@ class Door:
         return sock
 
     def turn_away(self) -> None:
-        """Send off all who stand before it."""
+        """Send off all that wait before it."""
         while (sock := self.accept()) is not None:
             sock.close()
 

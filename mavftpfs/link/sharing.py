@@ -228,7 +228,7 @@ class SharedLink:
             self._inner.send_nowait(frames)
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return who sent a chunk of the list that `receive` returned last."""
+        """Return the sender of a chunk of the list that `receive` returned last."""
         return None if self._heard_by is None else self._heard_by.sender(index)
 
     def answer(self, address: NetAddress) -> None:
@@ -282,7 +282,7 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
     async with trio.open_nursery() as nursery:
         try:
             await nursery.start(run)
-            lasting.shield = True  # whoever is cancelled (Ctrl-C) still closes the vehicle's session
+            lasting.shield = True  # a command that is cancelled (Ctrl-C) still closes the vehicle's session
             yield link
         except Exception as exc:  # raised again outside, so that it is not wrapped in a group
             failure = exc

@@ -22,8 +22,8 @@ from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
-"""Tells whoever waits for a mount (exit code, one line): 0 and perhaps a notice once it is up, else why there
-will be none. Only the first call counts."""
+"""Tells the command that waits for a mount (exit code, one line): 0 and perhaps a notice once it is up,
+else why there will be none. Only the first call counts."""
 
 SYSLOG_SOCKET = "/dev/log"
 MAX_REPORT = 64 * 1024

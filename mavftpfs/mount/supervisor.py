@@ -120,7 +120,7 @@ class _Supervisor:
     # -- vehicles
 
     async def _hear(self, link: Link) -> None:
-        """Note who is there. Our own heartbeats are for bridges that answer only whoever speaks."""
+        """Note what is there. Our own heartbeats are for bridges that answer only a client that speaks."""
         options = self._request.options.client
         own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
         key = connect_options(options).signing_key
@@ -171,7 +171,7 @@ class _Supervisor:
     async def _keep_mounted(self, member: Member) -> None:
         """Run a vehicle's mount until it ends."""
         place = self._place(member)
-        # Of a session of its own: Ctrl-C is for us, who have it end in order.
+        # Of a session of its own: Ctrl-C is for us, and we have it end in order.
         process = await trio.lowlevel.open_process(
             self._command(member),
             stdin=subprocess.DEVNULL,

@@ -45,7 +45,8 @@ _STEAL_AFTER = 3.0
 class Session:
     """A file a client has open, and the id that client chose.
 
-    owner: who claimed the session (generations B and C). last_sent: when something was last sent, 0 = never.
+    owner: the client that claimed the session (generations B and C). last_sent: when something was last sent,
+    0 = never.
     """
 
     file: OpenFile | None = None
@@ -358,7 +359,7 @@ class ArduPilot(Firmware):
                 yield from self._run_shared(request)
 
     def _run_single(self, request: Request) -> Iterator[float | None]:
-        """Generation A: `number` is the id of the one session, whoever uses it."""
+        """Generation A: `number` is the id of the one session, for all clients."""
         slot = self._slots[0]
         if self._is_repeat(request):
             self.replays += 1

@@ -68,7 +68,7 @@ class Profile:
     """Longer paths are cut silently (PX4, ArduPilot)."""
 
     tells_storage: bool = True
-    """STORAGE_INFORMATION is sent to who asks for it (not by MAVSDK's server)."""
+    """STORAGE_INFORMATION is sent when asked for (not by MAVSDK's server)."""
 
     # Sessions
     sessions: int = 1
@@ -79,7 +79,7 @@ class Profile:
     write_only_creates: bool = True
     """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
     open_replaces: bool = False
-    """An open closes what is open, whoever opened it; else it is refused (PX4 of September 2026)."""
+    """An open closes what any client has open; else it is refused (PX4 of September 2026)."""
     checks_sender: bool = False
     """Only the client that asked gets the answer again, without stray bytes (PX4 of September 2026)."""
     sticky_stream_failure: bool = False

@@ -143,7 +143,7 @@ class SimVehicle:
     Args:
         telemetry: bytes per second of unasked messages beside heartbeat and system time.
         armed: state at the start; also after a reboot it is disarmed.
-        tells_storage: answers who asks for STORAGE_INFORMATION; None: as the profile does.
+        tells_storage: answers when asked for STORAGE_INFORMATION; None: as the profile does.
         signing_key: as for Framer.
 
     Attributes:
