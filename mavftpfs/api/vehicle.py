@@ -354,7 +354,7 @@ class Drone:
         with translated():
             found = upload.collect(Path(local), recursive=recursive)
             batches = [(Path(local), found)]
-            tell = lambda where, size: told.append(os.fsdecode(where))  # noqa: E731
+            tell = lambda where, size, how: told.append(os.fsdecode(where))  # noqa: E731
             await upload.put_paths(self._session, batches, remote(path), Progress(), tell)
         return told
 

@@ -83,7 +83,7 @@ class Verifier:
             self.counts["verified_by_crc"] += 1
         elif doubted and draft.size:
             await self._read_back(path, draft)
-        elif draft.size:
+        else:
             self.counts["verified_by_size"] += 1
         return crc32
 

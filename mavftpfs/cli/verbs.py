@@ -340,10 +340,11 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
     unverified = parse_options(args.options).client.verify == "none"
     how = "not verified" if unverified else "verified"
 
-    def tell(remote: bytes, size: int) -> None:
-        print(f"{_name(remote)}: {readable_size(size)}, {how}", flush=True)
-
     async def work(session: Session) -> None:
+        def tell(remote: bytes, size: int, proof: str) -> None:
+            verified = f"verified by {proof}" if proof else how
+            print(f"{_name(session.on_vehicle(remote))}: {readable_size(size)}, {verified}", flush=True)
+
         async with noting_losses(session, bar):
             await function(session, progress=bar, tell=tell)
 

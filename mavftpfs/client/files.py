@@ -170,7 +170,8 @@ async def _no_return() -> bool:
 class Session:
     """A vehicle's files for the length of one command.
 
-    root: where `/` of `files` lies on the vehicle. acknowledged: asks what is not on the vehicle yet.
+    root: where `/` of `files` lies on the vehicle. acknowledged: asks what is not on the vehicle yet; counts:
+    how many files were verified in which way, as `status` has it.
     mountpoint: of the mount whose files these are, None for a connection of our own. silent: whether the
     vehicle is not heard; returned: waits for it, and returns whether it is heard again in time.
     """
@@ -181,6 +182,7 @@ class Session:
     mountpoint: str | None = None
     silent: Callable[[], bool] = lambda: False
     returned: Callable[[], Awaitable[bool]] = _no_return
+    counts: Callable[[], Awaitable[Mapping[str, Any]]] = _none
 
     def on_vehicle(self, path: bytes) -> bytes:
         """Return the vehicle's own name of a path."""
@@ -310,8 +312,11 @@ def session_on(status: Mapping[str, Any], root: bytes) -> Session:
         found = (await mount_status(mountpoint))["transfers"]
         return {facts["path"]: facts["done"] for facts in found if facts["direction"] == "write"}
 
+    async def counts() -> Mapping[str, Any]:
+        return dict((await mount_status(mountpoint))["cache"])
+
     files = MountedFiles(mountpoint, os.fsencode(status["root"]), root)
-    return Session(files, root, acknowledged, mountpoint)
+    return Session(files, root, acknowledged, mountpoint, counts=counts)
 
 
 async def mount_status(mountpoint: str) -> Mapping[str, Any]:
@@ -554,6 +559,9 @@ def session_of(vehicle: Attached, options: Options) -> Session:
         found: Any = vehicle.tree.status().get("transfers", [])
         return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}
 
+    async def counts() -> Mapping[str, Any]:
+        return vehicle.tree.status()
+
     def silent() -> bool:
         connection = vehicle.connection
         return connection.vehicle.silence(connection.clock()) > SILENCE_LIMIT
@@ -565,7 +573,7 @@ def session_of(vehicle: Attached, options: Options) -> Session:
             await trio.sleep(_TICK)
         return not silent()
 
-    return Session(vehicle.tree, options.root, acknowledged, silent=silent, returned=returned)
+    return Session(vehicle.tree, options.root, acknowledged, None, silent, returned, counts)
 
 
 @asynccontextmanager

@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import re
 import secrets
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import trio
 
@@ -20,9 +20,11 @@ from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import READ_SIZE, WITHDRAWAL_TIME, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import BY_CRC32, BY_SIZE
 from mavftpfs.shared.errors import (
     CrossDevice,
     IsADirectory,
+    LinkError,
     MavftpfsError,
     NotADirectory,
     NotDelivered,
@@ -36,6 +38,15 @@ from mavftpfs.shared.readable import name_text
 BESIDE = ".put-"
 """Begins the name of a file that a mount has until it is whole."""
 _BESIDE = re.compile(re.escape(BESIDE) + "[0-9a-f]+")
+
+Tell = Callable[[bytes, int, str], None]
+"""Hears the path of a file that was put, its size, and how it was verified."""
+
+_WAYS = {
+    "verified_by_size": BY_SIZE.words,
+    "verified_by_reading": "size and reading it back",
+    "verified_by_crc": BY_CRC32.words,
+}
 
 ASK_PERIOD = 0.25
 """Seconds between two looks at how much the vehicle has acknowledged."""
@@ -74,13 +85,13 @@ async def put_paths(
     batches: Sequence[tuple[Path, Sequence[Path]]],
     path: bytes,
     progress: Progress,
-    tell: Callable[[bytes, int], None],
+    tell: Tell,
     *,
     into: bool = False,
 ) -> None:
     """Put what `collect` found to `path`: an existing directory, or a new name for one thing.
 
-    `tell` hears the vehicle's name and the size of each file that is there. into: `path` was written with a
+    `tell` hears of each file that is there. into: `path` was written with a
     `/` at its end: a file goes into that directory only.
 
     Raises:
@@ -100,7 +111,7 @@ async def put_paths(
         if one.is_dir():
             await make_directory(session.files, remote, may_exist=True)
         else:
-            tell(session.on_vehicle(remote), await put_file(session, one, remote, progress))
+            await _put_and_tell(session, one, remote, progress, tell)
 
 
 def _placed(
@@ -127,7 +138,7 @@ async def put_alone(
     local: Path,
     path: bytes,
     progress: Progress,
-    tell: Callable[[bytes, int], None],
+    tell: Tell,
     *,
     into: bool = False,
 ) -> None:
@@ -141,7 +152,25 @@ async def put_alone(
             f"{name_text(path)}{'/' * into} is a directory; name the file that stdin is to become"
         )
     progress.plan(1, os.stat(local).st_size)
-    tell(session.on_vehicle(path), await put_file(session, local, path, progress))
+    await _put_and_tell(session, local, path, progress, tell)
+
+
+async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: Progress, tell: Tell) -> None:
+    before = await session.counts()
+    size = await put_file(session, local, remote, progress)
+    after: Mapping[str, Any] = {}
+    with suppress(LinkError):  # a mount that is gone: the file is on the vehicle all the same
+        after = await session.counts()
+    tell(remote, size, how_verified(before, after))
+
+
+def how_verified(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    """Return how a file was verified, from the counts of a status; "" where they do not tell. Where a mount
+    verified another file meanwhile it is the weaker of both."""
+    for way, words in _WAYS.items():
+        if after.get(way, 0) > before.get(way, 0):
+            return words
+    return ""
 
 
 async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> int:

@@ -161,7 +161,9 @@ def test_put_mv_and_rm_without_a_mount(field: Field, tiny_tree: Path) -> None:
     card, local = field.local("card"), field.local("twin")
     source = field.mavsdk(card).source
     said, _ = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", "/")
-    assert said.count(", verified\n") == len(list((tiny_tree / "sizes").iterdir())) + 1
+    count = len(list((tiny_tree / "sizes").iterdir())) + 1
+    assert said.count(", verified by size") == count
+    assert said.count(", verified by size and CRC32\n") == count - 1, "one is empty"
     argv = [sys.executable, "-m", "mavftpfs", "put", source, "-", "/from_stdin"]
     subprocess.run(argv, input=b"piped", check=True, capture_output=True, cwd=PROJECT, timeout=60)
     assert (card / "from_stdin").read_bytes() == b"piped"

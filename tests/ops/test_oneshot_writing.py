@@ -81,7 +81,9 @@ async def put(
     told: list[bytes] = []
     batches = [(local, collect(local, recursive=recursive)) for local in locals_]
     progress = Progress()
-    await put_paths(session_of(tree), batches, to, progress, lambda remote, _: told.append(remote), into=into)
+    await put_paths(
+        session_of(tree), batches, to, progress, lambda remote, _, __: told.append(remote), into=into
+    )
     assert (progress.files_done, progress.name, progress.done) == (len(told), "", progress.total)
     assert all(file.closed for file in tree.opened)
     return told
@@ -175,7 +177,7 @@ async def test_what_came_from_stdin_needs_a_name(local: Path) -> None:
     session = session_of(tree)
     with pytest.raises(IsADirectory, match="stdin"):
         await put_alone(session, local / "a", b"/d", Progress(), print)
-    await put_alone(session, local / "a", b"/d/new", Progress(), lambda path, _: told.append(path))
+    await put_alone(session, local / "a", b"/d/new", Progress(), lambda path, _, __: told.append(path))
     assert (tree.files[b"/d/new"], told) == (BIG, [b"/d/new"])
 
 
