@@ -31,6 +31,9 @@ _FIELDS = 12
 _MOST = 65535
 
 _DEGREES, _METRES, _PLAIN = 1e7, 1e4, 1.0
+_NO_PLACE = 2**31 - 1
+"""As x or y: none, the vehicle takes its own (MISSION_ITEM_INT)."""
+
 _GLOBAL = frozenset((0, 3, 5, 6, 10, 11))
 _SAME_FRAME = {5: 0, 6: 3, 11: 10}
 """Frames that mean the same as another, for integers."""
@@ -133,10 +136,13 @@ def _place_text(value: int, scale: float) -> str:
 
 
 def parse(text: str) -> tuple[list[Item], list[Problem]]:
-    """Read a file. Items count in the order of their lines, whatever their numbers say."""
+    """Read a file. Items are numbered from 0, in the order of their lines: where the first is missing, the
+    next one would be taken for the vehicle's home.
+    """
     items: list[Item] = []
     problems: list[Problem] = []
     titled = False
+    place = -1
     for number, raw in enumerate(text.split("\n"), 1):
         line = raw.partition("#")[0].strip()
         if not line:
@@ -147,8 +153,9 @@ def parse(text: str) -> tuple[list[Item], list[Problem]]:
                 problems.append(Problem(number, f"the first line is not {TITLE!r}"))
                 break
             continue
+        place += 1
         try:
-            items.append(_parse_item(line))
+            items.append(_parse_item(line, place))
         except BadValue as error:
             problems.append(Problem(number, str(error)))
     if not titled:
@@ -158,17 +165,29 @@ def parse(text: str) -> tuple[list[Item], list[Problem]]:
     return items, problems
 
 
-def _parse_item(line: str) -> Item:
+def _parse_item(line: str, place: int) -> Item:
     fields = line.split()
     if len(fields) != _FIELDS:
         raise BadValue(f"an item has {_FIELDS} numbers, and here are {len(fields)}")
-    _whole(fields[0], _MOST, "the number of an item")
+    if _whole(fields[0], _MOST, "the number of an item") != min(place, _MOST):
+        raise BadValue(f"this is item {place}, and its number is {fields[0]}: they count from 0")
     current, frame = _whole(fields[1], 255, "current"), _whole(fields[2], 255, "the frame")
     command, autocontinue = _whole(fields[3], _MOST, "the command"), _whole(fields[11], 255, "autocontinue")
     one, two, three, four = (_float(field) for field in fields[4:8])
     bare = Item(frame, command, (one, two, three, four), 0, 0, 0.0)
-    x, y, z = _scaled(fields[8], bare.scale), _scaled(fields[9], bare.scale), _float(fields[10])
+    x, y = _scaled(fields[8], bare.scale), _scaled(fields[9], bare.scale)
+    if bare.scale == _DEGREES:
+        _require_degrees(fields[8], x, 90, "latitude")
+        _require_degrees(fields[9], y, 180, "longitude")
+    z = _float(fields[10])
+    if not math.isfinite(z):
+        raise BadValue(f"{fields[10]} is no height")
     return Item(frame, command, bare.parameters, x, y, z, current, autocontinue)
+
+
+def _require_degrees(text: str, scaled: int, most: int, what: str) -> None:
+    if abs(scaled) > most * _DEGREES and scaled != _NO_PLACE:
+        raise BadValue(f"{text} is no {what}: from -{most} to {most}")
 
 
 def _whole(text: str, most: int, what: str) -> int:

@@ -7,6 +7,7 @@ closed. One that is refused is ACKed all the same by some, and the old items sta
 from __future__ import annotations
 
 import errno
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ ITEM = struct.Struct("<ffffiifHHBBBBBB")
 HOME = (0.0, 0.0, 0.0, 0.0, -353632610, 1491652299, 584.0899658203125, 0, 16, 0, 0, 0, 0, 1, 0)
 
 Item = tuple[float | int, ...]
-_COMMAND, _WAYPOINT = 8, 16
+_HEIGHT, _COMMAND, _WAYPOINT = 6, 8, 16
 _PLACELESS = frozenset((20, 112, 114, 115, 177, 178, 183, 206, 211))
 
 
@@ -65,7 +66,10 @@ class Missions:
         parts = [body[at : at + ITEM.size] for at in range(0, len(body), ITEM.size)]
         if not all(map(any, parts)):
             return None
-        return [self._kept(place, ITEM.unpack(part), kind) for place, part in enumerate(parts)]
+        items = [ITEM.unpack(part) for part in parts]
+        if not all(math.isfinite(item[_HEIGHT]) for item in items):
+            return None
+        return [self._kept(place, item, kind) for place, item in enumerate(items)]
 
     def _kept(self, place: int, item: Item, kind: int) -> Item:
         """Return what of an item there is room for: no ids, no yaw of a waypoint, heights in steps."""

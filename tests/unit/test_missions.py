@@ -106,7 +106,26 @@ def test_any_bytes_are_a_mission_or_an_error(data: bytes) -> None:
             items = unpack(whole, MISSION)
         except RemoteProtocolError:
             continue
-        assert parse(render(items))[1] == []
+        assert all("is no " in problem.reason for problem in parse(render(items))[1])
+
+
+def test_the_simulated_vehicle_refuses_a_height_that_is_none() -> None:
+    for height in (float("nan"), float("inf")):
+        missions = Missions()
+        before = missions.packed(b"mission.dat")
+        upload = b"".join(pack_upload([HOME, replace(GO, z=height)], MISSION, (1, 1)))
+        missions.replace(b"mission.dat", upload)
+        assert missions.packed(b"mission.dat") == before
+
+
+@given(st.binary(min_size=38, max_size=200))
+def test_the_simulated_vehicle_outlives_any_bytes(data: bytes) -> None:
+    items = data[: len(data) // 38 * 38]
+    for kind, name in enumerate((b"mission.dat", b"fence.dat", b"rally.dat")):
+        missions = Missions()
+        missions.replace(name, data)
+        missions.replace(name, HEADER.pack(0x763D, kind, 0, 0, len(items) // 38) + items)
+        unpack(missions.packed(name), kind)
 
 
 # --- text
@@ -149,9 +168,9 @@ def test_places_of_commands_without_one_are_plain_numbers() -> None:
             st.integers(0, 255),
             st.integers(0, 65535),
             st.tuples(*[st.floats(width=32, allow_nan=False)] * 4),
-            st.integers(-(2**31), 2**31 - 1),
-            st.integers(-(2**31), 2**31 - 1),
-            st.floats(width=32, allow_nan=False),
+            st.integers(-90 * 10**7, 90 * 10**7) | st.just(2**31 - 1),
+            st.integers(-180 * 10**7, 180 * 10**7) | st.just(2**31 - 1),
+            st.floats(width=32, allow_nan=False, allow_infinity=False),
             st.integers(0, 255),
             st.integers(0, 255),
         ),
@@ -174,6 +193,12 @@ def test_missions_come_back(items: list[Item]) -> None:
         ("QGC WPL 110\n0 0 0 99999 0 0 0 0 0 1 2 1\n", 2, "the command"),
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 999 1 2 1\n", 2, "no place"),
         ("QGC WPL 110\n0 0 0.5 16 0 0 0 0 9 1 2 1\n", 2, "the frame"),
+        ("QGC WPL 110\n0 0 0 16 0 0 0 0 90.1 1 2 1\n", 2, "90.1 is no latitude"),
+        ("QGC WPL 110\n0 0 0 16 0 0 0 0 90 -181 2 1\n", 2, "-181 is no longitude"),
+        ("QGC WPL 110\n0 0 0 16 0 0 0 0 nan 1 2 1\n", 2, "no place"),
+        ("QGC WPL 110\n0 0 0 16 0 0 0 0 9 1 nan 1\n", 2, "nan is no height"),
+        ("QGC WPL 110\n0 0 0 16 0 0 0 0 9 1 -inf 1\n", 2, "-inf is no height"),
+        ("QGC WPL 110\n1 0 0 16 0 0 0 0 9 1 2 1\n", 2, "this is item 0, and its number is 1"),
         ("QGC WPL 110\n0 0 0 16 1e39 0 0 0 9 1 2 1\n", 2, "too large"),
     ],
 )
