@@ -29,12 +29,13 @@ from mavftpfs.client import scan as scanning
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
-from mavftpfs.client.leftovers import recovered_directory
+from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
 from mavftpfs.client.source import target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, NotDelivered, UsageError, exit_code_for
+from mavftpfs.shared.private import make_private_directory
 from mavftpfs.shared.readable import printable, readable, readable_size
 
 ResultT = TypeVar("ResultT")
@@ -328,11 +329,21 @@ def put(args: Args) -> int:
 
 @contextmanager
 def _spooled_stdin() -> Iterator[Path]:
-    """Keep what stdin has in a file: how much it is has to be known before, and it may be sent twice."""
+    """Keep what stdin has in a file: how much it is has to be known before, and it may be sent twice.
+
+    Raises:
+        NotDelivered: the body did. Nobody else has the bytes, so they are kept, and the text says where.
+    """
     with NamedTemporaryFile(prefix="mavftpfs-") as file:
         shutil.copyfileobj(sys.stdin.buffer, file)
         file.flush()
-        yield Path(file.name)
+        try:
+            yield Path(file.name)
+        except NotDelivered as exc:
+            directory = recovery_directory("stdin")
+            make_private_directory(directory)
+            kept = Path(shutil.copy(file.name, directory / "stdin"))
+            raise NotDelivered(f"{exc}; what came from stdin is kept in {kept}", there=exc.there) from exc
 
 
 def _put(args: Args, component: int | None, function: Callable[..., Coroutine[Any, Any, None]]) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -81,6 +82,21 @@ def test_a_signal_ends_the_delivery_of_a_mount_that_is_unmounted(
         assert child.returncode == ExitCode.UNDELIVERED
     assert process.wait() == ExitCode.UNDELIVERED
     assert f"1 file(s) did not reach the vehicle; they are kept in {state}" in errors
+
+
+def test_what_came_from_stdin_and_was_not_delivered_is_kept(field: Field, data: Path, state: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    vehicle.pause()
+    argv = [*MAVFTPFS, "put", str(mount.path), "-", "/from_stdin"]
+    with data.open("rb") as source:
+        done = subprocess.run(argv, stdin=source, capture_output=True, text=True, timeout=120, check=False)
+    vehicle.resume()
+    assert done.returncode == ExitCode.UNDELIVERED, done.stderr
+    (kept,) = state.glob("*/stdin")
+    assert f"what came from stdin is kept in {kept}" in done.stderr
+    assert kept.read_bytes() == data.read_bytes()
 
 
 def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
