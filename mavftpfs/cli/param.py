@@ -7,7 +7,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,12 +45,16 @@ def _param(args: Args) -> int:
     if args.save is not None:
         return _with_session(args, partial(_save, args))
     if args.diff is not None:
-        return _with_session(args, partial(_diff, args, client.load(Path(args.diff))))
+        return _with_session(args, partial(_diff, args, client.load(_file(args.diff))))
     if args.load is not None:
-        return _change(args, client.load(Path(args.load)), args.load, meant=False)
+        return _change(args, lambda: client.load(_file(args.load)), args.load, meant=False)
     if setting:
-        return _change(args, client.assignments(setting), "", meant=True)
+        return _change(args, lambda: client.assignments(setting), "", meant=True)
     return _with_session(args, partial(_print, args))
+
+
+def _file(word: str) -> Path:
+    return Path("/dev/stdin") if word == "-" else Path(word)
 
 
 def _require_one_job(args: Args, setting: Sequence[str]) -> None:
@@ -163,12 +167,14 @@ def _difference_lines(found: Sequence[Difference]) -> list[str]:
 # -- setting --------------------------------------------------------------------------------------
 
 
-def _change(args: Args, lines: Sequence[Line], name: str, *, meant: bool) -> int:
-    bar, done = Progress(), list[Change]()
+def _change(args: Args, read: Callable[[], Sequence[Line]], name: str, *, meant: bool) -> int:
+    done = list[Change]()
     error: MavftpfsError | None = None
-    setting = _Setting(args, lines, name, meant, bar, done)
+    announced = False
     try:
+        setting = _Setting(args, read(), name, meant, Progress(), done)
         _with_session(args, setting.run, writing=True)
+        announced = setting.announced
     except MavftpfsError as exc:
         error = exc
     if args.json:
@@ -177,9 +183,9 @@ def _change(args: Args, lines: Sequence[Line], name: str, *, meant: bool) -> int
         ]
         print(json.dumps({"set": facts, "error": None if error is None else str(error)}, indent=2))
     elif error is None:
-        for change in () if setting.announced else done:
+        for change in () if announced else done:
             print(change)
-        if setting.announced or not done:
+        if announced or not done:
             print(f"{len(done)} set" if done else "nothing to set: all of it holds", file=sys.stderr)
     if error is not None:
         raise error

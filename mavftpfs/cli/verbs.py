@@ -158,8 +158,7 @@ def sync(args: Args) -> int:
         return max(exit_code_for(error), ExitCode.INCOMPLETE)
     if outcome.differing:
         return ExitCode.USAGE
-    complete = outcome.complete and not (args.check and outcome.lacking)
-    return ExitCode.OK if complete else ExitCode.INCOMPLETE
+    return ExitCode.OK if outcome.complete else ExitCode.INCOMPLETE
 
 
 def _print_outcome(args: Args, outcome: download.Outcome, since: float | None) -> None:

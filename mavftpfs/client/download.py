@@ -69,7 +69,7 @@ class Outcome:
 
     proofs: how those that were looked at were verified. failed: why a file, or what is in a directory, is not
     here. grown: (bytes that were here, bytes that are) of each that is still growing. differing: what `check`
-    found.
+    found. checked: it was `check`.
     """
 
     place: bytes = b""
@@ -80,12 +80,14 @@ class Outcome:
     failed: dict[bytes, MavftpfsError] = field(default_factory=dict)
     grown: dict[bytes, tuple[int, int]] = field(default_factory=dict)
     differing: dict[bytes, str] = field(default_factory=dict)
+    checked: bool = False
     finished: bool = False
 
     @property
     def complete(self) -> bool:
-        """Whether everything that was wished for is here."""
-        return self.finished and not self.failed
+        """Whether everything that was wished for is here, and for `check`, is proven to be the same."""
+        unproven = self.checked and bool(self.lacking)
+        return self.finished and not (self.failed or self.differing or unproven)
 
     @property
     def lacking(self) -> Counter[str]:
@@ -166,6 +168,7 @@ class Downloads:
         Raises:
             As `sync`.
         """
+        self.outcome.checked = True
         logs, progress = await self._logs(wish), self.fetcher.progress
         self.outcome.here = [log for log in logs if log.local.is_file()]
         self.outcome.wanted = [log for log in logs if not log.local.is_file()]

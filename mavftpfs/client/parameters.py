@@ -160,11 +160,13 @@ def assignments(words: Sequence[str]) -> list[Line]:
     """Return what NAME=VALUE words ask for.
 
     Raises:
-        UsageError: a value is no number, or a name has two.
+        UsageError: a word has no name, a value is no number, or a name has two.
     """
     lines: list[Line] = []
     for number, word in enumerate(words, 1):
         name, _, value = word.partition("=")
+        if not name.strip():
+            raise UsageError(f"{word}: write NAME=VALUE, without spaces")
         try:
             line = Line(number, name.strip(), parse_number(value.strip()))
         except BadValue as exc:

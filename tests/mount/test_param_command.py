@@ -52,12 +52,18 @@ def test_setting(source: str) -> None:
     told = json.loads("\n".join(param(source, "RTL_ALT=1600", "--json")))
     assert told == {"set": [{"name": "RTL_ALT", "from": 1500, "to": 1600}], "error": None}
     param(source, "RTL_ALT=1500")
+    for words, why in ((["RTL_ALT=x"], "'x' is not a number"), (["--load", "/nowhere/x"], "No such file")):
+        told = json.loads("\n".join(param(source, "--json", *words, code=1)))
+        assert told["set"] == []
+        assert why in told["error"]
 
 
 @pytest.mark.parametrize(
     ("words", "named"),
     [
         (("RTL_ALT=x",), "'x' is not a number"),
+        (("RTL_ALT", "=3"), "not both"),
+        (("=3",), "write NAME=VALUE"),
         (("RTL_ALT=1.5",), "not a whole number"),
         (("RTL_ALT=1", "RTL_ALT=2"), "given two values"),
         (("NOPE=1",), "has no NOPE"),

@@ -575,6 +575,14 @@ async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
         "/log/4": "wanted",
     }
     assert outcome.differing[b"/log/3"] == "3 bytes here, 5 on the vehicle"
+    assert outcome.facts()["complete"] is False
+    for path, data in tree.files.items():
+        (tmp_path / path.decode().rpartition("/")[2]).write_bytes(data)
+    outcome = Outcome()
+    await Downloads(fetcher_of(tree, verify="none"), outcome, lambda _: None, lambda _: None).check(
+        Wish(tmp_path)
+    )
+    assert outcome.facts()["complete"] is True
 
 
 @pytest.mark.parametrize("what", ["LOCAL", "--from"])
