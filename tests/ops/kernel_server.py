@@ -43,6 +43,9 @@ class QuietTree(FakeTree):
         """Nothing to keep."""
         return ()
 
+    async def keep_whole_files(self) -> None:
+        """Nothing to keep."""
+
 
 class Server:
     """The tree and the commands that change it."""
