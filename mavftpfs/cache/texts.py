@@ -253,7 +253,7 @@ class Texts(ABC, Generic[B]):
                 raise
             if done is not None:
                 self._know(program, done.known)
-            self._tell(name, [] if done is None else done.notes)
+                self._tell(name, done.notes)
 
     def _know(self, program: Program | None, known: B | None) -> None:
         """A program saved: this is what it still knows."""

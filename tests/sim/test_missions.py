@@ -72,10 +72,7 @@ async def test_a_mission_that_is_there_sends_nothing() -> None:
         tree = here.mount()
         await save(tree, MISSION, PLAN)
         for text in (PLAN, (await read_file(tree, MISSION)).decode()):
-            with pytest.raises(InvalidText):
-                await save(tree, MISSION, PLAN + "x\n")
             await save(tree, MISSION, text)
-            assert await read_file(tree, ERRORS) == b""
         assert here.count(Opcode.CREATE_FILE) == 1
 
 
@@ -118,7 +115,6 @@ async def test_what_the_vehicle_has_no_room_for_is_said() -> None:
     ("text", "said"),
     [
         ("1 2 3\n", b"mission.waypoints:1: the first line"),
-        (PLAN.replace("\t30\t", "\tnan\t"), b"mission.waypoints:4: nan is no height"),
         (PLAN + "x\n", b"mission.waypoints:6: an item has 12 numbers"),
         ("\xff\n", b"mission.waypoints:1: this is no text"),
     ],
