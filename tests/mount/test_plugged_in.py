@@ -72,8 +72,8 @@ set -eu
 mkdir "$1"
 mount -t tmpfs none "$1"
 for place in usr/local usr/sbin etc; do
-    mkdir -p "$1/up/$place" "$1/work/$place"
-    mount -t overlay none -o "lowerdir=/$place,upperdir=$1/up/$place,workdir=$1/work/$place" "/$place"
+    mkdir -p "$1/up/$place" "$1/scratch/$place"
+    mount -t overlay none -o "lowerdir=/$place,upperdir=$1/up/$place,workdir=$1/scratch/$place" "/$place"
 done
 written() { (cd "$1/up" && find . -type f -o -type l | sort | sed "s,^,$2 ,"); }
 """
@@ -83,13 +83,13 @@ class Installation:
     """A program that root installed, run in a namespace whose /usr/local, /usr/sbin and /etc are copies."""
 
     def __init__(self, folder: Path) -> None:
-        self.copy, self.library, self.programs = folder / "copy", folder / "library", folder / "bin"
-        shutil.copytree(PROJECT / "mavftpfs", self.library / "mavftpfs")
+        self.copy, self.packages, self.programs = folder / "copy", folder / "library", folder / "bin"
+        shutil.copytree(PROJECT / "mavftpfs", self.packages / "mavftpfs")
         self.programs.mkdir()
         for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
             program = self.programs / name
             program.write_text(
-                f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(self.library)!r})\n"
+                f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(self.packages)!r})\n"
                 f"from mavftpfs.cli import main\nsys.exit(main.{function}())\n"
             )
             program.chmod(0o755)
@@ -97,7 +97,7 @@ class Installation:
     def run(self, *steps: str, code: int = 0) -> dict[str, list[str]]:
         """Run the steps of a script; return what its lines say, by their first words."""
         script = "\n".join([IN_A_NAMESPACE, *steps])
-        places = map(str, (self.copy, self.programs, self.library))
+        places = map(str, (self.copy, self.programs, self.packages))
         command = ["unshare", "--mount", "sh", "-c", script, "sh", *places]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         assert done.returncode == code, done.stdout + done.stderr
