@@ -49,6 +49,15 @@ def temporaries(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where the daemons keep what is not delivered: not in the home of the user that runs the tests."""
+    path = tmp_path_factory.mktemp("state")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(path))
+        yield path
+
+
+@pytest.fixture(scope="session", autouse=True)
 def surroundings() -> Iterator[None]:
     """Give all programs the same surroundings: Ctrl-C and a hang-up end them, also where whoever runs the
     tests ignores these (`&`, nohup), modes are as usual, and what is no terminal is not taken for one."""

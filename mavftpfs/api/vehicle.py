@@ -33,6 +33,8 @@ from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
 from mavftpfs.shared.readable import name_text
 
 log = logging.getLogger("mavftpfs.api")
+logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
+"""What the caches warn of is raised, too: a program that set up no logging reads it once."""
 
 PathLike = str | bytes | os.PathLike[str]
 """A path on the vehicle. A relative one begins at the root."""
@@ -429,9 +431,6 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
         opened. UsageError (a ValueError): of source or options, which it names.
     """
-    caches = logging.getLogger("mavftpfs.cache")
-    if caches.level == logging.NOTSET:
-        caches.setLevel(logging.ERROR)  # what they warn of is raised, too
     with translated():
         target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))
         if target.mount is not None and not use_mount:

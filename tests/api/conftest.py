@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 import mavftpfs
-from tests.mount.conftest import Field, field, module_field, state_home
+from tests.mount.conftest import Field, field, module_field
 from tests.support.vehicles import SimVehicle
 
-__all__ = ["field", "module_field", "state_home"]
+__all__ = ["field", "module_field"]
 
 
 @pytest.fixture(scope="module")

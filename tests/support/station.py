@@ -97,11 +97,17 @@ def download_mission(station: RecordedStation) -> list[int]:
     found = []
     for number in range(message.count):
         station.mav.mission_request_int_send(*VEHICLE, number)
-        item = station.recv_match(type="MISSION_ITEM_INT", blocking=True, timeout=PATIENCE)
-        assert item is not None
-        assert item.seq == number
-        found.append(item.x)
+        found.append(mission_item(station, number).x)
     return found
+
+
+def mission_item(station: RecordedStation, number: int) -> Any:
+    """Return one item; those that another station with the same id asked for come here, too."""
+    while True:
+        item = station.recv_match(type="MISSION_ITEM_INT", blocking=True, timeout=PATIENCE)
+        assert item is not None, f"item {number} does not come"
+        if item.seq == number:
+            return item
 
 
 def fetch(station: RecordedStation, remote: str) -> str:
