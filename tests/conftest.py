@@ -60,13 +60,14 @@ def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="session", autouse=True)
 def surroundings() -> Iterator[None]:
     """Give all programs the same surroundings: Ctrl-C and a hang-up end them, also where whoever runs the
-    tests ignores these (`&`, nohup), modes are as usual, and what is no terminal is not taken for one."""
+    tests ignores these (`&`, nohup), modes are as usual, and what is no terminal is not taken for one.
+    Modules stay compiled, as in an installation: else each of the many programs compiles all of them anew."""
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) == signal.SIG_IGN:
             signal.signal(number, handler)
     os.umask(0o022)
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "PYTHONDONTWRITEBYTECODE"):
             patch.delenv(name, raising=False)
         yield
 
