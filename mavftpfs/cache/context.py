@@ -79,7 +79,7 @@ class Context:
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""
         node = self.nodes.get(path)
-        return self.unfinished.is_open(path) or (node is not None and node.changing)
+        return self.unfinished.is_unknown(path) or (node is not None and node.changing)
 
     def on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed: notice which files others replaced since they were opened or delivered
@@ -88,7 +88,7 @@ class Context:
             parent, name = split(node.path)
             entry = directory.entries.get(name) if parent == path else None
             draft = node.draft
-            if entry is None or draft is None or draft.base is None or directory.listed_at <= node.known_at:
+            if entry is None or draft is None or draft.base is None or directory.listed_at <= node.proven_at:
                 continue
             if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue

@@ -134,7 +134,7 @@ class Deliverer:
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.unacked < START_AT or not may_pass(node):
             return
-        if context.unfinished.is_open(node.path) or not draft.whole:
+        if context.unfinished.is_unknown(node.path) or not draft.whole:
             node.start_after = float("inf")
             return
         try:
@@ -185,12 +185,12 @@ class Deliverer:
                 return None
             there: bool | None = False
             try:
-                if context.unfinished.is_open(node.path):
+                if context.unfinished.is_unknown(node.path):
                     await self._mend(node, draft)
                     if not node.undelivered:
                         return True
                 await self.abandon(node)
-                if draft.begun:  # part of it may have the name
+                if draft.sent_in_place:  # part of it may have the name
                     if draft.base is None:
                         await self._names.remove_if_there(node.path)
                     else:
@@ -216,7 +216,7 @@ class Deliverer:
         if draft.state is State.STALE:
             raise FileChanged("others replaced the file on the vehicle while it was changed here")
         in_place = self._context.store.traits.rename_works is False
-        if in_place and draft.base is not None and not (self._context.options.inplace or draft.begun):
+        if in_place and draft.base is not None and not (self._context.options.inplace or draft.sent_in_place):
             raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
 
     async def _try(self, node: Node, draft: Draft) -> None:
@@ -225,7 +225,7 @@ class Deliverer:
         while True:
             in_place = store.traits.rename_works is False
             try:
-                if self._context.unfinished.is_open(node.path):
+                if self._context.unfinished.is_unknown(node.path):
                     await self._mend(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
@@ -386,7 +386,7 @@ class Deliverer:
             if not await self.verifier.is_same(node.path, draft.base):
                 draft.lose_base()
                 raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")
-        elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
+        elif draft.base is None and not draft.sent_in_place and not await self._names.is_free(node.path):
             raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
 
     async def _commit(self, node: Node, draft: Draft, attempt: Attempt, *, summed: bool) -> None:
@@ -411,7 +411,7 @@ class Deliverer:
             draft.give_up()  # unless it commits already
             if draft.state is State.COMMITTING:
                 unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-                if unknown or unfinished.is_open(path):
+                if unknown or unfinished.is_unknown(path):
                     unfinished.on_unknown(path)
                     draft.interrupted()
                 else:
@@ -457,7 +457,7 @@ class Deliverer:
             crc32 = draft.crc32()
         draft.delivered(crc32)
         node.generation += 1
-        node.known_at = context.clock()
+        node.proven_at = context.clock()
         node.close_base()
         context.files.on_changed(node.path)
 

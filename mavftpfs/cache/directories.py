@@ -45,8 +45,8 @@ from mavftpfs.shared.model import (
     DirEntry,
     EntryKind,
     Listing,
-    hides_files,
     join,
+    omits_files,
     split,
     usable_name,
 )
@@ -404,7 +404,7 @@ class Directories:
             tries += 1
             try:
                 listing = await self._store.list_directory(path)
-                if not self._dot_refused and hides_files(path, listing.entries):
+                if not self._dot_refused and omits_files(path, listing.entries):
                     listing = await self._with_dot(listing)
             except FtpNak:  # perhaps it is gone, so the parent is asked again
                 self.forget(path)
@@ -435,7 +435,7 @@ class Directories:
             listing.entries + more,
             listing.took + dot.took,
             listing.complete and dot.complete,
-            listing.hidden + dot.hidden,
+            listing.unshown + dot.unshown,
         )
 
     def begin(self, path: bytes) -> Sweep:

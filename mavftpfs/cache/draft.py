@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.sameness import Known
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 STEP = 64 * 1024
 """Bytes read from the spool at once for a checksum."""
@@ -150,8 +150,8 @@ class Draft:
         self.base = base
         self.base_limit = self.size
         self.state = State.DIRTY if base is None else State.CLEAN
-        self.sending: Sending | None = None
-        self.begun = False
+        self.sending: SendBuffer | None = None
+        self.sent_in_place = False
         self._held = ExtentSet()
         self._changed = ExtentSet()
         self.lacked = False
@@ -267,13 +267,13 @@ class Draft:
 
     # --- what delivery does
 
-    def begin(self, *, in_place: bool, progress: Callable[[int], None] | None = None) -> Sending:
+    def begin(self, *, in_place: bool, progress: Callable[[int], None] | None = None) -> SendBuffer:
         """Start to send a whole draft to an empty file. in_place: to the file's own name, so that from now on
-        nothing counts of what is there. progress: see Sending."""
+        nothing counts of what is there. progress: see SendBuffer."""
         self.on(Event.BEGUN)
         if in_place:
-            self.begun, self.base_limit = True, 0
-        self.sending = Sending(self.local_bytes, self.size, progress)
+            self.sent_in_place, self.base_limit = True, 0
+        self.sending = SendBuffer(self.local_bytes, self.size, progress)
         return self.sending
 
     def give_up(self) -> None:
@@ -295,7 +295,7 @@ class Draft:
             self.on(Event.COMMITS)
         self.on(Event.PLACED)
         self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
-        self.begun = False
+        self.sent_in_place = False
         self._changed = ExtentSet()
         self.content.restate(delivered=True)
 

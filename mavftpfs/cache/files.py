@@ -116,11 +116,13 @@ class Files:
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         version, same = await self._opening.run(path, partial(self._open_version, path, found))
-        keep_cache, direct_io = same and version.shown, False
+        keep_cache, direct_io = same and version.in_kernel, False
         for other in self.open_versions:
             if other.path == path and other is not version:
                 direct_io |= not other.replaced or other.by_others
-        version.shown = not direct_io  # the kernel may fetch pages for programs that read an older version
+        version.in_kernel = (
+            not direct_io
+        )  # the kernel may fetch pages for programs that read an older version
         version.handles += 1
         self.open_versions[version] = None
         return VersionHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
@@ -149,15 +151,15 @@ class Files:
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
         listed_at = found.directory.listed_at
-        answer = compare(replace(version.known, anew=True), Listed(found.entry))
-        if answer is Sameness.OTHER and listed_at > version.known_at:
+        answer = compare(replace(version.known, at_open=True), Listed(found.entry))
+        if answer is Sameness.OTHER and listed_at > version.proven_at:
             self.kill(version)
         if version.replaced or found.size != version.size:
             return False
         if fresh and answer is Sameness.SAME:
             version.prove(listed_at)
             return True
-        return self._clock() - version.known_at < self._proof_time
+        return self._clock() - version.proven_at < self._proof_time
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         self._directories.require_heard()
@@ -206,9 +208,9 @@ class Files:
         """
         async with self.paths.steady(version) as path:
             version.require_not_replaced()
-            expected = None if version.doubted else version.size
+            expected = None if version.ignores_data else version.size
             version.close_reader()
-            version.doubted = False
+            version.ignores_data = False
             reader = await self._store.open_reader(path, version, expected_size=expected)
         if version.handles == 0:
             reader.close()
@@ -298,7 +300,7 @@ class Files:
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and not version.replaced
-            if known and directory.listed_at > version.known_at and not self.is_changing(version.path):
+            if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
@@ -316,12 +318,12 @@ class Files:
         """The kernel may hold bytes of a file that had the path before."""
         current = self._current.get(path)
         if current is not None:
-            current.shown = False
+            current.in_kernel = False
         self._invalidate(path)
 
     def _on_dropped(self, version: Version) -> None:
         """Bytes of a version were dropped: the kernel may hold copies."""
-        version.shown = False
+        version.in_kernel = False
         current = self._current.get(version.path) is version
         if current or version in self.open_versions:
             self._invalidate(version.path)
@@ -339,7 +341,7 @@ class Files:
     def whole(self, path: bytes) -> Version | None:
         """Return a path's version if all of it is held, surely of one file, and nobody has another open."""
         version = self._current.get(path)
-        if version is None or version.replaced or not version.complete:
+        if version is None or version.replaced or not version.whole:
             return None
         alone = all(v is version or v.by_others for v in self.open_versions if v.path == path)
         return version if alone and self._is_sure(version) else None
@@ -366,7 +368,7 @@ class Files:
         if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
         version = self._version(path, size)
-        version.known_at, version.shown = proven_at, True
+        version.proven_at, version.in_kernel = proven_at, True
         version.ours = version.given = True
         self._replace(version)
         for at in range(0, size, ADOPTED_AT_ONCE):
@@ -405,7 +407,7 @@ class Files:
         version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
             version.clear()
-        elif version.replaced or version.known_at == NEVER:
+        elif version.replaced or version.proven_at == NEVER:
             self._forget(version)
 
     def forget_closed(self) -> None:
@@ -494,9 +496,9 @@ class VersionHandle(OpenFile):
                     await files.kept.fill(version, start, stop)
                     version.require_not_replaced()
                 if version.missing(start, stop):
-                    if version.reader is None or version.doubted:
+                    if version.reader is None or version.ignores_data:
                         await files.reopening.run(version, partial(files.open_reader, version))
-                    if version.reader is None or version.doubted:
+                    if version.reader is None or version.ignores_data:
                         return None
                     version.reader.want(start, stop, demand=True)
                     if ahead.start < ahead.stop:

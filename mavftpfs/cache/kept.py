@@ -175,18 +175,18 @@ class KeptCache:
         seen: dict[Version, dict[int, bytearray]] = {}
         while self._takes_more:
             await trio.sleep(SETTLED)
-            before, seen = seen, self._held()
+            before, seen = seen, self._in_memory()
             for version, held in seen.items():
                 known = before.get(version, {})
                 await self._keep(version, {i: b for i, b in held.items() if known.get(i) is b})
 
     async def keep_whole_files(self) -> None:
         """Keep what was read whole, also lately: the mount ends."""
-        for version in self._held():
-            if version.complete and version.size <= self._crc_limit():
+        for version in self._in_memory():
+            if version.whole and version.size <= self._crc_limit():
                 await self._keep(version, version.blocks(), by_crc32=True)
 
-    def _held(self) -> dict[Version, dict[int, bytearray]]:
+    def _in_memory(self) -> dict[Version, dict[int, bytearray]]:
         """Return the blocks that are whole and not on the disk, of files that may be kept."""
         held: dict[Version, dict[int, bytearray]] = {}
         for version, index in self._blocks.used:

@@ -278,7 +278,7 @@ class Names:
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
         await self._forget_old(target)
-        own, moved = self._context.own, None
+        own, unfinished, moved = self._context.own, self._context.unfinished, None
         aside = own.beside(target, Kind.OLD)
         own.in_use.add(aside)
         try:
@@ -303,7 +303,7 @@ class Names:
             if moved and not keep_old:
                 await self._discard_old(target, aside)
         finally:
-            if self._context.unfinished.owner_of(aside) is None or self._context.unfinished.is_open(target):
+            if unfinished.owner_of(aside) is None or unfinished.is_unknown(target):
                 own.in_use.discard(aside)
         if not (moved and keep_old):
             return None

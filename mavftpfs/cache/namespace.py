@@ -136,7 +136,7 @@ class Namespace:
         entry = await context.directories.current(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # what else has its name by now is not to be removed
-            there &= draft.base is not None or draft.begun or context.unfinished.is_open(path)
+            there &= draft.base is not None or draft.sent_in_place or context.unfinished.is_unknown(path)
         elif entry is None:
             raise NotFound(f"{path!r} does not exist")
         elif not there:
@@ -149,7 +149,7 @@ class Namespace:
                 await self._hide(node)
                 return
             except FileBusy:
-                if not self._hold(node):
+                if not self._keep_here(node):
                     raise
         if there:
             await self._names.remove_if_there(path)
@@ -230,7 +230,7 @@ class Namespace:
 
     # --- inside: open files that lose their names
 
-    def _hold(self, node: Node) -> bool:
+    def _keep_here(self, node: Node) -> bool:
         """Keep a file's bytes here for the programs that have it open; return whether all of it is known."""
         context, version = self._context, self._context.files.whole(node.path)
         if version is None or node.draft is not None:

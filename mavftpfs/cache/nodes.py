@@ -21,7 +21,7 @@ from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class Attempt:
 
     path: bytes
     in_place: bool
-    sending: Sending
+    sending: SendBuffer
     upload: Upload
     begun_at: float
     trial: RenameTrial | None = None
@@ -55,7 +55,7 @@ class Node:
     vehicle was changed by us. removed: it has no name any more. hidden: it is still on the vehicle, under a
     reserved name. error: why it could not be delivered. attempt: the present one to deliver it. base: reads
     the vehicle's file. start_after: no upload begins by itself before (infinite: only a close sends it).
-    known_at: when the vehicle was last known to have it all. lock: held to write or deliver it, or to take
+    proven_at: when the vehicle was last known to have it all. lock: held to write or deliver it, or to take
     its name. delivery: what ends the delivery under way. claims: how many wait for the lock to take
     name or content away; they go before deliveries.
     """
@@ -71,7 +71,7 @@ class Node:
     attempt: Attempt | None = None
     base: VersionHandle | None = None
     start_after: float = float("-inf")
-    known_at: float = float("-inf")
+    proven_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
     delivery: trio.CancelScope | None = None
     claims: int = 0
@@ -88,7 +88,7 @@ class Node:
     def changing(self) -> bool:
         """Whether what has its name on the vehicle is being changed (see Context.is_changing)."""
         draft = self.draft
-        return draft is not None and (draft.begun or draft.state is State.COMMITTING)
+        return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
 
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:
@@ -138,7 +138,7 @@ class Node:
     def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
         """It is going to be changed. base: the vehicle's file, None for a new one."""
         self.draft = Draft(SpoolContent(spool, self.path), base)
-        self.known_at = now
+        self.proven_at = now
         return self.draft
 
     def drop_draft(self) -> None:
@@ -147,7 +147,7 @@ class Node:
         if self.draft is not None:
             self.draft.content.close()
         self.draft = self.attempt = self.error = None
-        self.start_after = self.known_at = float("-inf")
+        self.start_after = self.proven_at = float("-inf")
 
 
 class Nodes:

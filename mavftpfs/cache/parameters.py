@@ -258,6 +258,6 @@ def _several(wanted: Sequence[Parameter]) -> str:
 
 def _said(verdict: Verdict, failure: MavftpfsError | None) -> list[str]:
     """Return what people are told of a save that did not come true."""
-    held = ", ".join(verdict.held) if verdict.held else "nothing"
+    taken = ", ".join(verdict.taken) if verdict.taken else "nothing"
     why = [] if failure is None else [str(failure)]
-    return [*why, *verdict.missed, *verdict.notes, f"set: {held}"]
+    return [*why, *verdict.missed, *verdict.notes, f"set: {taken}"]

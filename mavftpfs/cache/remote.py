@@ -10,7 +10,7 @@ from math import inf
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing, Traits
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 
 class ReadSink(Protocol):
@@ -198,7 +198,7 @@ class VehicleStore(RemoteStore, Protocol):
         """
         ...
 
-    async def open_upload(self, path: bytes, source: Sending) -> Upload:
+    async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Make a file by CreateFile and write it. Sends nothing before the source has something.
 
         `path` is a temporary of ours, or, on cards that cannot rename, a name that is known to be free. An

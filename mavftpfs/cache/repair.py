@@ -5,7 +5,7 @@
   an old file, its name there    is removed: the new one has the name
   an old file, its name missing  gets its name again
   an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy
-Nothing is touched while its owner may be alive: see STALE_AFTER.
+Nothing is touched while its owner may be alive: see DEAD_AFTER.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ log = logging.getLogger("mavftpfs.cache")
 MAX_LEFTOVERS = 128
 """Leftovers that are dealt with after one listing."""
 
-STALE_AFTER = 600.0
+DEAD_AFTER = 600.0
 """Seconds for which another mount's reserved name must have stayed the same before it counts as left."""
 
 MAX_SEEN = 1024
@@ -151,7 +151,7 @@ class Cleaner:
             seen = self._seen[path] = (entry.size, now)
             if len(self._seen) > MAX_SEEN:
                 del self._seen[next(iter(self._seen))]
-        return now - seen[1] >= STALE_AFTER
+        return now - seen[1] >= DEAD_AFTER
 
     async def _mend(self, left: bytes, name: Reserved, owner: bytes | None) -> None:
         """Remove what is left, or give it its name. owner: the path whose replacement left it, if known."""

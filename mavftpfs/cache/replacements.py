@@ -60,7 +60,7 @@ class Replacements:
         """Note what is known of a path from now on."""
         self._records[path] = record
 
-    def is_open(self, path: bytes) -> bool:
+    def is_unknown(self, path: bytes) -> bool:
         """Return whether what has the name is not known."""
         record = self._records.get(path)
         return record is not None and record.placed is not True

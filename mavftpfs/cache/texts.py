@@ -88,7 +88,7 @@ class Saved(Generic[B]):
 
 
 @dataclass(slots=True)
-class Sending:
+class TextUpload:
     """An upload that is under way, in bytes."""
 
     path: bytes
@@ -125,7 +125,7 @@ class Texts(ABC, Generic[B]):
         self._require_writable = require_writable
         self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
         self._saving = trio.Lock()
-        self._sending: Sending | None = None
+        self._upload: TextUpload | None = None
 
     # --- what the parameters and the missions implement
 
@@ -267,17 +267,17 @@ class Texts(ABC, Generic[B]):
             As VehicleStore.write_whole.
         """
         size = sum(map(len, pieces))
-        sending = self._sending = Sending(self.directory + b"/" + name, size)
+        sending = self._upload = TextUpload(self.directory + b"/" + name, size)
         try:
             await store.write_whole(file, pieces, sending.on_acked)
         finally:
-            self._sending = None
+            self._upload = None
 
     def transfers(self) -> Sequence[dict[str, object]]:
         """Return the upload that is under way, if one is, as the files that are written are told."""
-        return [] if self._sending is None else [self._sending.facts()]
+        return [] if self._upload is None else [self._upload.facts()]
 
-    def refuse_unfinished(self, name: bytes, text: bytes) -> InvalidText:
+    def refuse_missing_newline(self, name: bytes, text: bytes) -> InvalidText:
         """Say that a text ends in the middle of a line, and return the error."""
         number = text.count(b"\n") + 1
         line = f"{name.decode()}:{number}: the last line has no end, so nothing was set"
@@ -416,7 +416,7 @@ class TextHandle(OpenFile, Generic[B]):
             return
         text = bytes(self._content)
         if text and not text.endswith(b"\n"):
-            raise self._texts.refuse_unfinished(self._name, text)
+            raise self._texts.refuse_missing_newline(self._name, text)
         self._changed, self._error = False, None
         if not text:
             return

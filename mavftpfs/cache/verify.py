@@ -158,7 +158,7 @@ class Verifier:
                 same = False
             finally:
                 version.close_reader()
-            if not version.doubted:
+            if not version.ignores_data:
                 break
         else:
             raise SessionBusy(f"another FTP client was active whenever {path!r} was read back")

@@ -163,13 +163,13 @@ class Version:
         state: see VersionState.
         path: what it is called by now. size: in bytes, by the open reply. mtime: None if not known to belong
             to this size. ours: we wrote it. given: a program got bytes of it.
-        known_at: when the path was last known to be this file; NEVER after the vehicle restarted.
+        proven_at: when the path was last known to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the session that bytes come from now.
         compare_after: no listing is asked for before, only to compare.
         by_others: somebody else replaced it.
         reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
             local disk, if it may have one. shown: the kernel may hold pages of it, and all of them are good.
-        doubted: what comes from the present reader is ignored, until a new one is opened.
+        ignores_data: what comes from the present reader is ignored, until a new one is opened.
         drops: how often all bytes were dropped because they were in doubt, or another file's.
     """
 
@@ -189,9 +189,9 @@ class Version:
         self.reader: Reader | None = None
         self.handles = 0
         self.state = VersionState.CURRENT
-        self.known_at = cache.clock()
+        self.proven_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
-        self.ours = self.given = self.by_others = self.shown = self.doubted = False
+        self.ours = self.given = self.by_others = self.in_kernel = self.ignores_data = False
         self.kept: Kept | None = None
         self.drops = 0
         self._why = ""
@@ -222,7 +222,7 @@ class Version:
         return min(self.size, max(self.received, self._present.total))
 
     @property
-    def complete(self) -> bool:
+    def whole(self) -> bool:
         """Whether every byte is held."""
         return self._present.covers(0, self.size)
 
@@ -239,7 +239,7 @@ class Version:
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""
-        if self.doubted:
+        if self.ignores_data:
             return
         count = len(data)
         block = self._blocks.get(offset // BLOCK_SIZE)
@@ -288,9 +288,9 @@ class Version:
 
     def on_suspect(self, reason: str) -> None:
         """Drop every byte, given out or not; reads that wait ask again."""
-        if self.doubted:
+        if self.ignores_data:
             return
-        self.doubted = True
+        self.ignores_data = True
         self.drops += 1
         for index in list(self._blocks):
             self.evict(index)
@@ -324,7 +324,7 @@ class Version:
     @property
     def known(self) -> Known:
         """What it is compared by."""
-        restarted = self.known_at == NEVER
+        restarted = self.proven_at == NEVER
         return Known(self.size, self.mtime, given=self.given, restarted=restarted, ours=self.ours)
 
     def require_not_replaced(self) -> None:
@@ -334,12 +334,12 @@ class Version:
 
     def prove(self, at: float) -> None:
         """The path was known to be this file at that time."""
-        self.known_at = max(self.known_at, at)
+        self.proven_at = max(self.proven_at, at)
         self._look()
 
     def on_restart(self, at: float) -> None:
         """The vehicle restarted: nothing of it is proven any more."""
-        self.known_at = self.compare_after = NEVER
+        self.proven_at = self.compare_after = NEVER
         self.kept = None
         self.on_opened(at)
 
@@ -351,7 +351,7 @@ class Version:
 
     def _look(self) -> None:
         if not self.replaced:
-            proven = self.known_at >= self.opened_at
+            proven = self.proven_at >= self.opened_at
             self.state = VersionState.CURRENT if proven else VersionState.UNPROVEN
 
     def close_reader(self) -> None:

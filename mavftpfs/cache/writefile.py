@@ -136,7 +136,7 @@ class ReadFile(OpenFile):
             fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
             if fits:
                 with suppress(SpoolFailed):  # the local disk does not give it back
-                    context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.known_at)
+                    context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.proven_at)
         context.nodes.maybe_forget(node)
 
     # --- inside

@@ -344,7 +344,7 @@ class Hub:
                     splitter = splitters[key] = Splitter(stream=False)
                 place = Place(side, address)
                 frames += [(place, frame) for frame in splitter.feed(chunk)]
-            if any(frame.proven for _, frame in frames):
+            if any(frame.crc_fits for _, frame in frames):
                 link.keep_peer()
             self._pass_on(frames, forwarded=forwarded)
 

@@ -152,7 +152,7 @@ class Router:
                 return False  # it comes back
             where = place.address or ()
             before = book.last_place(sender)
-            if not frame.proven:
+            if not frame.crc_fits:
                 return before == where
             if not book.accepts(sender, where, now):
                 if len(self.doubles) < _MOST_SENDERS:
@@ -167,7 +167,7 @@ class Router:
         if places is not None and place in places:
             places[place] = now
             return True
-        if not frame.proven:
+        if not frame.crc_fits:
             return False
         self._make_room(place.side)
         self._elsewhere.setdefault(sender, {})[place] = now

@@ -21,14 +21,14 @@ EVERYBODY = Address(0, 0)
 class Frame(NamedTuple):
     """One frame.
 
-    target: EVERYBODY where it names none. proven: its CRC fits.
+    target: EVERYBODY where it names none. crc_fits: its CRC fits.
     """
 
     data: bytes
     source: Address
     target: Address
     id: int
-    proven: bool
+    crc_fits: bool
 
 
 class Splitter:
@@ -75,31 +75,31 @@ class Splitter:
         position, end = 0, len(data)
         while position < end:
             verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
-            if verdict is Verdict.UNFINISHED:
+            if verdict is Verdict.PARTIAL:
                 break
             if verdict is Verdict.GARBAGE:
                 self.garbage += stop - position
             else:
-                proven = verdict is Verdict.WHOLE and is_known(message_id)
-                out.append(_frame(data[position:stop], message_id, proven=proven))
+                crc_fits = verdict is Verdict.WHOLE and is_known(message_id)
+                out.append(_frame(data[position:stop], message_id, crc_fits=crc_fits))
             position = stop
         self._tail = data[position:]
         self.waiting = self._stream and bool(self._tail)
         return out
 
 
-def _frame(data: bytes, message_id: int, *, proven: bool) -> Frame:
+def _frame(data: bytes, message_id: int, *, crc_fits: bool) -> Frame:
     header = 10 if data[0] == 0xFD else 6
     at = 5 if header == 10 else 3
     source = Address(data[at], data[at + 1])
     places = TARGETS.get(message_id)
     if places is None:
-        return Frame(data, source, EVERYBODY, message_id, proven)
+        return Frame(data, source, EVERYBODY, message_id, crc_fits)
     # MAVLink 2 cuts zeros at the end: what is not there is 0.
     system, component = (
         data[header + place] if place is not None and place < data[1] else 0 for place in places
     )
-    return Frame(data, source, Address(system, component), message_id, proven)
+    return Frame(data, source, Address(system, component), message_id, crc_fits)
 
 
 def armed_by(frame: Frame) -> bool | None:

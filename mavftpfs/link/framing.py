@@ -96,7 +96,7 @@ class Verdict(Enum):
     WHOLE = "whole"  # a frame whose CRC fits, or that no CRC is known for
     DAMAGED = "damaged"  # it has a frame's bounds, and another CRC
     GARBAGE = "garbage"
-    UNFINISHED = "unfinished"
+    PARTIAL = "partial"
 
 
 def frame_at(
@@ -112,7 +112,7 @@ def frame_at(
         return Verdict.GARBAGE, found.start() if found else len(data), -1
     header = 10 if magic == _V2 else 6
     if len(data) - position < header:
-        return Verdict.UNFINISHED, position, -1
+        return Verdict.PARTIAL, position, -1
     signature = 0
     if magic == _V2:
         flags = data[position + 2]
@@ -124,14 +124,14 @@ def frame_at(
         message_id = data[position + 5]
     stop = position + header + data[position + 1] + 2 + signature
     if stop > len(data):
-        return Verdict.UNFINISHED, position, -1
+        return Verdict.PARTIAL, position, -1
     crc_at = stop - signature - 2
     extra = _CRC_EXTRA.get(message_id)
     if extra is None or crc16.mcrf4xx(data[position + 1 : crc_at] + bytes((extra,))) != (
         data[crc_at] | data[crc_at + 1] << 8
     ):
         if stop == len(data) and stream:
-            return Verdict.UNFINISHED, position, -1  # the byte behind decides
+            return Verdict.PARTIAL, position, -1  # the byte behind decides
         if stop < len(data) and data[stop] not in (_V1, _V2):
             return Verdict.GARBAGE, position + 1, -1
         if extra is not None:

@@ -122,7 +122,7 @@ class HubLink:
         self._tags: dict[bytes, NetAddress | None] = {b"": None}
         self._outbox = Outbox(_OUTBOX_LIMIT)
         self._work = trio.Event()
-        self._fresh = False
+        self._reopened = False
         self._closed = False
 
     @property
@@ -140,8 +140,8 @@ class HubLink:
         waited = False
         while True:
             chunks = self._drain()
-            if chunks or self._fresh:
-                self._fresh = self._fresh and bool(chunks)
+            if chunks or self._reopened:
+                self._reopened = self._reopened and bool(chunks)
                 if not waited:
                     await trio.lowlevel.cancel_shielded_checkpoint()
                 return chunks
@@ -233,7 +233,7 @@ class HubLink:
                 chunks.append(chunk)
                 senders.append(self._sender(tag))
             elif (unpack_facts(message) or {}).get("reopened"):
-                self._fresh = True
+                self._reopened = True
         if chunks:
             self._senders = senders
             self.stats.received_bytes += sum(map(len, chunks))

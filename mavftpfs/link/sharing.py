@@ -56,7 +56,7 @@ class SharedLink:
         self._heard_by: Link | None = None
         self._address: NetAddress | None = None
         self._system = 0
-        self._fresh = False
+        self._reopened = False
         self._opened = False
         self._changed = trio.Event()
         self._closed = False
@@ -88,7 +88,7 @@ class SharedLink:
                 self._use(hub)
                 await hub.gone.wait()
             self._inner = None
-            self._fresh = True
+            self._reopened = True
             log.warning("the hub of %s is gone; starting another one", self.description)
 
     async def _obtained(self) -> HubLink:
@@ -186,7 +186,7 @@ class SharedLink:
             link.answer(self._address)
         if self._system:
             link.focus(self._system)
-        if self._fresh:
+        if self._reopened:
             self.stats.reopened += 1
         self._changed.set()
         self._changed = trio.Event()
@@ -206,8 +206,8 @@ class SharedLink:
             if inner is None:
                 await self._changed.wait()
                 continue
-            if self._fresh:
-                self._fresh = False
+            if self._reopened:
+                self._reopened = False
                 await trio.lowlevel.cancel_shielded_checkpoint()
                 return []
             try:

@@ -73,7 +73,7 @@ class StreamLink:
         self._opener = opener
         self._pipe = pipe
         self._was_open = pipe is not None
-        self._fresh = False
+        self._reopened = False
         self._closed = False
         self._peer: NetAddress | None = None
         self._vouched_at = trio.current_time()
@@ -102,9 +102,9 @@ class StreamLink:
         while True:
             if self._closed:
                 raise LinkClosed(f"{self.description} is closed")
-            chunks = None if self._fresh else self._drain()
+            chunks = None if self._reopened else self._drain()
             if chunks is None or chunks:
-                self._fresh = False
+                self._reopened = False
                 if not waited:  # one checkpoint per batch, and none where data could be lost
                     await trio.lowlevel.cancel_shielded_checkpoint()
                 return chunks or []
@@ -163,7 +163,7 @@ class StreamLink:
         self._pipe = pipe
         self._peer = peer
         self._vouched_at = trio.current_time()
-        self._fresh = self._was_open
+        self._reopened = self._was_open
         if self._was_open:
             self.stats.reopened += 1
         self._was_open = True

@@ -101,7 +101,7 @@ def _conflict(now: Parameter, wanted: Number, before: Number) -> str:
 class Verdict:
     """What became of a plan: names that hold, a line for each that does not, and notes."""
 
-    held: list[str]
+    taken: list[str]
     missed: list[str]
     notes: list[str]
 
@@ -115,7 +115,7 @@ def judge(wanted: Sequence[Parameter], after: Values) -> Verdict:
         if now is None:
             verdict.missed.append(f"{one.name}: wanted {want}, and it is not there any more")
         elif same(now.value, one.value):
-            verdict.held.append(one.name)
+            verdict.taken.append(one.name)
         elif is_own(one.name):
             got = text_of(now.kind, now.value)
             verdict.notes.append(f"{one.name} is the vehicle's own: wanted {want}, it is {got}")

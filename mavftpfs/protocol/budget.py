@@ -38,7 +38,7 @@ class Budget:
 
     def __init__(self, rate: float, overhead: int = FRAME_OVERHEAD) -> None:
         self.rate = rate
-        self.held = False
+        self.exhausted = False
         self._overhead = overhead
         self._depth = rate * _DEPTH_SECONDS
         self._debt = max(_LEAST_DEBT, rate * _DEBT_SECONDS)
@@ -52,7 +52,7 @@ class Budget:
 
     def begin(self) -> None:
         """See Flow.begin."""
-        self.held = False
+        self.exhausted = False
         self._wanted = None
 
     def room(self, now: float, *, urgent: bool) -> int:
@@ -62,7 +62,7 @@ class Budget:
         balance = self._balance + self._lent
         self._left = 0 if balance < 0.0 else min(_MOST, 1 + int(balance / _FULL_FRAME))
         if self._left == 0:
-            self.held = True
+            self.exhausted = True
             self._want()
         return self._left
 

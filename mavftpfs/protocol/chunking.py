@@ -59,13 +59,13 @@ class ChunkSize:
         self._first_lost_at = 0.0
         self._shortest_lost = 0  # bytes: what is shorter proves nothing when it is answered
         self._answered = 0  # short chunks, while trying
-        self._turn = False
+        self._short_next = False
 
     def next_size(self, now: float) -> int:
         """Return the bytes of the next chunk."""
         if self.trying:
-            self._turn = not self._turn
-            return self._least if self._turn else self.most
+            self._short_next = not self._short_next
+            return self._least if self._short_next else self.most
         if now >= self._short_until:
             self._short_until, self._lost, self.size = inf, 0, self.most
         return self.size
@@ -92,7 +92,7 @@ class ChunkSize:
                 self._shortest_lost = min(size, self._shortest_lost) if self.trying else size
             self._shortest_lost = min(self._shortest_lost, size)
             self._lost += 1
-            self._turn = False  # a short one is next, also where there is one request at a time
+            self._short_next = False  # a short one is next, also where there is one request at a time
             self._settle(now)
         return size > self._least and (self.trying or size > self.size)
 

@@ -168,7 +168,7 @@ class Engine:
         if request is None:
             self._on_unknown(reply, now)
         elif reply.req_opcode != request.opcode:
-            self._on_stale(request)
+            self._on_replay(request)
         elif not request.fits(reply, self.traits):
             return
         elif reply.opcode != _NAK or not self._asks_again(request, reply):
@@ -220,7 +220,7 @@ class Engine:
             self.stats.unexplained += 1
             self.on_unexplained(reply, duplicates.late_by(reply.seq, now))
 
-    def _on_stale(self, request: Request) -> None:
+    def _on_replay(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""
         request.replays += 1
         # It may not be a replay but the rest of an abandoned burst: each new seq may be one more execution.
@@ -270,7 +270,7 @@ class Engine:
                 self.drop(op)
         if starved:
             self.flow.on_starved()
-        if self.flow.budget is not None and self.flow.budget.held:
+        if self.flow.budget is not None and self.flow.budget.exhausted:
             for op in self._ops:
                 op.progress_at = max(op.progress_at, now)
         return wires

@@ -154,7 +154,7 @@ class Flow:
         # What is known of the path.
         self._rates: deque[float] = deque(maxlen=ROUNDS)
         self._rate = 0.0
-        self._base, self._base_seen = inf, 0.0
+        self._shortest, self._shortest_seen = inf, 0.0
         self._probing = 0  # rounds of the search for the base round trip that are left
         self._spread = 0.0
         self._usual_loss, self._per_answer = 0.0, 1.0  # so many requests are to bring one answer
@@ -227,13 +227,13 @@ class Flow:
 
     def _beyond(self, now: float, paced: bool) -> float:
         """Return seconds of requests for which there is room beyond the window because a server pauses."""
-        if now >= self._paused_at + KNOWN or self._base < BRIDGE_FROM:
+        if now >= self._paused_at + KNOWN or self._shortest < BRIDGE_FROM:
             return 0.0
         silence = now - self._answered_at
         if silence > PAUSE:
             bridge = min(LONGEST_PAUSE, silence)
         else:  # those of a pause that just ended are not answered before a round trip later
-            bridge = self.pause if now < self._paused_at + self._base else 0.0
+            bridge = self.pause if now < self._paused_at + self._shortest else 0.0
         if silence < LONGEST_PAUSE:
             self._wake = now + FIRST / self._rate
         return max(BRIDGE * bridge, self._reserve() if paced else 0.0)
@@ -281,21 +281,21 @@ class Flow:
         self._answered += count
         gap, self._answered_at = now - self._answered_at, now
         # What ends a pause waited for its end; after a run of losses nothing waited.
-        waited = rtt is not None and rtt > self._base + gap / 2 and self._rate > 0.0
+        waited = rtt is not None and rtt > self._shortest + gap / 2 and self._rate > 0.0
         if waited and gap > PAUSE + FIRST / self._rate and not self._serial and self._pacer is None:
             self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
         elif now >= self._paused_at + KNOWN:
             self.pause = 0.0
         if rtt is not None:
             self._least = min(self._least, rtt)
-            if rtt <= self._base:
-                self._base, self._base_seen = rtt, now
+            if rtt <= self._shortest:
+                self._shortest, self._shortest_seen = rtt, now
             self._total_rtt += rtt * count
             self._rtts += count
         if self._before_silence:
             self.window, self._before_silence = min(self.cap, self._before_silence), 0
         elif self._starting and not self.starved:
-            most = max(2 * FIRST, START * self._held())
+            most = max(2 * FIRST, START * self._to_fill())
             self.window = max(self.window, min(self.cap, self.window + count, int(most)))
         if self._pacer is not None:
             self._pacer.on_replies(now, rtt, count, newest, next_order)
@@ -307,7 +307,7 @@ class Flow:
         self._round += 1  # it is over
         if self._round_end >= 0 and now > self._round_start:
             self._learn(now, now - self._round_start)
-        if not self._starting and self._rate > 0.0 and self._base >= BASE_LEAST:
+        if not self._starting and self._rate > 0.0 and self._shortest >= BASE_LEAST:
             self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
         else:
             self._pace = inf
@@ -342,7 +342,7 @@ class Flow:
         total = self._answered + self._lost
         # What arrives while a server pauses overflows its buffer, and its answers wait: that says nothing of
         # the link. It shows for a round trip after that.
-        paused = self.pause > 0.0 and self._paused_at + self._base >= self._round_start
+        paused = self.pause > 0.0 and self._paused_at + self._shortest >= self._round_start
         waits = self._reserve() if self.pause else 0.0
         congested = self._lost > 0 and not paused and self._queued(1.0, waits)
         usual = self._usual_loss * total
@@ -362,7 +362,7 @@ class Flow:
             self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
         if self._serial:
             back = lost_too_much or self._queued()
-            most = int(self._rate * (self._base + QUEUE)) + 2
+            most = int(self._rate * (self._shortest + QUEUE)) + 2
             self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1, most)
             return
         if self._starting:
@@ -371,13 +371,13 @@ class Flow:
             self._starting = self._flat < FLAT_ROUNDS and (paused or not overflown)
         if self._starting:
             return
-        held = self._held()  # the window is to fill the path, and a little more
+        to_fill = self._to_fill()  # the window is to fill the path, and a little more
         if self._probing > 1:
-            window = max(1, int((1.0 - STEP) * held))
+            window = max(1, int((1.0 - STEP) * to_fill))
         else:
-            spread = min(self._rate * self._spread, held)
-            step = STEP * (held + spread) if self._round % CYCLE == 0 or rate > before else 0.0
-            window = max(LEAST, round(held + SLACK + self._bold * (spread + step)))
+            spread = min(self._rate * self._spread, to_fill)
+            step = STEP * (to_fill + spread) if self._round % CYCLE == 0 or rate > before else 0.0
+            window = max(LEAST, round(to_fill + SLACK + self._bold * (spread + step)))
         self.window = min(self.cap, window)
 
     def _learn_averages(self, now: float, total: int, *, losses: bool) -> None:
@@ -395,11 +395,11 @@ class Flow:
             return
         if self._probing:
             self._probing -= 1
-        elif now >= self._base_seen + KNOWN and not (self._starting or self._serial or self._pacer):
+        elif now >= self._shortest_seen + KNOWN and not (self._starting or self._serial or self._pacer):
             self._probing = 3
         if self._probing == 1:
-            self._base, self._base_seen = least, now
-        spread = self._total_rtt / self._rtts - self._base
+            self._shortest, self._shortest_seen = least, now
+        spread = self._total_rtt / self._rtts - self._shortest
         self._spread += (min(spread, LITTLE) - self._spread) * SMOOTHING
 
     def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
@@ -407,12 +407,12 @@ class Flow:
         reserve: seconds that it waited for another reason."""
         if self._least == inf:
             return False
-        little = min(QUEUE_SHARE * self._base, LITTLE) + TICK
+        little = min(QUEUE_SHARE * self._shortest, LITTLE) + TICK
         jitter = self._total_rtt / self._rtts - self._least
-        return self._least > self._base + times * little + 2.0 * jitter + reserve
+        return self._least > self._shortest + times * little + 2.0 * jitter + reserve
 
-    def _held(self) -> float:
+    def _to_fill(self) -> float:
         """Return how many requests fill the path, as far as is known."""
-        if self._base == inf:
+        if self._shortest == inf:
             return LEAST
-        return self._rate * max(self._base, BASE_LEAST) * self._per_answer
+        return self._rate * max(self._shortest, BASE_LEAST) * self._per_answer

@@ -20,7 +20,7 @@ __all__ = ["ListDirectory", "OpenRequest", "Operation", "Priority", "Simple"]
 
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
-_MAX_STALE_PAGES = 32
+_MAX_FRUITLESS_PAGES = 32
 _MAX_EMPTY_PAGES = 4
 _KINDS = {b"F": EntryKind.FILE, b"D": EntryKind.DIRECTORY}
 _MAX_DIGITS = 20
@@ -114,12 +114,12 @@ class Page(NamedTuple):
     """What one page holds.
 
     strings: number of its non-empty strings, by which the next page's offset grows (servers.md 14.28).
-    hidden: how many of them name something that cannot be shown.
+    unshown: how many of them name something that cannot be shown.
     """
 
     entries: list[DirEntry]
     strings: int
-    hidden: int
+    unshown: int
 
 
 def parse_page(data: bytes, *, with_time: bool = False) -> Page:
@@ -128,13 +128,13 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
     A last string without NUL counts: a server that fills all 239 bytes may have cut the NUL only.
     """
     entries: list[DirEntry] = []
-    strings = hidden = 0
+    strings = unshown = 0
     for text in data.split(b"\0"):
         if not text:
             continue
         strings += 1
         kind, (name, *fields) = _KINDS.get(text[:1]), text[1:].split(b"\t")
-        # A tab in a name (MAVSDK lists those) shows as a field that is no number: it is hidden.
+        # A tab in a name (MAVSDK lists those) shows as a field that is no number: it is unshown.
         understood = kind is not None and usable_name(name)
         for field in fields:
             understood = understood and field.isdigit() and len(field) <= _MAX_DIGITS
@@ -143,8 +143,8 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
             mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
             entries.append(DirEntry(name, kind, size, mtime or None))
         elif text[:1] != b"S" and name not in (b".", b".."):
-            hidden += 1  # neither a skip mark, nor the directory itself or its parent
-    return Page(entries, strings, hidden)
+            unshown += 1  # neither a skip mark, nor the directory itself or its parent
+    return Page(entries, strings, unshown)
 
 
 class ListDirectory(Operation):
@@ -155,7 +155,7 @@ class ListDirectory(Operation):
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
         complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
-        hidden: names that cannot be shown (with a slash, a tab, or unparsable).
+        unshown: names that cannot be shown (with a slash, a tab, or unparsable).
         strings: how many strings were received so far, which is where the next page begins.
         on_page: called for each page, where it is not None.
 
@@ -168,7 +168,7 @@ class ListDirectory(Operation):
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
         self.entries: list[DirEntry] = []
         self.complete = True
-        self.hidden = 0
+        self.unshown = 0
         self.on_page: Callable[[], None] | None = None
         self._path = path
         self._with_time = with_time
@@ -179,7 +179,7 @@ class ListDirectory(Operation):
         self._pages = 0
         self._first_page = b""
         self._first_page_again = 0
-        self._stale_pages = 0
+        self._fruitless_pages = 0
         self._empty_pages = 0
 
     def next_requests(self, most: int, now: float) -> list[Request]:
@@ -214,7 +214,7 @@ class ListDirectory(Operation):
         elif reply.data == self._first_page:
             self._on_first_page_again()
         self.strings += page.strings
-        self.hidden += page.hidden
+        self.unshown += page.unshown
         known = len(self._names)
         for entry in page.entries:  # a page may name something twice, too
             if entry.name not in self._names:
@@ -222,13 +222,13 @@ class ListDirectory(Operation):
                 self.entries.append(entry)
         # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
         if len(self._names) > known:
-            self._stale_pages = 0
+            self._fruitless_pages = 0
         elif page.entries:
-            self._stale_pages += 1
+            self._fruitless_pages += 1
         if (
             self._pages >= MAX_PAGES
             or len(self.entries) >= MAX_ENTRIES
-            or self._stale_pages > _MAX_STALE_PAGES
+            or self._fruitless_pages > _MAX_FRUITLESS_PAGES
         ):
             self.complete = False
             self.finish()

@@ -27,7 +27,7 @@ _CAREFUL = 1.25
 _WORTH = 0.5
 """The share of a raise that must show in the answers for the raise to be kept."""
 
-_SHY = 0.8
+_SHARE_TAKEN = 0.8
 _UNUSUAL_LOSS = 0.04
 _UNLIKELY = 1.5
 """Standard deviations beyond that: a queue that a raise of a quarter overflows loses a fifth more."""
@@ -64,12 +64,12 @@ class Pacer:
         self._urgent_at = -inf
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
-        self._base_loss = 0.0
+        self._usual_loss = 0.0
         self._seen = 0.0  # so many requests would tell it as well
-        self._base_rtt = inf
+        self._shortest_rtt = inf
         self._least_rtt = inf
         self._hold_until = -inf
-        self._doubted = False
+        self._failed_once = False
         self._longer = 1.0  # the quickest of the last trial took so many least round trips
         self._tokens = 0.0
         self._tokens_at = 0.0
@@ -160,8 +160,8 @@ class Pacer:
         self._raise = _BOLD
         self._hold_until = -inf
         # What was usual need not be so any more, and the few that are sent now find no queue of ours.
-        self._base_loss = self._seen = 0.0
-        self._base_rtt = self._least_rtt = inf
+        self._usual_loss = self._seen = 0.0
+        self._shortest_rtt = self._least_rtt = inf
         self._starved = True
 
     # --- trials
@@ -181,10 +181,10 @@ class Pacer:
     def _end_trial(self, now: float, since: float, next_order: int) -> None:
         answers = self._answered / (now - since)
         loss = self._lost / (self._answered + self._lost)
-        self._base_rtt = min(self._least_rtt, self._base_rtt)
-        self._longer = self._least_rtt / self._base_rtt if self._base_rtt > 0.0 else 1.0
+        self._shortest_rtt = min(self._least_rtt, self._shortest_rtt)
+        self._longer = self._least_rtt / self._shortest_rtt if self._shortest_rtt > 0.0 else 1.0
         self._least_rtt = inf
-        if self._base_rtt < inf:
+        if self._shortest_rtt < inf:
             self._judge(answers, loss, now)
             self._widen(loss)
         self._begin(next_order)
@@ -206,22 +206,22 @@ class Pacer:
             self._accept(answers, loss)
             if self._limited:
                 self.rate *= self._raise
-        elif not self._doubted:
-            self._doubted = True  # so few answers may mislead: once more
+        elif not self._failed_once:
+            self._failed_once = True  # so few answers may mislead: once more
         elif self._raise == _BOLD:
             self.rate *= _CAREFUL / _BOLD
-            self._raise, self._doubted = _CAREFUL, False
+            self._raise, self._failed_once = _CAREFUL, False
         else:
             self._settle(answers, loss, now)
 
     def _accept(self, answers: float, loss: float) -> None:
-        self._best, self._doubted = answers, False
+        self._best, self._failed_once = answers, False
         self._learn(loss)
 
     def _learn(self, loss: float) -> None:
         """This is usual."""
         new = _SMOOTHING if self._seen else 1.0
-        self._base_loss += (loss - self._base_loss) * new
+        self._usual_loss += (loss - self._usual_loss) * new
         before = (1.0 - new) ** 2 / self._seen if self._seen else 0.0
         self._seen = 1.0 / (before + new**2 / (self._answered + self._lost))
 
@@ -230,13 +230,13 @@ class Pacer:
         return sqrt(loss * (1.0 - loss) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
 
     def _is_overflow(self, loss: float) -> bool:
-        return loss - self._base_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
+        return loss - self._usual_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
 
     def _settle(self, answers: float, loss: float, now: float) -> None:
         best = max(answers, self._best)
         overflowed = self._is_overflow(loss)
-        self.rate = best / (1.0 - self._base_loss) * (_SHY if overflowed else 1.0)
-        self._doubted = False
+        self.rate = best / (1.0 - self._usual_loss) * (_SHARE_TAKEN if overflowed else 1.0)
+        self._failed_once = False
         if overflowed or self._longer > _STANDING:
             self._hold_until = now + _HOLD
         else:  # no reason is seen why it should not be faster: chance may have spoken
@@ -247,15 +247,15 @@ class Pacer:
         """While holding: somebody else may have come, the server or the link become slower, the way longer,
         or all of it worse. Which of these, only those tell that are sent as at first."""
         expected = (self.rate or 0.0) * (1.0 - loss)
-        if loss <= self._base_loss + _ALARMING_LOSS and answers >= _SHORT * expected:
-            self._doubted = False
+        if loss <= self._usual_loss + _ALARMING_LOSS and answers >= _SHORT * expected:
+            self._failed_once = False
             self._learn(loss)
-        elif not self._doubted:
-            self._doubted = True
+        elif not self._failed_once:
+            self._failed_once = True
         else:
             self._begin_again()
 
     def _widen(self, loss: float) -> None:
         if self.rate is not None:
-            held = _SPREAD * self.rate * self._base_rtt / max(0.3, 1.0 - loss)
-            self.window = min(self._limit, max(self.queue, round(held) + 2))
+            on_way = _SPREAD * self.rate * self._shortest_rtt / max(0.3, 1.0 - loss)
+            self.window = min(self._limit, max(self.queue, round(on_way) + 2))

@@ -23,7 +23,7 @@ from mavftpfs.shared.extents import ExtentSet
 SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals that mean "no file is open" (servers.md 1)."""
 
-_DOUBTFUL_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
+_MAYBE_SESSION_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
 """Refusals that may mean it: MAVSDK says 1, PX4 says 8 for everything after one "file exists" (servers.md
 12)."""
 
@@ -197,7 +197,7 @@ class ReadTransfer(Operation):
                 return FileChanged(f"the file ends at or before {request.offset}, not at {self.size}")
             # MAVSDK says EOF when another client has closed the file; a reopen tells which it is.
             return SessionLost(f"end of file at {request.offset}, before {self.size}", by_server=True)
-        if nak.code in SESSION_CODES or nak.code in _DOUBTFUL_CODES or nak.server_errno == _EBADF:
+        if nak.code in SESSION_CODES or nak.code in _MAYBE_SESSION_CODES or nak.server_errno == _EBADF:
             return SessionLost(str(nak), by_server=True)
         return nak
 

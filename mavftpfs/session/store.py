@@ -39,11 +39,11 @@ from mavftpfs.shared.model import (
     EntryKind,
     Listing,
     Traits,
-    hides_files,
+    omits_files,
     split,
     wire_path,
 )
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
@@ -151,7 +151,7 @@ class Store:
             if refused or traits.time_silences >= TIME_SILENCES:
                 traits.lists_times = False
         entries = tuple(operation.entries)
-        return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
+        return Listing(entries, self._clock() - started, operation.complete, operation.unshown)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
@@ -225,7 +225,7 @@ class Store:
         finally:
             self._late.on_changed(path, self._clock())
 
-    async def open_upload(self, path: bytes, source: Sending) -> Upload:
+    async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
@@ -396,7 +396,7 @@ class Store:
                 seen = fresh
                 break
             seen |= fresh
-        if hides_files(directory, tuple(seen.values())):
+        if omits_files(directory, tuple(seen.values())):
             with suppress(FtpNak):
                 seen |= (await self._names(DOT))[0]
         return seen, complete

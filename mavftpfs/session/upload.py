@@ -36,7 +36,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
 )
 from mavftpfs.shared.model import split, wire_path
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 LONGEST_BACKOFF = 30.0
 """Most seconds between two attempts after a failure of the link."""
@@ -92,7 +92,7 @@ class Upload(SessionUser):
 
     writing = True
 
-    def __init__(self, path: bytes, source: Sending, scheduler: Scheduler) -> None:
+    def __init__(self, path: bytes, source: SendBuffer, scheduler: Scheduler) -> None:
         super().__init__(path)
         self._source = source
         self.begun = self.resent = False

@@ -46,20 +46,20 @@ class Listing:
     """A whole directory, duplicates and unusable names removed.
 
     took: seconds the sweep needed. complete: False when a cap ended it (absence then proves nothing).
-    hidden: how many names could not be shown.
+    unshown: how many names could not be shown.
     """
 
     entries: tuple[DirEntry, ...]
     took: float
     complete: bool = True
-    hidden: int = 0
+    unshown: int = 0
 
 
 DOT = b"."
 """The working directory of a server that runs as a process (ArduPilot SITL)."""
 
 
-def hides_files(path: bytes, entries: Sequence[DirEntry]) -> bool:
+def omits_files(path: bytes, entries: Sequence[DirEntry]) -> bool:
     """Return whether a listing looks like the `/` of ArduPilot's SITL, which has its files in `DOT` only
     (servers.md 14.32)."""
     if path != ROOT:

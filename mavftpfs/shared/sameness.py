@@ -36,7 +36,7 @@ class Known:
     given: a program may have bytes of it, so that another file of its size must not go on in its place.
     restarted: the vehicle did, since it was known to be this file. Nobody goes on writing a file then.
     ours: we wrote it. Before a listing told its time others may have replaced it, so its time is no proof.
-    anew: a program opens it now, so that equal sizes are no proof where no time is told.
+    at_open: a program opens it now, so that equal sizes are no proof where no time is told.
     """
 
     size: int
@@ -45,7 +45,7 @@ class Known:
     given: bool = True
     restarted: bool = False
     ours: bool = False
-    anew: bool = False
+    at_open: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _by_listing(known: Known, seen: Listed) -> Sameness:
     timed = known.mtime is not None and entry.mtime is not None
     if timed and known.mtime != entry.mtime:
         return Sameness.OTHER if known.given else Sameness.UNPROVEN
-    if known.ours or (known.anew and not timed):
+    if known.ours or (known.at_open and not timed):
         return Sameness.UNPROVEN
     return Sameness.SAME
 

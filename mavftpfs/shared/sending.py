@@ -1,8 +1,8 @@
 """What of a file is to be sent, is on its way, and is known to be on the card. Layer: shared; pure.
 
-The cache makes a `Sending` for each attempt to send a file, and says what changes; the session takes chunks
-from it, and says what became of them. A new attempt gets a new one, so whatever a late upload still says of
-the old one changes nothing.
+The cache makes a `SendBuffer` for each attempt to send a file, and tells it of changes. The session takes
+chunks from it, and tells it what became of them. Each attempt has its own buffer, so an upload of an earlier
+attempt changes nothing of the present one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FULL = 239
 """Bytes of a full request (servers.md 1)."""
 
 
-class Sending:
+class SendBuffer:
     """One attempt to send a file of `size` bytes, which `read(start, stop)` returns; it raises MavftpfsError.
 
     It goes from the file's begin to its end. What was handed out may not change: two copies of a byte could

@@ -55,10 +55,10 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
             blocks.on_data(step.start, bytes([number]) * step.size)
             blocks.on_batch(step.size)
             for at in sample:
-                if step.start <= at < stop and not blocks.doubted:
+                if step.start <= at < stop and not blocks.ignores_data:
                     held.setdefault(at, number)
         elif step.what == "begin":
-            blocks.doubted = False
+            blocks.ignores_data = False
         elif step.what == "suspect":
             blocks.on_suspect("test")
             held = {}

@@ -61,7 +61,7 @@ def each(any_card: Rig) -> Rig:
 @pytest.fixture
 def fat(fat_card: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
     """A card on which no rename replaces a file."""
-    monkeypatch.setattr(repair, "STALE_AFTER", STALE)
+    monkeypatch.setattr(repair, "DEAD_AFTER", STALE)
     fat_card.take(b"/d/empty/gone")
     return fat_card
 

@@ -316,7 +316,7 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
         for at in range(STEP, len(OLD) - STEP, STEP):
             await reader.read(at, STEP)
         await trio.sleep(IDLE)
-        assert version.complete
+        assert version.whole
         await tree.unlink(PATH)
         with pytest.raises(FileChanged):
             await reader.read(0, len(OLD))

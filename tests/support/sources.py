@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.sending import Sending
+from mavftpfs.shared.sending import SendBuffer
 
 
-class MemorySource(Sending):
+class MemorySource(SendBuffer):
     """Content that may grow (`add`)."""
 
     def __init__(self, content: bytes = b"") -> None:

@@ -51,7 +51,7 @@ def test_small_answers_go_ahead_and_bulk_pays() -> None:
     spend_all(budget, 0.0, 1.0)
     budget.begin()
     assert budget.room(1.0, urgent=False) == 0
-    assert budget.held
+    assert budget.exhausted
     assert budget.room(1.0, urgent=True) >= 1
     ahead = spend_all(budget, 1.0, 1.001, urgent=True)
     assert 1 <= len(ahead) <= 4
@@ -66,7 +66,7 @@ def test_who_has_nothing_to_send_is_not_woken() -> None:
     assert budget.next_room_at() == inf
     assert budget.room(5.0, urgent=False) >= 1
     assert budget.next_room_at() == inf
-    assert not budget.held
+    assert not budget.exhausted
 
 
 def test_a_read_pays_for_its_reply_when_it_goes_out() -> None:

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from mavftpfs.cache.draft import TRANSITIONS, Base, Draft, Event, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError
-from mavftpfs.shared.sending import AHEAD, Sending
+from mavftpfs.shared.sending import AHEAD, SendBuffer
 
 SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
@@ -21,7 +21,7 @@ def draft_over(base: bytes | None) -> Draft:
     return Draft(SpoolContent(SPOOL), None if base is None else Base(len(base)))
 
 
-def sending_of(data: bytes) -> tuple[Draft, Sending]:
+def sending_of(data: bytes) -> tuple[Draft, SendBuffer]:
     draft = draft_over(None)
     draft.write(0, data)
     return draft, draft.begin(in_place=False)
@@ -34,7 +34,7 @@ def content(draft: Draft, base: bytes) -> bytes:
     return b"".join(parts)
 
 
-def sent(sending: Sending, limit: int = 7) -> list[tuple[int, bytes]]:
+def sent(sending: SendBuffer, limit: int = 7) -> list[tuple[int, bytes]]:
     chunks = []
     while (chunk := sending.next_chunk(limit)) is not None:
         chunks.append(chunk)

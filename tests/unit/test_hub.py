@@ -51,7 +51,7 @@ def foreign(source: Address, number: int, payload: bytes = b"whatever") -> bytes
 
 def test_of_a_frame_the_header_is_read_and_whom_it_is_for() -> None:
     frame = ftp(ONE, STATION)
-    assert (frame.source, frame.target, frame.id, frame.proven) == (ONE, STATION, 110, True)
+    assert (frame.source, frame.target, frame.id, frame.crc_fits) == (ONE, STATION, 110, True)
     assert beat(ONE).target == EVERYBODY
     command = parsed(Framer(STATION, stream=False).encode_request_message(TWO, 148))
     assert (command.source, command.target, command.id) == (STATION, TWO, 76)
@@ -74,7 +74,7 @@ def test_a_damaged_frame_passes_and_proves_nothing() -> None:
     good = bytearray(beat(ONE).data)
     good[-1] ^= 1
     frame = parsed(bytes(good))
-    assert not frame.proven
+    assert not frame.crc_fits
     assert frame.data == bytes(good)
 
 
@@ -241,9 +241,9 @@ def test_vehicles_at_endpoints_are_no_business_of_clients(net: Net) -> None:
 
 
 def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
-    damaged = attitude(ONE)._replace(proven=False)
+    damaged = attitude(ONE)._replace(crc_fits=False)
     assert EAST in net.sides(damaged, PORT, AT_ONE)
-    unheard = attitude(Address(77, 1))._replace(proven=False)
+    unheard = attitude(Address(77, 1))._replace(crc_fits=False)
     assert not net.sides(unheard, PORT, AT_TWO) & {EAST, WEST}
     assert not net.router.taken(Address(77, 1), net.now)
 

@@ -28,7 +28,7 @@ F, D = EntryKind.FILE, EntryKind.DIRECTORY
 def test_forms(data: bytes, entries: list[DirEntry]) -> None:
     page = parse_page(data)
     assert page.entries == entries
-    assert page.hidden == 0
+    assert page.unshown == 0
 
 
 @pytest.mark.parametrize(
@@ -50,13 +50,13 @@ def test_forms_with_time(data: bytes, entries: list[DirEntry]) -> None:
 def test_strings_count_but_empty_ones_do_not() -> None:
     page = parse_page(b"S\0S\0\0Fa\t1\0\0X?\0Dd\0")
     assert page.strings == 5
-    assert page.hidden == 1
+    assert page.unshown == 1
 
 
 @pytest.mark.parametrize("name", [b".", b".."])
 def test_dots_are_dropped_in_silence(name: bytes) -> None:
     page = parse_page(b"D" + name + b"\0F" + name + b"\t1\0S" + name + b"\0")
-    assert (page.entries, page.strings, page.hidden) == ([], 3, 0)
+    assert (page.entries, page.strings, page.unshown) == ([], 3, 0)
 
 
 @pytest.mark.parametrize(
@@ -77,4 +77,4 @@ def test_dots_are_dropped_in_silence(name: bytes) -> None:
 def test_unusable_names_are_hidden_and_counted(text: bytes) -> None:
     page = parse_page(text + b"\0Fok\t1\0")
     assert page.entries == [DirEntry(b"ok", F, 1)]
-    assert (page.strings, page.hidden) == (2, 1)
+    assert (page.strings, page.unshown) == (2, 1)

@@ -140,7 +140,7 @@ def test_repeats_are_dropped_and_bad_names_counted() -> None:
     lister.page(b"Fa\t1\0Fb\t1\0")
     lister.end(NakCode.EOF)
     assert lister.names == [b"a", b"b"]
-    assert lister.op.hidden == 1
+    assert lister.op.unshown == 1
     assert lister.offsets == [0, 4, 6]
 
 

@@ -320,7 +320,7 @@ def test_an_older_text_as_a_whole_is_meant_unless_an_editor_read_again() -> None
 def test_a_verdict_names_what_was_wanted_and_what_is_there() -> None:
     wanted = [moved(COUNTER, 6), moved(GAIN, 2), Parameter("GONE", Kind.INT8, 1), moved(BOOTS, 0)]
     verdict = judge(wanted, values(moved(COUNTER, 6), GAIN, BOOTS))
-    assert verdict.held == ["COUNTER"]
+    assert verdict.taken == ["COUNTER"]
     assert verdict.missed == ["GAIN: wanted 2, got 1.5", "GONE: wanted 1, and it is not there any more"]
     assert verdict.notes == ["STAT_BOOTCNT is the vehicle's own: wanted 0, it is 7"]
 

@@ -10,7 +10,7 @@ FILE, ASIDE = b"/d/f", b"/d/.aside"
 
 
 @pytest.mark.parametrize(
-    ("aside", "placed", "is_open", "lacks_file"),
+    ("aside", "placed", "is_unknown", "lacks_file"),
     [
         (None, None, True, False),
         (ASIDE, None, True, True),
@@ -19,13 +19,13 @@ FILE, ASIDE = b"/d/f", b"/d/.aside"
     ],
 )
 def test_what_is_known_of_a_name(
-    aside: bytes | None, placed: bool | None, is_open: bool, lacks_file: bool
+    aside: bytes | None, placed: bool | None, is_unknown: bool, lacks_file: bool
 ) -> None:
     unfinished = Replacements()
-    assert not unfinished.is_open(FILE)
+    assert not unfinished.is_unknown(FILE)
     assert not unfinished.lacks_file(FILE)
     unfinished.put(FILE, Replacement(aside, placed))
-    assert unfinished.is_open(FILE) == is_open
+    assert unfinished.is_unknown(FILE) == is_unknown
     assert unfinished.lacks_file(FILE) == lacks_file
     assert unfinished.asides() == ({aside} if lacks_file else set())
 

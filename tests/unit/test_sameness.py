@@ -37,11 +37,11 @@ TABLE: list[tuple[str, Known, Seen, Sameness]] = [
     ("larger", Known(SIZE, 5), listed(SIZE + 1, 6), GREW),
     ("larger after a restart", Known(SIZE, 5, restarted=True), listed(SIZE + 1, 6), OTHER),
     ("equal, no times", Known(SIZE), listed(), SAME),
-    ("equal, no times, opened anew", Known(SIZE, anew=True), listed(), UNPROVEN),
+    ("equal, no times, opened anew", Known(SIZE, at_open=True), listed(), UNPROVEN),
     ("equal, its time was not known", Known(SIZE), listed(mtime=5), SAME),
-    ("equal, its time was not known, opened anew", Known(SIZE, anew=True), listed(mtime=5), UNPROVEN),
+    ("equal, its time was not known, opened anew", Known(SIZE, at_open=True), listed(mtime=5), UNPROVEN),
     ("equal, its time is not told", Known(SIZE, 5), listed(), SAME),
-    ("equal, and of that time", Known(SIZE, 5, anew=True), listed(mtime=5), SAME),
+    ("equal, and of that time", Known(SIZE, 5, at_open=True), listed(mtime=5), SAME),
     ("equal, and of that time after a restart", Known(SIZE, 5, restarted=True), listed(mtime=5), SAME),
     ("equal, of another time", Known(SIZE, 5), listed(mtime=6), OTHER),
     ("equal, of another time, nothing given", Known(SIZE, 5, given=False), listed(mtime=6), UNPROVEN),
@@ -110,7 +110,7 @@ def test_no_row_takes_another_file_for_the_same_nor_the_same_for_another() -> No
         assert (answer is GREW) <= (size is not None and size > known.size), (known, seen)
         assert (answer is SAME) <= (size in (None, known.size)), (known, seen)
         # A program that opens it anew gets what is cached only where times, or a CRC32, agree.
-        if answer is SAME and known.anew and isinstance(seen, Listed):
+        if answer is SAME and known.at_open and isinstance(seen, Listed):
             assert seen.entry is not None
             assert seen.entry.mtime == known.mtime is not None
         # A time that may be another file's proves nothing.

@@ -204,7 +204,7 @@ async def test_all_bytes_are_dropped_in_doubt_and_none_taken_before_a_new_reader
     assert cache.bytes_cached == 0
     deliver(blocks, 10, b"\xff" * 20)  # from the reader that is in doubt
     assert blocks.get(10, 30) is None
-    blocks.doubted = False
+    blocks.ignores_data = False
     deliver(blocks, 10, b"\xff" * 20)
     assert bytes(old) == before
     assert bytes(blocks.get(10, 30) or b"") == b"\xff" * 20
