@@ -20,8 +20,8 @@ from mavftpfs.shared.errors import LinkError
 TICK = 1.0
 """Seconds between two looks at what was heard. That the one whose files we have is armed is told at once."""
 _POLL = 0.1
-MOUNT_TICK = 0.5
-"""Seconds between two questions to a mount."""
+MOUNT_TICK = 0.25
+"""Seconds between two questions to a mount: it is to be left within a second of arming."""
 IDENTITY_PATIENCE = 5.0
 """Seconds for a vehicle to tell its unique id."""
 
@@ -133,12 +133,13 @@ class LinkContact:
 
 @dataclass(slots=True)
 class MountContact:
-    """A mount that is up. It closes the server's session itself, a moment after the last use."""
+    """A mount that is up. It closes the server's session itself, once nobody uses it."""
 
     session: Session
     system: int | None = None
     _uid: str | None = None
     _restarts: int = 0
+    _refusals: int = 0
 
     async def listen(self, hearing: Hearing) -> None:
         """See Contact."""
@@ -149,8 +150,11 @@ class MountContact:
                 vehicle = status["vehicle"]
                 if self.system is not None and vehicle["restarts"] > self._restarts:
                     hearing.restarted(self.system)
+                if self.system is not None and vehicle.get("arming_refused", 0) > self._refusals:
+                    hearing.refused(self.system)
                 self.system, self._uid = vehicle["system"], vehicle["uid"]
                 self._restarts = vehicle["restarts"]
+                self._refusals = vehicle.get("arming_refused", 0)  # an older mount does not tell it
                 if self.system is not None and status["link"]["state"] in ("fine", "lossy"):
                     hearing.heard(self.system, armed=vehicle["armed"])
                 hearing.time_passed()

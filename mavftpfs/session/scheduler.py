@@ -481,7 +481,7 @@ class Scheduler:
             news_in = max(0.0, self.held_until - now)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
-            left = max(0.0, self._used_at + IDLE_CLOSE - now)
+            left = max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(server.session.path) else 0.0
             if not await server.sleep(min(left, news_in)) and self.first() is None:
                 await server.close_quietly()
         elif server.state is State.MAYBE_OPEN and not server.vehicle.lost(now):
@@ -490,6 +490,10 @@ class Scheduler:
                 await server.close_maybe_open()
         else:
             await server.sleep(news_in)
+
+    def _is_kept(self, path: bytes) -> bool:
+        """Return whether a file stays open a moment longer: not in flight, if nobody has it open here."""
+        return not self.server.vehicle.armed or any(user.path == path for user in self.users)
 
     async def close(self) -> None:
         """Terminate the session, best effort: a server forgets it by itself, sooner or later. The caller

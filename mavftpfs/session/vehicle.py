@@ -212,6 +212,7 @@ class Vehicle:
     storage: StorageInformation | None = None
     foreign_at: float | None = None
     reboots: int = 0
+    refusals: int = 0
     identity: Identity = field(default_factory=Identity)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     armed: bool = True
@@ -245,6 +246,7 @@ class Vehicle:
             "firmware": None if version is None else version.firmware,
             "uid": None if version is None else version.board,
             "restarts": self.reboots,
+            "arming_refused": self.refusals,
         }
 
     def silence(self, now: float) -> float:
@@ -318,6 +320,7 @@ class Vehicle:
             case SystemTime() if message.source == self.address:
                 self._on_boot_time(message.time_boot_ms, now)
             case CommandAck() | StatusText() if message.refuses_to_arm:
+                self.refusals += 1
                 self.on_refusal()
 
     def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -325,6 +326,35 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
     assert ("a mount has this vehicle now" in out) is (mounted == "later")
     (home,) = (path for path in local.iterdir() if path.is_dir())
     assert filecmp.cmpfiles(card, home, ["1.BIN", "2.BIN"], shallow=False) == (["1.BIN", "2.BIN"], [], [])
+
+
+@pytest.mark.holds("promise 9")
+@pytest.mark.parametrize("how", ["armed", "refused"])
+def test_a_transfer_by_a_mount_lets_go(field: Field, tmp_path: Path, how: str) -> None:
+    root, local, said = field.local("card"), tmp_path / "logs", tmp_path / "said"
+    vehicle = field.counted_sim(root, "px4")
+    write_log(root / "fs/microsd/log/1.ulg", 400_000, 1, 1)
+    mount = field.mount(vehicle.source, "bwlimit=10000")
+    with (
+        said.open("wb") as output,
+        subprocess.Popen(
+            argv("sync", mount.path, local, "--watch"), stdout=output, stderr=output, cwd=PROJECT
+        ) as child,
+    ):
+        wait_until("some of the log came", lambda: any(part.stat().st_size for part in local.rglob("*.part")))
+        if how == "armed":
+            vehicle.do(vehicle.vehicle.arm)
+        else:
+            vehicle.do(lambda: vehicle.vehicle.say(3, "Arming denied: high throttle"))
+        wait_until("that is noticed", lambda: "the transfer waits" in said.read_text())
+        wait_until("its session is closed", lambda: not vehicle.sessions())
+        asked = vehicle.asked()
+        time.sleep(2.0)
+        assert vehicle.asked() == asked
+        child.send_signal(signal.SIGTERM)
+        assert child.wait(COMMAND_TIMEOUT) == 0
+    word = "is armed" if how == "armed" else "refused to be armed"
+    assert said.read_text().count(word) == 1
 
 
 def test_what_goes_with_watch_only_is_said(tmp_path: Path) -> None:

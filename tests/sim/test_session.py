@@ -547,6 +547,25 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
         assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("promise 9")
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(
+    profile: str, autojump: MockClock
+) -> None:
+    here = world(profile, LINK, f=DATA)
+    async with here.connection() as connection:
+        log = Log(here)
+        reader, sink = await begin_to_read(connection, path(profile, "f"), 1000)
+        await sink.wait_for(0, 1000)
+        here.vehicle.arm()
+        here.link.kick()
+        await trio.sleep(0.5)
+        assert log.count(Opcode.TERMINATE_SESSION) == 0, "it is still open here"
+        reader.close()
+        await trio.sleep(0.5)
+        assert here.vehicle.server.open_sessions == 0
+
+
 @pytest.mark.holds("rule 14.31")
 async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
