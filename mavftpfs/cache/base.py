@@ -16,10 +16,10 @@ STEP = 128 * 1024
 
 
 async def open_node(context: Context, node: Node) -> VersionHandle:
-    """Open what the vehicle has of a node, whatever it is called by now.
+    """Open the vehicle's file of a node, under the name that it has by now.
 
     Raises:
-        FileChanged: it has no name there. Else as Files.open.
+        FileChanged: the vehicle does not have it any more. Else as Files.open.
     """
     while True:
         async with context.paths.steady(node) as path:
@@ -28,7 +28,7 @@ async def open_node(context: Context, node: Node) -> VersionHandle:
                 return await context.files.open(path)
             except (NotFound, FtpNak):
                 if node.path == path:
-                    raise  # else it got a reserved name meanwhile
+                    raise  # else the file got a reserved name meanwhile
 
 
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:
@@ -52,17 +52,17 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             return await base.read(start, stop - start)
         except (FileChanged, LocalProtocolError) as error:
             if node.base is not base:
-                continue  # we changed it there ourselves meanwhile
+                continue  # we replaced the file ourselves meanwhile
             if isinstance(error, FileChanged) and node.draft and not context.is_changing(node.path):
                 context.on_replaced(node, node.draft)
             raise
 
 
 async def fetch(context: Context, node: Node, draft: Draft) -> None:
-    """Get what only the vehicle has of a node's draft; the caller delivers it.
+    """Fetch the bytes of a draft that only the vehicle has. The caller delivers the draft.
 
-    Where listings tell no times, all of the old file is read, so that its checksum is known: it is compared
-    before the old file is replaced.
+    Where listings tell no times, the whole old file is read to know its checksum. The delivery compares that
+    before it replaces the old file.
 
     Raises:
         NoSpace; else as read_base.

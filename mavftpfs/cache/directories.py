@@ -1,16 +1,16 @@
-"""What the vehicle has under which name: remembered listings, and asking for new ones. Layer: cache.
+"""What the vehicle has under each name: remembered listings, and requests for new ones. Layer: cache.
 
-There is no stat on the wire (servers.md 14.30): everything known of a path comes from its parent's
-listing. A listing is fresh for a while; a name that a fresh and complete one lacks does not exist.
-Expired listings are kept to be served while the vehicle is out of reach.
+There is no stat on the wire (servers.md 14.30): everything known of a path comes from its parent's listing. A
+listing is fresh for a while. A name that a fresh and complete listing lacks does not exist. Expired listings
+are kept, and served while the vehicle is lost.
 
-A listing takes many requests, and a change made by us meanwhile may show in it or not. So each sweep under
-way is a `Sweep` in which every change of ours is written down, and what was written down beats what the sweep
-saw. The entries behind a changed name shifted between the sweep's pages (servers.md 6, "Concurrent change"):
-so the result expires at once.
+A listing takes many requests. It may show a change that we make meanwhile, or not. So a listing under way is
+a `Sweep`, which notes each of our changes, and a noted change beats what the sweep saw. Entries behind a
+changed name may move between the sweep's pages (servers.md 6, "Concurrent change"), so the result expires at
+once.
 
-Only a path that its parent's listing shows as a directory is listed: listing a file ends a MAVSDK server
-(servers.md 6), so a path is walked from the root. A walk costs nothing where listings are fresh.
+Listing a file ends a MAVSDK server (servers.md 6). So a path is listed only if its parent's listing shows it
+as a directory, and each path is walked from the root. The walk costs nothing where listings are fresh.
 
 Callers ask about a directory, or about one name in it, and say how good the answer has to be:
 
@@ -57,8 +57,8 @@ COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
 
 LOOK_FACTOR = 5
-"""A listing that took T seconds is good for changes of names for LOOK_FACTOR * T: else each mv and rm over a
-slow link lists a long directory anew."""
+"""A listing that took T seconds is recent enough to change names by for LOOK_FACTOR * T. Else each mv and rm
+over a slow link would list a long directory again."""
 
 STILL_GROWING = 30.0
 """A file that was seen to grow is taken to be open on the vehicle for so many seconds."""
@@ -70,7 +70,7 @@ LOOK = 1.0
 """Seconds after which a caller that has an older listing checks whether the vehicle is lost."""
 
 SWEEP_TRIES = 3
-"""How often a listing is repeated because names came or went meanwhile through us."""
+"""How often a directory is listed at most because we changed names in it meanwhile."""
 
 
 @dataclass(slots=True)
@@ -79,9 +79,9 @@ class Directory:
 
     entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
     after that it proves nothing. complete: the vehicle listed it to its end.
-    sizes: what opening told about an entry since, which beats the listing. growing: when a file was last seen
-    to be larger than before, though we did not write it. proven: when the vehicle last confirmed that we gave
-    a name to what is listed there.
+    sizes: what replies to opens told since; they beat the listing. growing: when a file was last seen to be
+    larger than before, though we did not write it. proven: when the vehicle last confirmed that an own change
+    gave this name to the entry.
     """
 
     entries: dict[bytes, DirEntry]
@@ -115,7 +115,7 @@ class Found:
 class Sweep:
     """A listing under way.
 
-    changes: what we changed in that directory since it began. void: it is in doubt, or not wanted any more.
+    changes: what we changed in that directory since it began. void: its result is not to be remembered.
     """
 
     path: bytes
@@ -129,7 +129,7 @@ class Directories:
     ones are dropped when they have more than `max_entries` names.
 
     Attributes:
-        on_listed: called with each listing as it is made; on_swept: before it is given out.
+        on_listed: called with each new listing. on_swept: awaited before a new listing is returned.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
 
@@ -178,8 +178,8 @@ class Directories:
         return self.clock() < directory.fresh_until
 
     def left(self, directory: Directory) -> float:
-        """Return for how many seconds a listing is the newest that can be had: while the vehicle is lost,
-        without end."""
+        """Return for how many seconds a listing stays fresh; without end while the vehicle is lost, because
+        no newer one can be had."""
         return directory.fresh_until - self.clock() if self._store.why_lost() is None else inf
 
     def entry(self, path: bytes) -> DirEntry | None:
@@ -195,7 +195,8 @@ class Directories:
         return directory is not None and self.clock() - directory.growing.get(name, -inf) < STILL_GROWING
 
     def learn_size(self, path: bytes, size: int) -> None:
-        """An open told the size: it beats the listing until the next one. If it is larger, the file grows."""
+        """Note the size that an open reply told. It beats the listing until the next one. If it is larger,
+        the file grows."""
         parent, name = split(path)
         directory = self._known.get(parent)
         if directory is None or name not in directory.entries:
@@ -206,9 +207,10 @@ class Directories:
             directory.growing[name] = self.clock()
 
     def put(self, path: bytes, entry: DirEntry | None, *, proven: bool = False) -> None:
-        """We made, wrote, renamed or removed (None) what has this name; what lies below is to be listed anew.
+        """Note that we made, wrote, renamed or removed (None) this name. Directories below it are listed
+        again.
 
-        proven: the vehicle said just now that the name is this.
+        proven: the vehicle has just confirmed it.
         """
         self.forget(path)
         parent, name = split(path)
@@ -227,7 +229,7 @@ class Directories:
                 directory.proven[name] = self.clock()
 
     def rename(self, old: bytes, new: bytes) -> None:
-        """We renamed something, perhaps over something else, and the vehicle just said so."""
+        """Note a rename, perhaps over another file, that the vehicle has just confirmed."""
         entry = self.entry(old)
         self.put(old, None)
         self.put(new, entry, proven=True)
@@ -235,7 +237,7 @@ class Directories:
             self.expire(split(new)[0])
 
     def expire(self, path: bytes) -> None:
-        """The listing of `path` is in doubt: it proves nothing any more, but may be served stale."""
+        """Make a listing prove nothing from now on. It may still be served while the vehicle is lost."""
         sweep, directory = self._sweeps.get(path), self._known.get(path)
         if sweep is not None:
             sweep.void = True
@@ -254,7 +256,7 @@ class Directories:
                 sweep.void = True
 
     def rebooted(self) -> None:
-        """Everything is in doubt, and what was learnt of the server's ways may no longer hold."""
+        """Expire all listings, and forget what was learnt of the server."""
         for path in self._known.keys() | self._sweeps.keys():
             self.expire(path)
         self.tells_times = False
@@ -266,11 +268,11 @@ class Directories:
     async def find(self, path: bytes) -> Found:
         """Return what is known of a path below the root.
 
-        A name that an incomplete listing lacks is asked for by opening it as a file: there is no other way.
+        If an incomplete listing lacks a name, it is opened as a file: there is no other way to ask.
 
         Raises:
             NotFound: its parent's listing does not show it.
-            NotADirectory: a part of it is a file. Else as RemoteStore.list_directory and open_reader.
+            NotADirectory: a part of the path is a file. Else as RemoteStore.list_directory and open_reader.
         """
         if path.count(b"/") > MAX_DEPTH:
             raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
@@ -291,8 +293,9 @@ class Directories:
         return Found(entry, directory)
 
     async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
-        """Return what the vehicle has there, not drafts, by a change of ours or a listing that began at most
-        `within` seconds ago. Where a listing takes long that is longer (LOOK_FACTOR). 0: just now.
+        """Return what the vehicle has at a path, whatever drafts say. The answer is a change of ours or a
+        listing that began at most `within` seconds ago; longer where listings take long (LOOK_FACTOR). 0:
+        list now.
 
         Raises:
             As ask, but None where its directory is gone.
@@ -309,7 +312,7 @@ class Directories:
             return None
 
     async def ask(self, path: bytes, *, began: float | None = None) -> Directory:
-        """Return a directory's listing that is asked for just now, or began at that time or later.
+        """Return a directory's listing that begins now, or that began at the time `began` or later.
 
         Raises:
             NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
@@ -328,8 +331,8 @@ class Directories:
         raise VehicleLost("the vehicle does not answer")
 
     async def get(self, path: bytes) -> Directory:
-        """Return a directory's listing: fresh, else a new one. While the vehicle is lost, the one that is
-        known, at once.
+        """Return a directory's listing: a fresh one, else a new one. While the vehicle is lost, return the
+        known one at once.
 
         Raises:
             NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
@@ -346,7 +349,7 @@ class Directories:
             return directory
 
     def require_heard(self) -> None:
-        """Raise VehicleLost if the vehicle is known to be lost: what begins now would wait for nothing."""
+        """Raise VehicleLost if the vehicle is lost: a request that begins now would wait in vain."""
         why = self._store.why_lost()
         if why is not None:
             raise VehicleLost(why)
@@ -354,10 +357,10 @@ class Directories:
     # --- listing
 
     async def _list(self, path: bytes, *, until_lost: bool = False) -> Directory:
-        """List a directory that is known to be one, and repair what is found in it.
+        """Check that a path is a directory, list it, and have leftovers in it repaired.
 
-        until_lost: wait for the listing until the vehicle is lost, and no longer. The listing goes on then,
-            for the next caller.
+        until_lost: wait for the listing only until the vehicle is lost. The listing goes on for the next
+        caller.
 
         Raises:
             NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
@@ -379,7 +382,7 @@ class Directories:
         return directory
 
     async def _walk_to_root(self) -> None:
-        """See once that no part of the mount's root is a file.
+        """Check, once, that no part of the mount's root is a file.
 
         A part that no listing shows may still be listed, because PX4 hides symlinked directories
         (MavlinkFTP::_workList sends them as skip entries) and some trees are not announced.
@@ -396,7 +399,7 @@ class Directories:
         self._root_proven = True
 
     async def _sweep(self, path: bytes) -> Directory:
-        """List until no change of ours came between, or SWEEP_TRIES times."""
+        """List a directory; again if we changed it meanwhile, SWEEP_TRIES times at most."""
         tries = 0
         while True:
             sweep = self.begin(path)
@@ -406,7 +409,7 @@ class Directories:
                 listing = await self._store.list_directory(path)
                 if not self._dot_refused and omits_files(path, listing.entries):
                     listing = await self._with_dot(listing)
-            except FtpNak:  # perhaps it is gone, so the parent is asked again
+            except FtpNak:  # perhaps the directory is gone: its parent is listed again
                 self.forget(path)
                 if path != ROOT:
                     self.expire(split(path)[0])
@@ -428,7 +431,7 @@ class Directories:
             self._dot_refused = True
             return listing
         if not any(entry.kind is EntryKind.FILE for entry in dot.entries):
-            return listing  # proves nothing: the first file may come later, and must not seem to be gone
+            return listing  # asked again next time: its first file may come later
         shown = {entry.name for entry in listing.entries}
         more = tuple(entry for entry in dot.entries if entry.name not in shown)
         return Listing(
@@ -439,7 +442,7 @@ class Directories:
         )
 
     def begin(self, path: bytes) -> Sweep:
-        """Note that a listing of `path` starts. One at a time of each directory."""
+        """Note that a listing of `path` begins. Each directory has one at a time."""
         sweep = self._sweeps[path] = Sweep(path, self.clock())
         return sweep
 
@@ -480,7 +483,7 @@ class Directories:
 
 
 def _see_growth(old: Directory, new: Directory, sweep: Sweep) -> None:
-    """Note which files grew since the last listing without us, or did a short while ago."""
+    """Note which files grew since the last listing without our writing, and keep what was noted before."""
     for name in new.entries.keys() & old.entries.keys() - sweep.changes.keys():
         if new.size_of(name) > old.size_of(name):
             new.growing[name] = new.ended_at

@@ -1,9 +1,9 @@
 """Files whose names never reach the vehicle: swap files, locks. Layer: cache.
 
-Editors put such files beside the ones they work on, by names that the `local=` patterns know. They live in
-memory, bounded, and are seen by this mount only. Directories of such names cannot be made: a trash would be
-lost with the mount, and file managers that find none offer to delete. Between these names and those on the
-vehicle nothing is renamed: they are two places, so programs hear EXDEV and copy.
+Editors make such files beside the files they work on; the `local=` patterns know their names. They live in
+memory, within a limit, and only this mount shows them. Directories with such names cannot be made: a trash
+directory would be lost with the mount, and a file manager that finds none offers to delete instead. A rename
+between a local name and the vehicle is EXDEV, as between two disks, so programs copy.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class LocalFiles:
         return LocalHandle(self, file, writable=write)
 
     def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
-        """Make a file, or open the one that is there; the directory it is put in was checked.
+        """Make a file, or open the one that is there. The caller has checked its directory.
 
         Raises:
             AlreadyExists, NoSpace.
@@ -129,13 +129,13 @@ class LocalFiles:
         file.mtime_ns = self._now_ns()
 
     def forget_unused(self, file: LocalFile) -> None:
-        """A file has fewer names or handles; without any its bytes are not counted any more."""
+        """Stop counting the bytes of a file that has neither a name nor a handle any more."""
         if not file.named and not file.handles:
             self.used -= len(file.data)
 
 
 class LocalHandle(OpenFile):
-    """One open() of a local file. There is nowhere to deliver it."""
+    """One open() of a local file. It is never delivered."""
 
     writable = False
 

@@ -90,10 +90,10 @@ class Missions(Texts[Items]):
         return Saved(None, [f"{one.text} (the vehicle does not keep it)" for one in found])
 
     async def _replace(self, name: bytes, wanted: Items) -> list[Difference]:
-        """Replace all items, read them back, and return what the vehicle has no room for.
+        """Replace all items, read them back, and return the differences that the vehicle cannot keep.
 
         Raises:
-            Refused: it has other items.
+            Refused: the vehicle has other items afterwards.
         """
         failure: MavftpfsError | None = None
         file, kind = _file_of(name), KINDS[name]

@@ -28,8 +28,8 @@ from mavftpfs.shared.sending import SendBuffer
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go: a reserved name, or the file's own if it is sent `in_place`.
-    begun_at: when, by the caches' clock. trial: of the card's renames, beside the upload.
+    path: where its bytes go: a reserved name, or the file's own if it is sent `in_place`. begun_at: when it
+    began, by the caches' clock. trial: the test whether the card can rename, which runs beside the upload.
     """
 
     path: bytes
@@ -40,7 +40,7 @@ class Attempt:
     trial: RenameTrial | None = None
 
     def fits(self, draft: Draft, *, in_place: bool) -> bool:
-        """Return whether what it sent is still right, and where it goes is."""
+        """Return whether the bytes that it sent are still right, and the place that they go to."""
         if self.sending is not draft.sending or self.sending.overtaken:
             return False
         return in_place == self.in_place
@@ -50,14 +50,15 @@ class Attempt:
 class Node:
     """One file.
 
-    path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it.
-    handles: how many are open, writers: those for writing. generation: counts how often its content on the
-    vehicle was changed by us. removed: it has no name any more. hidden: it is still on the vehicle, under a
-    reserved name. error: why it could not be delivered. attempt: the present one to deliver it. base: reads
-    the vehicle's file. start_after: no upload begins by itself before (infinite: only a close sends it).
-    proven_at: when the vehicle was last known to have it all. lock: held to write or deliver it, or to take
-    its name. delivery: what ends the delivery under way. claims: how many wait for the lock to take
-    name or content away; they go before deliveries.
+    path: its name, or the reserved name that it was hidden under. draft: its content here, if it was written.
+    handles: how many are open; writers: how many of them are for writing. generation: counts how often we
+    changed its content on the vehicle. removed: it has no name any more. hidden: it was unlinked while it was
+    open, and is still on the vehicle under a reserved name. error: why the last delivery failed. attempt: the
+    present attempt to deliver it. base: a handle on the vehicle's file. start_after: no upload begins by
+    itself before that time (infinite: only a close sends the file). proven_at: when the vehicle was last
+    proven to have what the draft says it has. lock: a program writes the file, a delivery is under way, or a
+    call takes its name away. delivery: the scope of the delivery under way. claims: how many calls wait for
+    the lock to take its name or content away; they go before deliveries.
     """
 
     path: bytes
@@ -86,18 +87,18 @@ class Node:
 
     @property
     def changing(self) -> bool:
-        """Whether what has its name on the vehicle is being changed (see Context.is_changing)."""
+        """Whether we are changing the file that has its name on the vehicle (see Context.is_changing)."""
         draft = self.draft
         return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
 
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:
-        """The body takes the name or the content away, and has the lock. A delivery under way is called off,
-        unless it is just being renamed into place; its caller begins it again."""
+        """Have the lock for a body that takes the name or the content away. A delivery under way is
+        cancelled, and its caller begins it again later. A rename into place is not cancelled."""
         self.claims += 1
         try:
             committing = self.draft is not None and self.draft.state is State.COMMITTING
-            if self.delivery is not None and not committing:  # nobody would find what it left there
+            if self.delivery is not None and not committing:  # cancelled, its outcome is unknown
                 self.delivery.cancel()
             await self.lock.acquire()
         finally:
@@ -113,36 +114,38 @@ class Node:
         return self.handles > 0 and not (self.draft is not None and self.draft.whole)
 
     def require_reachable(self) -> None:
-        """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
+        """Raise FileChanged if the file was replaced or removed, and is not hidden: its path may be another
+        file's."""
         if self.removed and not self.hidden:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
     def require_current(self) -> None:
-        """Raise FileChanged if its name is another file's."""
+        """Raise FileChanged if another file has its name."""
         if self.draft is not None and self.draft.state is State.STALE:
             raise FileChanged(f"{self.path!r} is another file by now")
 
     def close_base(self) -> None:
-        """The vehicle's file is another one, or is not needed."""
+        """Close the handle on the vehicle's file: that is another file now, or is not needed."""
         base, self.base = self.base, None
         if base is not None:
             base.close()
 
     def lose_name(self) -> None:
-        """It has no name any more: only the programs that have it open need its bytes."""
+        """Note that it has no name any more. Only programs that have it open need its bytes."""
         self.removed = True
         if self.draft is not None:
             self.draft.content.name = None
             self.draft.content.restate()
 
     def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
-        """It is going to be changed. base: the vehicle's file, None for a new one."""
+        """Make a draft, because the file is going to be changed. base: the vehicle's file, None for a new
+        one."""
         self.draft = Draft(SpoolContent(spool, self.path), base)
         self.proven_at = now
         return self.draft
 
     def drop_draft(self) -> None:
-        """The vehicle has it all, or nobody wants it."""
+        """Forget the draft: the vehicle has all of it, or no program wants it."""
         self.close_base()
         if self.draft is not None:
             self.draft.content.close()
@@ -178,47 +181,48 @@ class Nodes:
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
 
     def maybe_forget(self, node: Node) -> None:
-        """Forget a node that nobody has open, and that the vehicle has."""
+        """Forget a node if no program has it open and nothing of it is undelivered."""
         if not (node.handles or node.undelivered or node.lock.locked() or node.attempt):
             node.drop_draft()
             self.detach(node)
 
     def detach(self, node: Node) -> None:
-        """The node's path is not its name any more."""
+        """Take a node away from its path."""
         if self._by_path.get(node.path) is node:
             del self._by_path[node.path]
 
     def unnamed(self, node: Node) -> None:
-        """The node's file was removed, or another one was renamed over it; what only its name needed goes."""
+        """Note that the node's file was removed, or that another one was renamed over it."""
         node.lose_name()
         self.detach(node)
         if not node.handles:
             node.drop_draft()
 
     def replaced(self, node: Node) -> None:
-        """The node's name is another file's: its open handles keep the node, later opens get a new one."""
+        """Note that another file has the node's name. Open handles keep the node; later opens get a new
+        one."""
         self._stale = [other for other in self._stale if other.handles] + [node]
         node.lose_name()
         self.detach(node)
 
     def has_another(self, path: bytes) -> bool:
-        """Return whether a file is open that had this path, which is another file's now."""
+        """Return whether a file is still open that had this path before another file got it."""
         return any(node.path == path and node.handles for node in self._stale)
 
     def hide(self, node: Node, path: bytes) -> None:
-        """An unlinked file's node is called `path`, a reserved name, from now on."""
+        """Give the node of an unlinked file the reserved name `path`."""
         self.detach(node)
         self.hidden.pop(node.path, None)
         node.path, node.hidden = path, True
         self.hidden[path] = node
 
     def forget_hidden(self, node: Node) -> None:
-        """An unlinked file is gone for good, or is left to the next listing."""
+        """Forget a hidden file: it is removed, or left to the next listing."""
         node.hidden = False
         self.hidden.pop(node.path, None)
 
     def rename(self, old: bytes, new: bytes) -> None:
-        """Nodes at `old` and below it have another path; `new` must have no nodes."""
+        """Move the nodes at `old` and below it to `new`, which must have no nodes."""
         for nodes in (self._by_path, self.hidden):
             rename_keys(nodes, old, new)
             for path, node in nodes.items():

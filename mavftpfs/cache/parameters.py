@@ -1,8 +1,8 @@
 """`@PARAM` as texts: what is read, and how a saved text changes the vehicle. Layer: cache.
 
-One download of `param.pck` is what all texts show; it holds for a second. Which lines of a saved text are
-to be set says `parameters.saving`. They go out in one upload, and only a new download tells what became of
-it: servers skip what they do not know, cut numbers to fit, and ACK what they refuse (docs/servers.md 17).
+All texts show one download of `param.pck`, which holds for a second. `parameters.saving` says which values a
+saved text sets. They go out in one upload. Only a new download tells what became of them: servers skip names
+that they do not know, cut numbers to fit, and ACK what they refuse (docs/servers.md 17).
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ class Parameters(Texts[Values]):
         return Shown(text.encode(), snapshot.values, snapshot.since_ns)
 
     async def _read(self, *, reread: bool) -> Snapshot:
-        """Return what the vehicle has. reread: now; else as it was read last, if it was.
+        """Return the vehicle's parameters. reread: read them now; else what was read last will do, if
+        anything was.
 
         Raises:
             NotFound, RemoteProtocolError; else as RemoteStore.read_whole.
@@ -125,9 +126,10 @@ class Parameters(Texts[Values]):
             return _complete(unpack(await self._virtual.content(PARAM_FILE, reread=True)))
 
     def _take(self, raw: bytes, download: Download) -> None:
-        """A download came. Where it says what the last one said, the texts are those of the last one.
+        """Take a new download. If its values are those of the last one, the texts stay as they are.
 
-        What the vehicle sets by itself gives the texts no new time: an editor would warn at each save.
+        Values that the vehicle sets by itself do not change the texts' time: else an editor would warn at
+        each save.
         """
         before, values = self._snapshot, {one.name: one for one in download.parameters}
         if before is not None and before.values == values:
@@ -152,9 +154,9 @@ class Parameters(Texts[Values]):
         return [one for one in with_defaults if one.changed]
 
     async def _read_defaults(self) -> None:
-        """Ask for defaults; they stay as they are until the vehicle restarts.
+        """Ask for defaults; they hold until the vehicle restarts.
 
-        Where a download with defaults has none with a parameter, its value is the default.
+        In such a download a parameter without a default has its default value.
         """
         try:
             download = unpack(await self._virtual.content(DEFAULTS_FILE, reread=True))
@@ -181,7 +183,7 @@ class Parameters(Texts[Values]):
             raise problems_refused(save.name, plan.problems)
         if plan.conflicts:
             raise Refused(NotTaken(plan.conflicts[0]), [*plan.conflicts, "nothing was set"])
-        # What the program changed itself counts from now on whatever it says, also if it goes back.
+        # From now on each line that the program changed itself counts, also if it is changed back.
         names = {line.name for line in changed}
         known = None if base is None else {name: one for name, one in base.items() if name not in names}
         if plan.wanted:
@@ -257,7 +259,7 @@ def _several(wanted: Sequence[Parameter]) -> str:
 
 
 def _said(verdict: Verdict, failure: MavftpfsError | None) -> list[str]:
-    """Return what people are told of a save that did not come true."""
+    """Return the lines for people about a save that was not wholly carried out."""
     taken = ", ".join(verdict.taken) if verdict.taken else "nothing"
     why = [] if failure is None else [str(failure)]
     return [*why, *verdict.missed, *verdict.notes, f"set: {taken}"]

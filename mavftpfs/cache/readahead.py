@@ -1,8 +1,8 @@
-"""When to fetch what nobody asked for yet. Layer: cache; pure: the time is an argument.
+"""When to fetch bytes that no program has asked for yet. Layer: cache; pure: the time is an argument.
 
 One `Readahead` per open handle watches its reads. Reads that follow each other open a window ahead of the
-reader, which doubles as it is used up; a seek closes it. A small file is wanted whole at once. On a slow
-link the window holds no more than a few seconds of it, so that `head` of a log costs no megabyte.
+reader, which doubles as it is used up; a seek closes it. A small file is wanted whole at once. On a slow link
+the window is a few seconds at most, so that `head` of a log does not fetch a megabyte.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_WINDOW = 8 * 1024 * 1024
 class Plan:
     """What to ask for besides the read itself: [start, stop), empty if start == stop.
 
-    seeked: what was asked ahead before is of no use any more.
+    seeked: the reader went elsewhere, so earlier readahead is of no use any more.
     """
 
     start: int = 0
@@ -37,7 +37,7 @@ class Readahead:
         self._last_start = 0
         self._window = 0
         self._used = 0  # bytes read since the window last doubled
-        self._asked = 0  # what lies below was asked for already
+        self._asked = 0  # all below was asked for
 
     def on_read(self, start: int, stop: int, *, limit: int, small: int) -> Plan:
         """Note a read of [start, stop) and return what to ask for.

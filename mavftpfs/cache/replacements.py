@@ -1,8 +1,9 @@
 """Replacements of files that are not finished. Layer: cache; pure.
 
 A file is replaced by one rename, or by three requests: the old file moves aside, the new one gets the name,
-and the old one is removed. If they are interrupted, one record says what is known of the name. It is made
-where the interruption is noticed (`names`, `delivery`). The cleaner (`repair`) ends it; a draft asks it.
+and the old one is removed. If they are interrupted, one record says what is known of the name. `names` or
+`delivery`, which notices the interruption, makes the record. The cleaner (`repair`) ends it. A delivery looks
+at it first.
 
   aside   placed   the name has
   none    None     the new file, the old one, or nothing: a single rename was interrupted
@@ -61,7 +62,7 @@ class Replacements:
         self._records[path] = record
 
     def is_unknown(self, path: bytes) -> bool:
-        """Return whether what has the name is not known."""
+        """Return whether it is not known which file has the name."""
         record = self._records.get(path)
         return record is not None and record.placed is not True
 
@@ -71,18 +72,18 @@ class Replacements:
         return record is not None and record.lacks_file
 
     def on_unknown(self, path: bytes) -> Replacement:
-        """Nobody knows whether the new file has the name; return what is known."""
+        """Note that it is not known whether the new file has the name; return the record."""
         record = self._records.setdefault(path, Replacement())
         if record.placed:
             record.placed, record.until = None, inf
         return record
 
     def end(self, path: bytes) -> Replacement | None:
-        """Nothing of it is open any more; return what was known."""
+        """Remove the record of a path, and return it."""
         return self._records.pop(path, None)
 
     def owner_of(self, aside: bytes) -> bytes | None:
-        """Return the path whose old file lies there."""
+        """Return the path whose old file lies, or may lie, at `aside`."""
         return next((path for path, record in self._records.items() if record.aside == aside), None)
 
     def asides(self) -> set[bytes]:

@@ -1,11 +1,12 @@
 """Where bytes wait that are not proven to be on the vehicle. Layer: cache.
 
-Up to `memory_max` bytes over all files lie in memory; beyond that a file's bytes move to a file of their own
-in a 0700 directory, at the same offsets, up to `spool_max` over all. Nothing leaves before its draft is told
-that the vehicle has it. A file's name is written down when it goes to disk, and `persist` writes down all
-that is known of it (fsynced), so that the next mount of the vehicle finds it after a kill -9 (`recovery`).
+Up to `memory_max` bytes of all files together lie in memory. Beyond that, a file's bytes move to a local file
+of its own in a 0700 directory, at the same offsets, up to `spool_max` bytes together. Bytes stay until the
+draft is told that the vehicle has them. When a file goes to disk, its name is written down beside it.
+`persist` writes down all that is known of it, with fsync. So the next mount of the vehicle finds it after a
+kill -9 (`recovery`).
 
-A local disk that fails is an error of the file whose bytes it had (SpoolFailed), never of the mount.
+If the local disk fails, the file whose bytes it had gets the error (SpoolFailed), never the whole mount.
 
 Local files are written in the event loop: they go to the page cache, in pieces of at most a megabyte.
 """
@@ -58,7 +59,7 @@ class Spool:
         return self._directory / f"{self._number:06}.data"
 
     def remove_file(self, path: Path) -> None:
-        """Remove a file; a directory that was made here goes with its last one."""
+        """Remove a local file, and with the last one the directory, if it was made here."""
         remove(path)
         self.full = False
         if self._temporary is not None:
@@ -71,7 +72,7 @@ class SpoolContent:
     """The held bytes of one draft; implements cache.draft.Content.
 
     Attributes:
-        name: the file's path on the vehicle, None once nobody wants it any more.
+        name: the file's path on the vehicle, None once no program wants it any more.
     """
 
     def __init__(self, spool: Spool, name: bytes | None = b"") -> None:
@@ -101,13 +102,13 @@ class SpoolContent:
             spool.in_memory += more
             self._settled = False
             return
-        said = spool.full  # an attempt that fails frees what it had taken itself
+        said = spool.full  # a failed attempt resets it as it cleans up
         try:
             self._spill()
             self._write_down(settled=False)
             self._put_on_disk(offset, data)
         except NoSpace as error:
-            if not said:  # to a program ENOSPC means the card
+            if not said:  # a program takes ENOSPC for a full card
                 log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
             spool.full = True
             raise
@@ -129,7 +130,7 @@ class SpoolContent:
         return data
 
     def cut(self, size: int) -> None:
-        """Forget what lies at and beyond `size`; if it is extended again, zeros are there.
+        """Forget the bytes at and beyond `size`. If the file is extended again, zeros are there.
 
         Raises:
             NoSpace, SpoolFailed: nothing changed.
@@ -149,9 +150,9 @@ class SpoolContent:
         self._spool.on_disk += self._stored.total - before
 
     def restate(self, *, delivered: bool = False) -> None:
-        """Its name changed, or nobody wants it any more: write that down; a failure is only logged.
+        """Write down that its name changed, or that no program wants it any more. A failure is only logged.
 
-        delivered: the vehicle has all of it, so that until more is put the next mount need not offer it.
+        delivered: the vehicle has all of it. The next mount need not offer it, until more is put.
         """
         self._settled |= delivered
         try:
@@ -160,7 +161,8 @@ class SpoolContent:
             log.warning("what %s is cannot be written down: %s", self._path, exc)
 
     def persist(self, facts: dict[str, Any]) -> str:
-        """Have bytes and `facts` (JSON) survive the end of this process; once until more is put or cut.
+        """Make bytes and `facts` (JSON) survive the end of this process. A second call does nothing, until
+        more is put or cut.
 
         Returns the path of the file that holds the bytes.
 
@@ -181,7 +183,7 @@ class SpoolContent:
         return str(self._path)
 
     def close(self) -> None:
-        """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""
+        """Forget the bytes: the vehicle has them, or no program wants them. Raises nothing."""
         self._spool.in_memory -= len(self._memory)
         self._spool.on_disk -= self._stored.total
         self._memory, self._stored = bytearray(), ExtentSet()
@@ -189,7 +191,7 @@ class SpoolContent:
             try:
                 os.close(self._file)
             except OSError as exc:
-                log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
+                log.warning("closing %s: %s", self._path, exc)  # its bytes are not needed any more
         if self._path is not None:
             self._spool.remove_file(self._path)
         self._file = self._path = self._told = None
@@ -198,7 +200,8 @@ class SpoolContent:
     # --- inside
 
     def _write_down(self, *, settled: bool) -> None:
-        """Have the text beside the file, if there is one, say what that is: never less than is true.
+        """Update the description beside the local file, if there is one. It never calls a file needless that
+        is needed.
 
         settled: the vehicle has all of it.
 
@@ -217,7 +220,8 @@ class SpoolContent:
         self._settled = settled
 
     def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
-        """Write what is new before what replaces something: a full disk refuses the former."""
+        """Write new bytes before bytes that replace others: a full disk refuses the new ones, and nothing is
+        replaced."""
         assert self._file is not None
         whole, stop = memoryview(data), offset + len(data)
         old = self._stored.intersection(offset, stop)
@@ -261,9 +265,10 @@ class SpoolContent:
 
 
 def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:
-    """Write down what a spooled file is, so that being killed leaves the old text or the new one.
+    """Write the description of a spooled file. If the process is killed meanwhile, the old one or the new one
+    is there.
 
-    durable: also a loss of power does.
+    durable: also after a loss of power.
 
     Raises:
         OSError.

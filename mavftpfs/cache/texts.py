@@ -1,12 +1,12 @@
 """Texts that stand for a packed `@` file: reading shows the vehicle, saving changes it. Layer: cache.
 
-Each handle that writes has a text of its own, which nobody else sees. It is *saved*, as a whole, by fsync
-and by each close (flush) since which it changed. What a save asks for, compared with what the vehicle has,
-is for `Texts.carry_out`, which the parameters and the missions implement. Nothing is kept: a text that was
-refused is gone with its handle.
+Each handle that writes has a text of its own, which no other handle sees. If it changed, the text is *saved*
+as a whole by fsync and by each close (flush). `Texts.carry_out`, which the parameters and the missions
+implement, compares a saved text with the vehicle, and changes the vehicle. No text is kept: a refused text is
+gone with its handle.
 
-A program that saves what it read before means the lines that it changed. So what programs read is remembered
-for each, until it saves.
+A program reads a text, changes some lines, and saves all of them. It means only the lines that it changed. So
+what a program read is remembered, for each program, until it saves.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from mavftpfs.shared.model import EntryKind, split
 
 LAST_ERROR = b"last_error.txt"
 MAX_TEXT = 4 << 20
-"""Bytes of a text that is written."""
+"""Bytes of the longest text that can be saved."""
 
 MAX_PROGRAMS = 256
 MAX_READ = 8
-"""Of how many programs it is remembered what they read, and how many of their last reads."""
+"""So many programs are remembered, with so many of the last texts that each has read."""
 
 B = TypeVar("B")
 
@@ -45,7 +45,7 @@ Program = Hashable
 
 @dataclass(frozen=True, slots=True)
 class Shown(Generic[B]):
-    """What a reader gets. base: the same, for a later save. since_ns: when it changed last."""
+    """A text as a reader gets it. base: its values, for a later save. since_ns: when they changed last."""
 
     text: bytes
     base: B
@@ -54,8 +54,8 @@ class Shown(Generic[B]):
 
 @dataclass(slots=True)
 class Reads(Generic[B]):
-    """What a program read, the oldest first. rereads: it tried to make another file beside it, as an editor
-    does that is about to copy the file to a backup.
+    """What a program read, the oldest first. rereads: the program tried to make another file beside the text,
+    as an editor does that is about to read the text again for a backup.
     """
 
     bases: list[B] = field(default_factory=list)
@@ -66,8 +66,8 @@ class Reads(Generic[B]):
 class Save(Generic[B]):
     """A text that is saved.
 
-    bases: what its writer read, the oldest first; rereads: see Reads. appended: the lines were appended,
-    each is meant.
+    bases: what its program read, the oldest first; rereads: see Reads. appended: the lines were appended, so
+    each of them is meant.
     """
 
     name: bytes
@@ -79,8 +79,8 @@ class Save(Generic[B]):
 
 @dataclass(frozen=True, slots=True)
 class Saved(Generic[B]):
-    """A save came true. known: what its program still knows of the vehicle, None if it had read nothing.
-    notes: for people.
+    """A save that was carried out. known: what its program still knows of the vehicle, None if it had read
+    nothing. notes: lines for people.
     """
 
     known: B | None
@@ -96,7 +96,7 @@ class TextUpload:
     acked: int = 0
 
     def on_acked(self, count: int) -> None:
-        """So many more were ACKed."""
+        """Note that so many more bytes were ACKed."""
         self.acked += count
 
     def facts(self) -> dict[str, object]:
@@ -136,22 +136,22 @@ class Texts(ABC, Generic[B]):
 
     @abstractmethod
     async def show(self, name: bytes, *, reread: bool) -> Shown[B]:
-        """Return a text. reread: as the vehicle is now; else as it was read last, if it was.
+        """Return a text. reread: read the vehicle now; else what was read last will do, if anything was.
 
         Raises:
-            NotFound: the vehicle has nothing that it would stand for. Else as RemoteStore.read_whole.
+            NotFound: the vehicle has nothing that the text could show. Else as RemoteStore.read_whole.
         """
 
     @abstractmethod
     def forget(self) -> None:
-        """The vehicle restarted, or what is remembered of it is to be asked again."""
+        """Forget what was read: the vehicle restarted, or a user wants it read again."""
 
     @abstractmethod
     async def carry_out(self, save: Save[B]) -> Saved[B] | None:
-        """Change the vehicle. None: the text asks for nothing.
+        """Change the vehicle as a text asks. Returns None if it asks for no change.
 
         Raises:
-            Refused: it did not, or not wholly. Else as RemoteStore.read_whole.
+            Refused: the vehicle did not take it, or not all of it. Else as RemoteStore.read_whole.
         """
 
     # --- what the tree asks
@@ -169,7 +169,7 @@ class Texts(ABC, Generic[B]):
         return Stat(EntryKind.FILE, len(shown.text), shown.since_ns, 0.0)
 
     async def list(self, patience: float) -> list[tuple[bytes, Stat]]:
-        """Return those that are there; after so many seconds, without the sizes of those not read by then."""
+        """Return the texts that are there. One that was not read within `patience` seconds has size 0."""
         found = {}
         with trio.move_on_after(patience) as scope:
             for name in self.names:
@@ -205,14 +205,14 @@ class Texts(ABC, Generic[B]):
         return zlib.crc32(text, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
     def note_other_file(self, program: Program | None) -> None:
-        """A program tried to make a file beside these."""
+        """Note that a program tried to make a file beside the texts."""
         if program in self._reads:
             self._reads[program].rereads = True
 
     # --- what handles ask
 
     def note_read(self, program: Program | None, base: B) -> None:
-        """A program read this."""
+        """Note what a program read."""
         if program is None:
             return
         reads = self._reads.setdefault(program, Reads())
@@ -231,7 +231,7 @@ class Texts(ABC, Generic[B]):
         base: B | None,
         appended: bool,
     ) -> None:
-        """Save a text; one after the other. base: what its handle showed before.
+        """Save a text; one save at a time. base: what its handle showed before.
 
         Raises:
             InvalidText, NotTaken, Armed; else as RemoteStore.read_whole.
@@ -256,7 +256,7 @@ class Texts(ABC, Generic[B]):
                 self._tell(name, done.notes)
 
     def _know(self, program: Program | None, known: B | None) -> None:
-        """A program saved: this is what it still knows."""
+        """Note what a program still knows after its save."""
         if known is not None and program is not None:
             self._reads[program] = Reads([known])
 
@@ -274,18 +274,18 @@ class Texts(ABC, Generic[B]):
             self._upload = None
 
     def transfers(self) -> Sequence[dict[str, object]]:
-        """Return the upload that is under way, if one is, as the files that are written are told."""
+        """Return the upload that is under way, if one is, in the form of `Throttle.transfers`."""
         return [] if self._upload is None else [self._upload.facts()]
 
     def refuse_missing_newline(self, name: bytes, text: bytes) -> InvalidText:
-        """Say that a text ends in the middle of a line, and return the error."""
+        """Note in last_error.txt that a text ends in the middle of a line, and return the error."""
         number = text.count(b"\n") + 1
         line = f"{name.decode()}:{number}: the last line has no end, so nothing was set"
         self._tell(name, [line])
         return InvalidText(line)
 
     def _tell(self, name: bytes, lines: Sequence[str]) -> None:
-        """Keep what the last save said."""
+        """Make last_error.txt say what came of the last save."""
         now = self._wall()
         when = datetime.fromtimestamp(now, UTC)
         head = f"# {when:%Y-%m-%d %H:%M:%S} UTC, {name.decode()}"
@@ -296,7 +296,7 @@ class Texts(ABC, Generic[B]):
 class Refused(Exception):
     """A save was not carried out, or not wholly.
 
-    error: for the program. lines: for people. known: see Saved; None: what it knew before.
+    error: for the program. lines: for people. known: see Saved; None: the program knows what it knew before.
     """
 
     def __init__(self, error: MavftpfsError, lines: Sequence[str], known: Any = None) -> None:
@@ -324,7 +324,7 @@ class ErrorHandle(OpenFile):
         return self._text[offset : offset + size]
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing is to be released."""
 
 
 class TextHandle(OpenFile, Generic[B]):
@@ -351,7 +351,7 @@ class TextHandle(OpenFile, Generic[B]):
         self._append = append and write
         self._base = None if truncate or self._append else shown.base
         self._shown = shown.base
-        self._before = b"" if truncate else shown.text  # of what is appended
+        self._before = b"" if truncate else shown.text  # what the appended lines follow
         self._content = bytearray() if self._append else bytearray(self._before)
         self._changed = False
         self._error: MavftpfsError | None = None
@@ -404,11 +404,11 @@ class TextHandle(OpenFile, Generic[B]):
         self._changed = True
 
     async def flush(self) -> None:
-        """Save what changed since the last time. An unfinished last line is an error, and stays: more may
-        come.
+        """Save the text if it changed since the last time. A last line without its end is an error; the text
+        stays, because more may come.
 
         Raises:
-            InvalidText, NotTaken, Armed; also of the last time, if nothing changed since.
+            InvalidText, NotTaken, Armed. If nothing changed since a save failed, its error again.
         """
         if not self._changed:
             if self._error is not None:
@@ -440,18 +440,18 @@ class TextHandle(OpenFile, Generic[B]):
         await self.flush()
 
     async def release(self) -> None:
-        """Let the text go, saved or not: the program that closed it was told."""
+        """Drop the text, saved or not: the program that closed it was told."""
 
     async def give_up(self) -> bool:
-        """Let the text go; return whether the vehicle has it."""
+        """Drop the text; return whether the vehicle has it."""
         return not self._changed and self._error is None
 
     def close(self) -> None:
-        """Let the text go."""
+        """Drop the text."""
 
 
 def problems_refused(name: bytes, problems: Sequence[Problem]) -> Refused:
-    """Return the refusal of a text with lines that cannot be; names each."""
+    """Return the refusal of a text with invalid lines. It names each line."""
     ordered = sorted(problems, key=lambda problem: problem.number)
     lines = [f"{name.decode()}:{problem.number}: {problem.reason}" for problem in ordered]
     return Refused(InvalidText(lines[0]), [*lines, "nothing was set"])

@@ -1,10 +1,10 @@
 """Compares a file that was sent with what it should be (promise 2). Layer: cache.
 
-The vehicle's CRC32 is compared for files up to verify_max; in doubt, and with verify=crc, of any size. It
-covers the whole file, so one that is right proves the size, too. But zeros before the first other byte do not
-change it (servers.md 10). So where it is 0, or was not told, the size is asked for by opening the file.
-Without a CRC32 a file counts as verified by size, which is logged and counted. In doubt it is read back
-instead, past every cache.
+Files up to verify_max are compared by the vehicle's CRC32; in doubt, and with verify=crc, files of any size.
+A CRC32 covers the whole file, so the right one proves the size, too. Only zeros at the beginning of a file do
+not change it (servers.md 10): a file of nothing but zeros has the CRC32 0. So if it is 0, or if the vehicle
+told none, the file is opened to learn its size. A file without a CRC32 counts as verified by size; that is
+logged and counted. In doubt it is read back instead, past every cache.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ PIECE = 64 * 1024
 """Bytes that are read back at once."""
 
 READ_TRIES = 3
-"""How often a file is read back at most because another FTP client may have mixed up the bytes."""
+"""How often a file is read back at most. It is read again if another FTP client was active meanwhile."""
 
 
 class Verifier:
-    """Compares, and counts for status: comparisons by CRC32, by reading back and by size alone, and CRC32s
-    that were not answered."""
+    """Compares files. Counts for status: comparisons by CRC32, by reading back and by size alone, and
+    requests for a CRC32 that were not answered."""
 
     def __init__(self, context: Context, names: Names) -> None:
         self._context = context
@@ -54,12 +54,12 @@ class Verifier:
     async def check(self, path: bytes, draft: Draft, *, doubted: bool) -> int | None:
         """Compare a file on the vehicle with a whole draft; return its CRC32 if that was compared.
 
-        doubted: what was sent may be elsewhere, or older: the size alone proves nothing.
+        doubted: the file may have other bytes than the ACKs say, so the size alone proves nothing.
 
         Raises:
-            VerificationFailed: it is another file, or is gone, or its CRC32 was not told though verify=crc.
-            Armed: it is not asked for now. SessionBusy: another client keeps it from being read back. Else
-            as VehicleStore.stat_size.
+            VerificationFailed: the vehicle has another file or none, or told no CRC32 although verify=crc.
+            Armed: a CRC32 is not asked for in flight. SessionBusy: another client was active each time the
+            file was read back. Else as VehicleStore.stat_size.
         """
         options, crc32 = self._context.options, None
         if options.verify == "none" and not doubted:
@@ -88,7 +88,7 @@ class Verifier:
         return crc32
 
     async def is_same(self, path: bytes, base: Base) -> bool:
-        """Return whether a file on the vehicle is still the one that is known of it.
+        """Return whether a file on the vehicle is still the base.
 
         Raises:
             As VehicleStore.stat_size and Directories.current.
@@ -122,13 +122,13 @@ class Verifier:
             return None
 
     def _go_without(self, path: bytes, error: Exception) -> None:
-        """No checksum came.
+        """Note that no checksum came.
 
         Raises:
-            VerificationFailed: verify=crc. Armed: it can be asked for after the flight.
+            VerificationFailed: verify=crc needs one. Armed: it can be asked for after the flight.
         """
         if self._context.options.verify == "crc":
-            self._context.require_disarmed()  # else it is asked for after the flight
+            self._context.require_disarmed()  # Armed: it is asked for after the flight
             raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
         if not isinstance(error, Armed):
             self.counts["checksums_unanswered"] += 1

@@ -2,8 +2,9 @@
 
 A NAK means different things by request (servers.md 12 and 14.35): FileExists on a read from PX4 is a
 leftover of an older request, FileNotFound on a read from ArduPilot means that the session is gone. So
-the key is (opcode, NAK code), then the code alone, then EIO. Numbers behind FailErrno are the drone OS's
-and sometimes stale, so only those pass that make sense for the request.
+the key is (opcode, NAK code), then the code alone, then EIO. Numbers behind FailErrno are those of the
+drone's OS, and some are left from an older failure. So only numbers that make sense for the request are
+passed on.
 
 Opcodes and codes are plain numbers here because their enums live one layer up; a test holds them equal.
 """
@@ -72,7 +73,7 @@ _SAME_ON_ALL = (
 _DRONE_ERRNO: dict[int, int] = {
     **{number: number for number in _SAME_ON_ALL},
     36: errno.ENAMETOOLONG,
-    38: errno.EOPNOTSUPP,  # ENOSYS; told as such, the kernel would never ask again
+    38: errno.EOPNOTSUPP,  # ENOSYS itself would keep the kernel from ever asking again
     39: errno.ENOTEMPTY,
     40: errno.ELOOP,
     # newlib (ChibiOS, ESP32); on Linux these are socket errors, which no file request can mean
@@ -84,7 +85,8 @@ _DRONE_ERRNO: dict[int, int] = {
 }
 
 _SESSION_ERRNO = frozenset({errno.EIO, errno.EFBIG, errno.ENOSPC, errno.EROFS, errno.ENXIO})
-"""What a request on an open file may say; a name cannot be missing or exist there, so others are stale."""
+"""Numbers that a request on an open file may have. It names no path, so numbers about names are left from an
+older failure."""
 
 _RMDIR_NOT_EMPTY = frozenset({errno.EEXIST, errno.EISDIR, errno.ENOTEMPTY})
 """RemoveDirectory of a full directory: unlink's EISDIR shows on POSIX ArduPilot (servers.md 9)."""

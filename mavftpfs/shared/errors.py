@@ -15,7 +15,7 @@ class MavftpfsError(Exception):
 
 
 class UsageError(MavftpfsError, ValueError):
-    """The caller asked for something that cannot be (bad option, bad SOURCE); exit code 1."""
+    """The caller asked for something impossible (bad option, bad SOURCE); exit code 1."""
 
 
 class LinkError(MavftpfsError):
@@ -35,7 +35,7 @@ class ProtocolError(MavftpfsError):
 
 
 class LocalProtocolError(ProtocolError):
-    """By us: a bug, or a request that cannot be expressed (a path that is too long)."""
+    """We broke a rule: a bug, or a request that cannot be expressed (a path that is too long)."""
 
 
 class PathTooLong(LocalProtocolError):
@@ -43,7 +43,7 @@ class PathTooLong(LocalProtocolError):
 
 
 class RemoteProtocolError(ProtocolError):
-    """By the peer: malformed bytes, or an answer that cannot be right."""
+    """The peer broke a rule: malformed bytes, or an answer that cannot be right."""
 
 
 class RequestTimeout(MavftpfsError):
@@ -87,10 +87,10 @@ class DataUnproven(MavftpfsError):
 
 
 class SessionLost(MavftpfsError):
-    """The server's session is gone, or no longer to be believed: reopen and go on at the same offset.
+    """The server's session is gone, or may be gone: reopen the file and go on at the same offset.
 
     Attributes:
-        by_server: an answer said so (else it is our own doubt, after a silence).
+        by_server: an answer said so; else the server was silent.
     """
 
     def __init__(self, reason: str, *, by_server: bool = False) -> None:
@@ -103,7 +103,7 @@ class SessionBusy(MavftpfsError):
 
 
 class Armed(MavftpfsError):
-    """The vehicle is armed (or was never heard), and what was asked is not done in flight."""
+    """The vehicle is armed (or was never heard), and the request is not carried out in flight."""
 
 
 class NotDeliveredYet(MavftpfsError):
@@ -111,7 +111,7 @@ class NotDeliveredYet(MavftpfsError):
 
 
 class ReadOnly(MavftpfsError):
-    """What was asked would change a tree, or a part of it, that is only read (EROFS)."""
+    """The request would change a tree, or a part of one, that is read-only (EROFS)."""
 
 
 class AlreadyExists(MavftpfsError):
@@ -135,11 +135,11 @@ class FileBusy(MavftpfsError):
 
 
 class InvalidText(MavftpfsError):
-    """A saved text has lines that cannot be; nothing of it was done (EINVAL)."""
+    """A saved text has invalid lines; nothing of it was set (EINVAL)."""
 
 
 class NotTaken(MavftpfsError):
-    """What a saved text asks for does not hold on the vehicle (EIO)."""
+    """The vehicle does not have what a saved text asked for (EIO)."""
 
 
 class NotSupported(MavftpfsError):
@@ -151,11 +151,11 @@ class FileTooLarge(MavftpfsError):
 
 
 class NoSpace(MavftpfsError):
-    """The local store for what the vehicle does not have yet is full (ENOSPC)."""
+    """The spool, which keeps what the vehicle does not have yet, is full (ENOSPC)."""
 
 
 class SpoolFailed(MavftpfsError):
-    """The local disk fails that holds what the vehicle does not have yet (EIO)."""
+    """The local disk that keeps undelivered bytes failed (EIO)."""
 
 
 class VerificationFailed(MavftpfsError):
@@ -163,7 +163,7 @@ class VerificationFailed(MavftpfsError):
 
 
 class OtherRefusal(MavftpfsError):
-    """A mount refused with an errno that none of these stands for.
+    """A mount refused with an errno for which there is no class here.
 
     Attributes:
         number: the errno.
@@ -179,15 +179,15 @@ class MountFailed(MavftpfsError):
 
 
 class NoFtp(MavftpfsError):
-    """A vehicle is there, but its files are not."""
+    """A vehicle is there, but it does not serve its files."""
 
 
 class NotDelivered(MavftpfsError):
-    """Bytes that were to be written are not provably on the vehicle.
+    """It is not proven that the vehicle has the bytes that were written.
 
     Attributes:
         there: whether the file is there as it was written. False: it is not, and nothing of it is sent from
-            now on. None: nobody can tell.
+            now on. None: that is not known.
     """
 
     def __init__(self, reason: str, *, there: bool | None = None) -> None:
@@ -230,8 +230,8 @@ _ERRNOS = {
     28: "the card is full",
     30: "it is read-only",
 }
-"""What people are told, by opcode, NAK code and errno (these are the same on all systems); the numbers stand
-behind it."""
+"""Words for people, by opcode, NAK code and errno. These errnos are the same on all systems. A message ends
+with the numbers."""
 
 
 class FtpNak(MavftpfsError):
@@ -286,7 +286,7 @@ EXIT_CODES = {
 """What each means, for the man page."""
 
 SIGNALLED = 128
-"""Plus a signal's number: that signal ended it, as shells say it."""
+"""This plus a signal's number is the exit code of a command that the signal ended, as in shells."""
 
 
 _NOT_POSSIBLE = (

@@ -22,7 +22,7 @@ class ExtentSet:
             self.add(start, stop)
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Yield (start, stop) in ascending order, as they are now; the set may be changed meanwhile."""
+        """Yield the present (start, stop) in ascending order; the set may be changed meanwhile."""
         return iter(list(zip(self._starts, self._stops, strict=True)))
 
     def __len__(self) -> int:

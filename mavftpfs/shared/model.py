@@ -33,7 +33,7 @@ class EntryKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class DirEntry:
-    """One listed name. size: bytes, 0 of directories. mtime: seconds UTC, None if the server told none."""
+    """One listed name. size: bytes, 0 for directories. mtime: seconds UTC, None if the server told none."""
 
     name: bytes
     kind: EntryKind
@@ -60,8 +60,8 @@ DOT = b"."
 
 
 def omits_files(path: bytes, entries: Sequence[DirEntry]) -> bool:
-    """Return whether a listing looks like the `/` of ArduPilot's SITL, which has its files in `DOT` only
-    (servers.md 14.32)."""
+    """Return whether a listing looks like that of `/` by ArduPilot's SITL, which shows no files: they are in
+    `DOT` (servers.md 14.32)."""
     if path != ROOT:
         return False
     names, kinds = {entry.name for entry in entries}, {entry.kind for entry in entries}
@@ -80,12 +80,12 @@ def split(path: bytes) -> tuple[bytes, bytes]:
 
 
 def renamed(path: bytes, old: bytes, new: bytes) -> bytes:
-    """Return what a path is called when what was `old` is called `new`."""
+    """Return the path that `path` has after `old` was renamed to `new`."""
     return new + path[len(old) :] if path == old or path.startswith(old + b"/") else path
 
 
 def rename_keys(facts: MutableMapping[bytes, T], old: bytes, new: bytes) -> None:
-    """File what is known of a path, and of all below it, under its new name."""
+    """Move the entries of a path, and of all paths below it, to their new names."""
     for path in list(facts):
         now = renamed(path, old, new)
         if now != path:
@@ -107,8 +107,8 @@ def normalise(path: bytes) -> bytes:
 def is_virtual(path: bytes) -> bool:
     """Return whether the path lies in an `@` tree.
 
-    The prefix decides (servers.md 14.13), also on a server that has no such tree and would take `/@x` for a
-    file: no listing tells the two apart, and what is written to `@PARAM` changes the vehicle.
+    Only the prefix decides (servers.md 14.13). A server without such trees may have an ordinary file `/@x`.
+    No listing tells the two apart, and a write to `@PARAM` would change the vehicle.
     """
     return path.startswith(b"/@")
 
@@ -132,7 +132,8 @@ def wire_path(path: bytes) -> bytes:
 
 
 def require_listable(path: bytes) -> None:
-    """Check that a listing could show a new name: what no listing shows can be neither found nor removed.
+    """Check that a listing could show a new name. A file that no listing shows can be neither found nor
+    removed.
 
     Raises:
         LocalProtocolError: it holds a tab, which ends a name in a listing (servers.md 6, 14.33).
@@ -168,7 +169,8 @@ class Traits:
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
         paths_disarm: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
-        lists_times: it answers opcode 16. time_silences: how often it did not, and then answered opcode 3.
+        lists_times: it answers opcode 16. time_silences: how often it did not answer that, and then answered
+        opcode 3.
         wo_truncates: OpenFileWO empties the file (servers.md 8).
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.

@@ -62,8 +62,8 @@ def directories_of(uid: int, home: str | None = None) -> list[Path]:
 
 
 def private_directory(directories: list[Path], *, longest_name: int) -> Path | None:
-    """Return the first directory that is, or can be made, ours alone, and where sockets of so long a name
-    can be; None if there is none."""
+    """Return the first directory that is, or can be made, this user's alone, and where a socket's path with
+    such a long name fits; None if there is none."""
     for directory in directories:
         try:
             # Not parents=True for a runtime directory: only the system creates /run/user/UID.

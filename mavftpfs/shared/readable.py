@@ -8,7 +8,7 @@ import re
 _BYTES = re.compile(r"""\bb('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")""")
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-"""All but tabs and the ends of lines."""
+"""All control characters but tabs and line ends."""
 
 _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 """MAV_AUTOPILOT values people meet."""
@@ -17,7 +17,7 @@ _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 def readable(message: str) -> str:
     """Return a message in which names, which are bytes, are text: `b'/Fl\\xc3\\xbcge'` is `'/Flüge'`.
 
-    What is no UTF-8 stays escaped; what a terminal would obey is `?`.
+    Bytes that are no UTF-8 stay escaped. A character that a terminal would obey becomes `?`.
     """
     return _CONTROL.sub("?", _BYTES.sub(_as_text, message))
 

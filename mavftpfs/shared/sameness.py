@@ -1,9 +1,10 @@
 """Is it still the same file? Layer: shared; pure.
 
-A version of a file is its size, and its time where listings tell one. Three things tell of it: the reply to
-an open has a size, a listing has a size and perhaps a time, and there is the CRC32. `compare` holds what was
-seen against what is known. It alone decides that: for readers, and the sessions that are opened anew for
-them, for drafts and their deliveries, and for blocks on the local disk. Its callers decide what follows.
+A version of a file is its size, and its modification time where listings tell one. The vehicle shows a file
+in three ways: the reply to an open has a size; a listing has a size and perhaps a time; and there is the
+CRC32. `compare` compares what was seen with what is known. Only here it is decided whether that is the same
+file: for readers, for drafts and their deliveries, and for blocks on the local disk. The callers decide what
+follows.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ class Sameness(Enum):
     GREW = "grew"
     """It is the same file, and somebody appended to it: logs grow."""
     UNPROVEN = "unproven"
-    """Nothing contradicts, and something else can tell more; or nobody has anything of it that could be
-    wrong."""
+    """Nothing contradicts, but nothing proves it. Something else can tell more, or no program has bytes that
+    could be wrong."""
     OTHER = "other"
-    """Another file has its name, or none."""
+    """Another file has the name, or none has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +34,12 @@ class Known:
     """What is known of a file.
 
     size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
-    given: a program may have bytes of it, so that another file of its size must not go on in its place.
-    restarted: the vehicle did, since it was known to be this file. Nobody goes on writing a file then.
-    ours: we wrote it. Before a listing told its time others may have replaced it, so its time is no proof.
-    at_open: a program opens it now, so that equal sizes are no proof where no time is told.
+    given: a program may have read bytes of it. Then another file of the same size must not continue in its
+    place.
+    restarted: the vehicle restarted since the last proof. After a restart no program goes on writing an old
+    file.
+    ours: we wrote it. Others may have replaced it before a listing told its time, so its time is no proof.
+    at_open: a program opens it now. Then equal sizes are no proof where no time is told.
     """
 
     size: int
@@ -114,5 +117,5 @@ def _by_crc32(known: Known, seen: Summed) -> Sameness:
         return Sameness.UNPROVEN
     if known.crc32 != seen.crc32:
         return Sameness.OTHER
-    # It starts with 0, so zeros before the first other byte do not change it (docs/servers.md 10).
+    # A CRC32 starts with 0, so zeros before the first other byte do not change it (docs/servers.md 10).
     return Sameness.SAME if seen.crc32 else Sameness.UNPROVEN

@@ -22,23 +22,23 @@ FULL = 239
 class SendBuffer:
     """One attempt to send a file of `size` bytes, which `read(start, stop)` returns; it raises MavftpfsError.
 
-    It goes from the file's begin to its end. What was handed out may not change: two copies of a byte could
-    reach the card in the wrong order.
+    Chunks are handed out from the file's beginning to its end. Bytes that were handed out may not change: two
+    copies of one byte could reach the card in the wrong order.
 
     Attributes:
-        todo, acked, proven: bytes to be handed out; ACKed since the file was closed the last time; ACKed
-            before that. What is in none of them is on its way.
-        closed: a Terminate was ACKed, so the card holds what is proven.
-        overtaken: bytes that were handed out changed, or were cut off: the file is to be sent anew.
-        reached: one past the highest byte that was ACKed; after a rollback, that is proven.
-        furthest: what `reached` was at most before the last rollback.
-        growing: more may be written behind the last byte; what fills no request there waits for it.
+        todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
+            bytes ACKed before it was last closed. All other bytes are on their way.
+        closed: a Terminate was ACKed, so the card has the proven bytes.
+        overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
+        reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
+        furthest: the largest value of `reached` before the last rollback.
+        growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
     """
 
     def __init__(
         self, read: Callable[[int, int], bytes], size: int, progress: Callable[[int], None] | None = None
     ) -> None:
-        """`progress` is told how many bytes were ACKed, each time that some were."""
+        """`progress(count)` is called for each ACK, with its number of bytes."""
         self.size = size
         self.todo = ExtentSet([(0, size)])
         self.acked = ExtentSet()
@@ -71,7 +71,7 @@ class SendBuffer:
         """Return whether there is something to send now.
 
         Raises:
-            MavftpfsError: it could not be read. It is tried again from now on.
+            MavftpfsError: the bytes could not be read. The next call tries again.
         """
         failed, self._failed = self._failed, None
         if failed is not None:
@@ -79,9 +79,10 @@ class SendBuffer:
         return self._next(FULL) is not None
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """Return (offset, at most `limit` bytes), now on their way; None = nothing for now.
+        """Return (offset, at most `limit` bytes), which count as on their way; None: nothing for now.
 
-        The engine serves everybody, so what cannot be read counts as nothing; `has_more` tells.
+        Bytes that cannot be read count as nothing here, because the engine serves all files. `has_more`
+        raises the error.
         """
         found = self._next(limit)
         if found is None:
@@ -120,8 +121,8 @@ class SendBuffer:
         self.acked = ExtentSet()
 
     def roll_back(self, *, everything: bool) -> None:
-        """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
-        because the file was emptied by reopening it."""
+        """The session was lost. What was ACKed since the checkpoint is sent again; or everything, if
+        reopening emptied the file."""
         self.furthest = max(self.furthest, self.reached)
         self.acked = ExtentSet()
         if everything:
