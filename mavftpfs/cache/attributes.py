@@ -1,7 +1,7 @@
 """What is shown of an entry whose listing says too little or too much. Layer: cache; pure.
 
-That includes mtimes that users set: no server can be told one. It is shown until the file changes, that is,
-until a listing shows another size or another mtime than the first one that was seen with it.
+That includes mtimes that users set, because no server can be told one. Such an mtime is shown until the file
+changes: until a listing shows another size or mtime than the first listing after it was set.
 """
 
 from __future__ import annotations
@@ -97,12 +97,13 @@ class Times:
             self._times.popitem(last=False)
 
     def peek(self, path: bytes) -> int | None:
-        """Return what was set, in nanoseconds; for a file of which more is known than any listing tells."""
+        """Return the mtime that was set, in nanoseconds, whatever a listing says; for a file with a draft."""
         known = self._times.get(path)
         return None if known is None else known.nanoseconds
 
     def get(self, path: bytes, size: int, listed: int | None) -> int | None:
-        """Return what was set, in nanoseconds, if a listing that says this still shows the same file."""
+        """Return the mtime that was set, in nanoseconds, if the listed size and mtime still show the same
+        file."""
         known = self._times.get(path)
         if known is None:
             return None

@@ -27,8 +27,8 @@ class Context:
 
     clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. times: mtimes that the vehicle
     cannot be told. blocked: nothing may be changed, because the vehicle is armed (only
-    Writeback.armed_changed sets it). retry_later(): something was not delivered, or a replacement is
-    unfinished: try again by and by.
+    Writeback.armed_changed sets it). retry_later(): to be called when something was not delivered, or a
+    replacement is unfinished; it is tried again.
     """
 
     store: VehicleStore
@@ -62,7 +62,7 @@ class Context:
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
 
     def touch(self, path: bytes) -> None:
-        """A file's content changed: it is of now, also where no listing tells times."""
+        """Give a file that changed the present time, also where no listing tells times."""
         self.times.set(path, int(self.wall() * SECOND))
 
     async def entry(self, path: bytes) -> DirEntry | None:
@@ -77,13 +77,13 @@ class Context:
         return (await self.directories.get(parent)).entries.get(name)
 
     def is_changing(self, path: bytes) -> bool:
-        """Return whether we are changing what the vehicle has under a path, or may have done so in part."""
+        """Return whether we are changing what the vehicle has under a path, or a change may have happened in
+        part."""
         node = self.nodes.get(path)
         return self.unfinished.is_unknown(path) or (node is not None and node.changing)
 
     def on_listed(self, path: bytes, directory: Directory) -> None:
-        """A directory was listed: notice which files others replaced since they were opened or delivered
-        here."""
+        """Find in a new listing which files others replaced since they were opened or delivered here."""
         for node in self.nodes:
             parent, name = split(node.path)
             entry = directory.entries.get(name) if parent == path else None
@@ -98,9 +98,9 @@ class Context:
                 draft.base = replace(draft.base, mtime=entry.mtime)
 
     def on_replaced(self, node: Node, draft: Draft) -> None:
-        """Others replaced the vehicle's file that a draft lies over."""
+        """Note that others replaced the base of a draft."""
         if node.delivery is not None:
-            return  # its delivery looks for itself
+            return  # its delivery compares the base itself
         draft.lose_base()
         if draft.state is State.STALE and not draft.lacked:
             self.nodes.replaced(node)

@@ -1,8 +1,9 @@
-"""Brings drafts to the vehicle, and knows that they are there. Layer: cache.
+"""Delivers drafts: sends each one, verifies it, and renames it into place. Layer: cache.
 
-`deliver` returns when the vehicle has the file, checked (promise 2), or raises why not. What was not
-delivered stays held, and the next call goes on with it. Meanwhile nobody writes the file (`Node.lock`), so
-what is verified is what was sent. While a program still writes, `push` begins the upload.
+`deliver` returns when the vehicle has the file, verified (promise 2), else it raises the reason. Undelivered
+bytes stay held, and the next call goes on with them. During a delivery no program writes the file
+(`Node.lock`), so the verified bytes are the sent bytes. `push` begins the upload while a program still
+writes.
 
 There is one way to the card: the whole file is sent under a reserved name, verified there, and renamed into
 place. In doubt it is then compared once more. A card that cannot rename gets the file under its own name.
@@ -49,14 +50,15 @@ from mavftpfs.shared.model import DirEntry, EntryKind
 log = logging.getLogger("mavftpfs.cache")
 
 MISMATCHES = 2
-"""The delivery fails after the file arrived as another one so often."""
+"""A delivery fails when the file on the card differed from what was sent so many times."""
 
 RESEND_PAUSE = 1.0
-"""Seconds before such a file is sent again: what spoiled it may last a moment."""
+"""Seconds before such a file is sent again: the cause may last a moment."""
 
 SENT_TWICE = 4096
-"""Bytes of the largest file that is sent before it is known whether the card can rename. A card that cannot
-gets it twice, once in a mount: a round trip or two. To find out first costs four requests on every card."""
+"""Bytes of the largest file that is sent before it is known whether the card can rename. If it cannot, the
+file is sent twice, once in a mount: a round trip or two. Finding out first would cost four requests on every
+card."""
 
 SHORT = 4096
 """Bytes of the largest file whose checksum the slowest card computes at once."""
@@ -72,7 +74,7 @@ PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 
 
 def may_pass(node: Node) -> bool:
-    """Return whether a delivery may succeed that is tried again: nothing failed, or what failed may pass."""
+    """Return whether trying a delivery again may help: none failed yet, or its error may pass."""
     return node.error is None or isinstance(node.error, PASSING)
 
 
@@ -87,7 +89,7 @@ class Deliverer:
         self.verifier = Verifier(context, names)
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
-        """Have the vehicle hold the node's file, checked. It is given up when it is not `wanted` any more.
+        """Bring a node's file to the vehicle, and verify it. Stop when it is not `wanted` any more.
 
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
@@ -102,9 +104,9 @@ class Deliverer:
                     if draft is None or not node.undelivered:
                         await self.abandon(node)
                         return
-                    with trio.CancelScope() as node.delivery:  # cancelled, it begins again
+                    with trio.CancelScope() as node.delivery:  # if cancelled, it begins again
                         try:
-                            if not context.unfinished.lacks_file(node.path):  # else it gets its file first
+                            if not context.unfinished.lacks_file(node.path):  # else it is mended in flight
                                 context.require_disarmed()
                             await self._try(node, draft)
                             node.error, node.start_after = None, float("-inf")
@@ -145,7 +147,7 @@ class Deliverer:
                     attempt.upload.wake()
         except MavftpfsError as error:
             node.start_after = context.clock() + START_PAUSE
-            level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line is enough for all
+            level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line for all files
             log.log(level, "%r is not sent just now: %s", node.path, error)
         finally:
             node.delivery = None
@@ -171,10 +173,11 @@ class Deliverer:
             self._context.own.in_use.discard(attempt.path)
 
     async def withdraw(self, node: Node) -> bool | None:
-        """Take back what the vehicle does not have of a file, so that nothing of it is sent from now on.
+        """Take back the undelivered bytes of a file: nothing of it is sent from now on.
 
-        What has the name on the vehicle keeps it. Programs that have this file open keep it without a name.
-        Returns whether the vehicle has all of it; None if that is not known, or if others write it, too.
+        The file that has the name on the vehicle keeps it. Programs that have our file open keep it without a
+        name. Returns whether the vehicle has all of it; None if that is not known, or if another handle
+        writes it, too.
         """
         context = self._context
         async with node.claim(), context.paths.steady(node, lasting=True):
@@ -220,7 +223,8 @@ class Deliverer:
             raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
 
     async def _try(self, node: Node, draft: Draft) -> None:
-        """Deliver: once more if the file arrived as another one, or if the card proved unable to rename."""
+        """Deliver. Try once more if the card has other bytes than were sent, or if it proved unable to
+        rename."""
         mismatches, store = 0, self._context.store
         while True:
             in_place = store.traits.rename_works is False
@@ -247,7 +251,8 @@ class Deliverer:
                 log.debug("%r: %s; trying another way", node.path, error)
 
     async def _mend(self, node: Node, draft: Draft) -> None:
-        """The renames of this file were interrupted. Have a listing show what has the name, and compare that.
+        """Find out by a listing what has the name after interrupted renames, and compare that file with the
+        draft.
 
         Raises:
             As Directories.ask and Verifier.check.
@@ -338,7 +343,7 @@ class Deliverer:
             return None
         trial = await self._names.begin_trial(node.path)
         try:
-            if inplace:  # first, for the card may have no room for both files, and never tell
+            if inplace:  # first: the card may have no room for both files, and never tell
                 await trial.rename()
                 await trial.end()
             self._require_deliverable(draft)  # it may have changed meanwhile
@@ -352,10 +357,11 @@ class Deliverer:
         return await self.verifier.check(attempt.path, draft, doubted=doubted)
 
     async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
-        """Compare what was sent, and look what has the name; return the CRC32 if that was compared.
+        """Compare what was sent, and check what has the name; return the CRC32 if it was compared.
 
-        Requests that the server answers at once go out together. A long checksum goes alone: requests behind
-        it would be repeated meanwhile, and the name may be taken while it is computed.
+        Requests that the server answers at once go out together. A long checksum goes alone, because requests
+        behind it would be repeated meanwhile. The name is checked after it: others may take the name while it
+        is computed.
 
         Raises:
             As Verifier.check and _require_expected.
@@ -402,13 +408,13 @@ class Deliverer:
             await attempt.upload.end()
             self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
-            compared = summed or store.in_doubt()  # that is as quick as a listing, and tells more
+            compared = summed or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
                 await self._names.rename(attempt.path, path, compared=compared)
             else:
                 await self._names.replace(attempt.path, path, compared=compared)
         except BaseException as error:
-            draft.give_up()  # unless it commits already
+            draft.give_up()  # does nothing if it commits already
             if draft.state is State.COMMITTING:
                 unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
                 if unknown or unfinished.is_unknown(path):
@@ -440,7 +446,7 @@ class Deliverer:
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
             old = self._context.unfinished.on_unknown(path).aside
-            self._context.own.in_use.discard(old or b"")  # if the name has no file the old one is given back
+            self._context.own.in_use.discard(old or b"")  # if the name has no file, the old one gets it back
             draft.interrupted(ours=True)
             if unproven and isinstance(error, VerificationFailed):
                 await self._names.find_out(path)
@@ -450,7 +456,7 @@ class Deliverer:
     # --- after
 
     def _on_delivered(self, node: Node, draft: Draft, crc32: int | None) -> None:
-        """The vehicle has it: listings, blocks and checksums follow."""
+        """Note that the vehicle has the draft: update listings, blocks and checksums."""
         context = self._context
         context.directories.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
         if crc32 is None and draft.size <= context.options.verify_max:

@@ -1,8 +1,8 @@
 """What a file is to be, and how far the vehicle has it. Layer: cache; pure.
 
 A draft lies over a base: the file as it is on the vehicle. Each byte below `size` is *held* (the spool has
-it), else *base* (below `base_limit`: the vehicle has it), else zero: the content between the old end and a
-write beyond it, or of a file that was extended.
+it), else *base* (below `base_limit`: the vehicle has it), else zero (a gap before a write beyond the old end,
+or an extension).
 
 All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`;
 `delivery` takes the steps. A changed file is sent as a whole new file under a reserved name beside it,
@@ -34,7 +34,7 @@ class State(Enum):
     under a reserved name. COMMITTING: that file is verified and being renamed into place. STALE: the base is
     another file now.
 
-    If the renames were interrupted it is DIRTY, and may be on the vehicle all the same: `replacements` knows.
+    After interrupted renames it is DIRTY although the vehicle may have it: `replacements` tells.
     """
 
     CLEAN = "clean"
@@ -49,8 +49,8 @@ class Event(Enum):
 
     CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
     BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
-    is verified, and the first rename is about to be asked for. PLACED: it has its name. REFUSED: it has not,
-    or nobody knows. REPLACED: others replaced the base.
+    is verified, and the first rename is about to be asked for. PLACED: it has its name. REFUSED: it does not
+    have its name, or that is not known. REPLACED: others replaced the base.
     """
 
     CHANGED = "changed"
@@ -125,7 +125,7 @@ class Base:
 
     @property
     def known(self) -> Known:
-        """What it is compared by. Where its CRC32 is known that tells more than its time: we wrote it, or no
+        """What it is compared by. If its CRC32 is known, that tells more than its time: we wrote it, or no
         time was told."""
         return Known(self.size, self.mtime, self.crc32, ours=self.crc32 is not None)
 
@@ -139,7 +139,7 @@ class Draft:
         base: the file on the vehicle, None if there is none.
         base_limit: below this, bytes that are not held are the base's.
         state: see State.
-        sending: the present attempt's books, only while SENDING.
+        sending: the buffer of the present attempt, only while SENDING.
         lacked: whether the vehicle lacked something of it when the base was replaced (STALE).
         begun: the file may exist under its own name because of us (cards that cannot rename).
     """
@@ -160,7 +160,7 @@ class Draft:
 
     @property
     def whole(self) -> bool:
-        """Whether the content is known without asking the vehicle."""
+        """Whether all bytes of it are here."""
         return self._held.covers(0, min(self.base_limit, self.size))
 
     @property
@@ -268,8 +268,8 @@ class Draft:
     # --- what delivery does
 
     def begin(self, *, in_place: bool, progress: Callable[[int], None] | None = None) -> SendBuffer:
-        """Start to send a whole draft to an empty file. in_place: to the file's own name, so that from now on
-        nothing counts of what is there. progress: see SendBuffer."""
+        """Start to send a whole draft to an empty file. in_place: under the file's own name, so the old
+        content there does not count from now on. progress: see SendBuffer."""
         self.on(Event.BEGUN)
         if in_place:
             self.sent_in_place, self.base_limit = True, 0
@@ -282,7 +282,8 @@ class Draft:
             self.on(Event.GIVEN_UP)
 
     def interrupted(self, *, ours: bool = False) -> None:
-        """Nobody knows which file has the name now. All of the draft is here, so no base counts any more.
+        """Note that it is not known which file has the name. All of the draft is here, so no base counts any
+        more.
         ours: the file that has the name is the one that was sent, or what became of it."""
         self.on(Event.REFUSED)
         self.base_limit = 0
@@ -290,7 +291,8 @@ class Draft:
             self.base = Base(self.size)
 
     def delivered(self, crc32: int | None = None) -> None:
-        """The vehicle has it, checked: from now on that is the base. crc32: of the content, if known."""
+        """Note that the vehicle has it, verified: from now on that is the base. crc32: of the content, if
+        known."""
         if self.state is State.SENDING:  # a card that cannot rename
             self.on(Event.COMMITS)
         self.on(Event.PLACED)
@@ -300,14 +302,14 @@ class Draft:
         self.content.restate(delivered=True)
 
     def lose_base(self) -> None:
-        """Others replaced the file on the vehicle. If no byte of it was to stay that changes nothing."""
+        """Note that others replaced the base. That changes nothing if no byte of the base was to stay."""
         if self.base_limit and self.state is not State.STALE:
             self.lacked = self.state is not State.CLEAN
             self.give_up()
             self.on(Event.REPLACED)
 
     def on(self, event: Event) -> None:
-        """Go to the next state; the books of an attempt end with SENDING.
+        """Go to the next state. The buffer of an attempt ends with SENDING.
 
         Raises:
             LocalProtocolError: that cannot happen now.

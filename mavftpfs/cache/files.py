@@ -1,17 +1,17 @@
 """Open regular files: close-to-open consistency over cached blocks. Layer: cache.
 
-At open it is decided whether what is cached of the path is still the vehicle's file:
-- size and mtime of a fresh listing are known and equal the version's, or
-- the version was known to be the vehicle's (by an open reply or a listing) less than `dir_timeout` ago and no
-  later listing says otherwise: it is used, and nothing is asked;
-- else the file is opened on the vehicle and a new version starts with the size in the reply, because equal
-  sizes without an mtime prove nothing.
+At open it is decided whether the version in the cache is still the vehicle's file:
+- It is if a fresh listing shows its size and mtime.
+- It is if that was proven (by an open reply or a listing) less than `dir_timeout` ago, and no later listing
+  contradicts. Then the vehicle is not asked.
+- Else the file is opened on the vehicle, and a new version starts with the size in the reply: equal sizes
+  without an mtime prove nothing.
 
-While a file is open the server's session on it is closed and opened again: after losses, restarts, and turns
-of other files. Then size and mtime are compared (`VersionHandle.read`): equal, or larger, means the same
-file, because logs grow. Else readers get FileChanged; only where the size is equal and none of them was
-given bytes they go on with the file that is there now. The open reply tells the size; the mtime takes a
-listing that began after the reopening, where listings tell any. After the vehicle restarted nothing is
+While a program has a file open, its session is closed and opened again: after losses, restarts, and turns of
+other users. Then size and mtime are compared (`VersionHandle.read`). A file that is equal, or larger, is the
+same, because logs grow. For another file readers get FileChanged. But if its size is equal, and no program
+got a byte of the old one, they go on with the new one. The open reply tells the size. Where listings tell
+mtimes, a listing that began after the reopening tells the mtime. After a restart of the vehicle nothing is
 proven.
 
 The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
@@ -50,28 +50,28 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 from mavftpfs.shared.sameness import Listed, Opened, Sameness, compare
 
 MAX_CLOSED = 4096
-"""How many files that nobody has open are remembered with their blocks."""
+"""How many closed files are remembered, with their blocks."""
 
 READING = 3.0
 """Seconds for which a file of which bytes came counts as being read."""
 
 PAUSES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Seconds that a read waits before it tries again because its bytes were dropped as doubtful: together longer
-than what is read stays provisional after another client of the vehicle used our session."""
+"""Seconds that a read waits before it tries again after its bytes were dropped in doubt. Together they are
+longer than it takes to notice that another client used our session."""
 
 ADOPTED_AT_ONCE = 64 * 1024
 """Bytes of a file we wrote that are read at once."""
 
 COMPARE_PAUSE = 2.0
-"""Seconds between two listings that only compare one file; 50 times what the last one took where that is
-more. A read that reaches the end of the file waits for neither."""
+"""Seconds between two listings that only compare one file, or 50 times what the last one took if that is
+more. A read that reaches the end of the file does not wait for that."""
 
 
 class Files:
     """All regular files that are open or cached. Paths are the vehicle's.
 
     Attributes:
-        is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
+        is_changing: see Context.is_changing.
         kept: the cache on the local disk, if there is one. open_versions: those with open handles.
         reopening: the versions that are given a reader now, see `open_reader`.
     """
@@ -86,7 +86,7 @@ class Files:
         invalidate: Callable[[bytes], None],
         kept: KeptCache | None = None,
     ) -> None:
-        """`proof_time`: seconds that what is known of a file holds."""
+        """`proof_time`: seconds for which a proof that a version is the vehicle's file holds."""
         self.kept = kept
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
@@ -149,7 +149,7 @@ class Files:
         return Version(self.cache, path, size, mtime, on_dropped=self._on_dropped)
 
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
-        """Return whether a version is known to be what the vehicle holds now."""
+        """Return whether a version is proven to be the vehicle's file now."""
         listed_at = found.directory.listed_at
         answer = compare(replace(version.known, at_open=True), Listed(found.entry))
         if answer is Sameness.OTHER and listed_at > version.proven_at:
@@ -185,9 +185,9 @@ class Files:
         return version
 
     async def _require_listed(self, path: bytes, size: int) -> DirEntry:
-        """Return what a listing that begins now shows of a file whose open reply told this size.
+        """Return what a new listing shows of a file, if it agrees with the size in an open reply.
 
-        A reply with a size that is too small would make a copy too short, without an error.
+        A size that is too small would make a copy too short, without an error.
 
         Raises:
             DataUnproven: it shows another size. NotFound; else as RemoteStore.list_directory.
@@ -201,7 +201,7 @@ class Files:
 
     async def open_reader(self, version: Version) -> None:
         """Give a version a reader; run by `reopening`, once for all handles. In doubt the file is opened
-        anew at once, else when bytes are wanted.
+        again at once, else when bytes are wanted.
 
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
@@ -247,7 +247,7 @@ class Files:
     async def compare(self, version: Version, *, now: bool) -> None:
         """Compare a version with a listing, if the server opened its file anew and listings tell times.
 
-        now: also if one was asked for to compare it just before.
+        now: even if a listing was asked for just before to compare it.
 
         Raises:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
@@ -258,8 +258,8 @@ class Files:
         version.require_not_replaced()
 
     def _is_sure(self, version: Version) -> bool:
-        """Return whether a version is known to be the path's file since the server opened that last, or a
-        listing would tell no more than an open reply does: that it did not become smaller."""
+        """Return whether a listing would tell nothing more of a version: it is CURRENT, or the open reply,
+        which shows that the file did not become smaller, is all the proof that there can be."""
         if version.current:
             return True
         reply = Opened(version.size, self._directories.tells_times)  # a smaller one was refused
@@ -280,13 +280,13 @@ class Files:
         self._compare_listed(version, directory)
 
     def _compare_listed(self, version: Version, directory: Directory) -> None:
-        """Take what a listing shows that began after a version was last known to be the path's file."""
+        """Compare a version with a listing that began after its last proof."""
         entry = directory.entries.get(split(version.path)[1])
         answer = compare(version.known, Listed(entry, directory.complete))
         if answer is Sameness.OTHER:
             self.kill(version)
         elif entry is None:
-            return  # what came of the listing does not tell
+            return  # the listing is incomplete, and does not tell
         elif answer is Sameness.UNPROVEN and not version.given:
             version.start_over(entry.mtime, directory.listed_at)
         else:
@@ -296,7 +296,7 @@ class Files:
                 version.mtime = entry.mtime
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
-        """A directory was listed, for whatever reason."""
+        """Compare the open versions of a directory with any new listing of it."""
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and not version.replaced
@@ -304,7 +304,7 @@ class Files:
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
-        """The file was replaced: so are this version and all older ones of its path."""
+        """Make a version REPLACED, and with the newest one of a path all older ones."""
         by_others = not self.is_changing(version.path)
         newest = self._current.get(version.path) is version
         older = [v for v in self.open_versions if newest and v.path == version.path]
@@ -315,23 +315,23 @@ class Files:
                 self._invalidate(one.path)
 
     def forget_pages(self, path: bytes) -> None:
-        """The kernel may hold bytes of a file that had the path before."""
+        """Drop the kernel's pages of a path: they may be of a file that had it before."""
         current = self._current.get(path)
         if current is not None:
             current.in_kernel = False
         self._invalidate(path)
 
     def _on_dropped(self, version: Version) -> None:
-        """Bytes of a version were dropped: the kernel may hold copies."""
+        """Drop the kernel's pages of a version whose bytes were dropped."""
         version.in_kernel = False
         current = self._current.get(version.path) is version
         if current or version in self.open_versions:
             self._invalidate(version.path)
         if current and not version.handles:
-            self._forget(version)  # to open it anew costs less than to compare it with a listing
+            self._forget(version)  # opening it again costs less than comparing it with a listing
 
     def rebooted(self) -> None:
-        """Nothing is proven any more; open files are compared before more of them is given out."""
+        """Forget all proofs. Open files are compared before more of their bytes are given out."""
         self._restarted_at = self._clock()
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
             version.on_restart(self._restarted_at)
@@ -339,7 +339,8 @@ class Files:
     # --- we changed the file ourselves
 
     def whole(self, path: bytes) -> Version | None:
-        """Return a path's version if all of it is held, surely of one file, and nobody has another open."""
+        """Return a path's version if all of it is here, surely of one file, and no other version of it is
+        open."""
         version = self._current.get(path)
         if version is None or version.replaced or not version.whole:
             return None
@@ -347,23 +348,25 @@ class Files:
         return version if alone and self._is_sure(version) else None
 
     def others_replaced(self, path: bytes) -> bool:
-        """Return whether somebody has a version of the path open, and is to read nothing more."""
+        """Return whether a version of the path is open that others replaced: it may not be read any more."""
         return any(v.path == path and v.by_others for v in self.open_versions)
 
     def kill_all(self, path: bytes) -> None:
-        """Programs that have a file of that path open must not read what we are about to write there."""
+        """Make all open versions of a path REPLACED: their handles must not read what we are about to write
+        there."""
         for version in [v for v in self.open_versions if v.path == path and not v.replaced]:
             self.kill(version)
 
     def on_changed(self, path: bytes) -> None:
-        """We wrote or removed what has the path: programs that have the old file open open the path anew."""
+        """Note that we wrote or removed the file of a path. Handles of the old file open the path again."""
         for version in self._at_or_below(path):
             if self._current.get(version.path) is version:
                 del self._current[version.path]
             version.replace(f"{version.path!r} was changed here")
 
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
-        """Take over the content of a file we wrote, which was proven then; `read(start, stop)` returns it."""
+        """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns
+        it."""
         self.on_changed(path)
         if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
@@ -388,7 +391,7 @@ class Files:
                 self._current[version.path] = version
 
     def _at_or_below(self, path: bytes) -> list[Version]:
-        """Return what is cached or open of a path, older ones too, and of what lies below it."""
+        """Return the versions, older ones too, of a path and of all paths below it."""
         found, below = [], path + b"/"
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
             if version.path == path or version.path.startswith(below):
@@ -468,7 +471,7 @@ class VersionHandle(OpenFile):
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
     def require_not_replaced_by_others(self) -> None:
-        """Raise FileChanged if the file became another one by somebody else's doing."""
+        """Raise FileChanged if others replaced the file."""
         if self._version.by_others:
             self._version.require_not_replaced()
 

@@ -8,8 +8,9 @@ Off unless `cache_dir=` names a directory. There are two kinds of keys that tell
   it is disarmed, of files up to verify_max, and for at most CRC_LIMIT seconds.
 
 Every SETTLED seconds all blocks in memory are looked at, and those that were there the last time go to the
-disk: bytes that were read lately may yet turn out to be another file's. At a clean unmount whole files are
-kept that were read lately, too, by their CRC32: if they are another file's, it will not agree.
+disk: bytes that were read lately may yet turn out to be another file's. At a clean unmount files that are
+here whole are kept even if they were read lately, by their CRC32: if the bytes are another file's, the
+vehicle's CRC32 will not agree.
 
 Never kept: `@` files, a file that grows or was changed in the last minute, and anything after the vehicle
 restarted (it may be another one by then). The disk is only touched in threads.
@@ -107,7 +108,8 @@ class KeptCache:
     # --- from the disk
 
     async def find(self, path: bytes, entry: DirEntry) -> Kept | None:
-        """Return what is kept of a freshly listed file, None if its beginning is not, or may be another's."""
+        """Return what is kept of a freshly listed file; None if its first block is not kept, or may be
+        another file's."""
         key = self._key(path, entry)
         if key is not None and not (_is_dated(key) and await self._begins(key)):
             key = await self._with_crc32(key)
@@ -122,7 +124,7 @@ class KeptCache:
         return await self._run(self._disk.read, key.block(*_extent(key.size, 0))) is not None
 
     async def fill(self, version: Version, start: int, stop: int) -> None:
-        """Add the blocks of [start, stop) that are lacking and on the disk."""
+        """Add the blocks of [start, stop) that the version lacks and the disk has."""
         kept = version.kept
         if kept is None or not kept.key.version:
             return
@@ -181,7 +183,7 @@ class KeptCache:
                 await self._keep(version, {i: b for i, b in held.items() if known.get(i) is b})
 
     async def keep_whole_files(self) -> None:
-        """Keep what was read whole, also lately: the mount ends."""
+        """Keep the files that were read whole, even those read lately, because the mount ends."""
         for version in self._in_memory():
             if version.whole and version.size <= self._crc_limit():
                 await self._keep(version, version.blocks(), by_crc32=True)
@@ -207,7 +209,7 @@ class KeptCache:
         return listed is None or compare(version.known, Listed(listed)) is Sameness.SAME
 
     async def _keep(self, version: Version, blocks: dict[int, bytearray], *, by_crc32: bool = False) -> None:
-        """Write blocks of a version that are held whole. by_crc32: all of them, under its CRC32 only."""
+        """Write whole blocks of a version. by_crc32: all of its blocks, under its CRC32 only."""
         kept = version.kept
         if kept is None or not self._may_keep(version, kept.key):
             version.kept = None

@@ -1,7 +1,7 @@
 """Blocks of files in a directory of the local disk. Layer: cache; blocks the caller: run it in threads.
 
-A block is named by a digest of everything that decides whose bytes it holds: the vehicle, the path, the
-size, what tells its versions apart (`FileKey.version`) and the block's place. The name is part of its
+A block is named by a digest of everything that decides which bytes it has: the vehicle, the path, the size,
+what tells versions of the file apart (`FileKey.version`) and the block's place. The name is part of its
 checksum. So a block of another version is never found, one under a wrong name counts as damaged, and two
 mounts that write the same block write the same bytes.
 
@@ -46,7 +46,8 @@ class FileKey:
     version: str
 
     def block(self, start: int, stop: int) -> str:
-        """Return the name of a block, whatever size blocks have in this version of the program."""
+        """Return the name of a block. Its extent is part of it, so a later program may use another block
+        size."""
         digest = hashlib.blake2b(digest_size=DIGEST_SIZE)
         for part in (self.vehicle, self.path, str((self.size, self.version, start, stop)).encode()):
             digest.update(_LENGTH.pack(len(part)) + part)
@@ -55,7 +56,8 @@ class FileKey:
 
 @dataclass(slots=True)
 class Kept:
-    """What the disk has, or will have, of one version of a file. done: blocks that are on the disk."""
+    """The part of one version of a file that is on the disk, or will be. done: blocks that are on the
+    disk."""
 
     key: FileKey
     done: set[int] = field(default_factory=set)
@@ -65,7 +67,7 @@ class KeptDisk:
     """A directory of our own (0700) in `parent`, made if need be, that holds at most about `budget` bytes.
 
     Raises:
-        OSError: it cannot be made, or is somebody else's.
+        OSError: it cannot be made, or belongs to another user.
     """
 
     def __init__(self, parent: Path, budget: int) -> None:
@@ -114,7 +116,8 @@ class KeptDisk:
             self.shrink()
 
     def shrink(self) -> None:
-        """If there is too much, remove what was not used for longest; and what crashed writers left."""
+        """If there is too much, remove the blocks not used for longest; and remove what crashed writers
+        left."""
         self._until_shrink = self._budget // 16
         blocks, now = [], time.time()
         for folder in self._path.glob("[0-9a-f][0-9a-f]"):

@@ -1,17 +1,17 @@
 """What the vehicle has under a name, changes of names, and how files get their names. Layer: cache.
 
-A server does not ask what has a name by now: RemoveFile removes an empty directory where the server calls
-remove(3), a rename moves into a directory on NuttX, and it replaces a file that others made (servers.md 9,
-14.34). So before a name is changed the vehicle is asked what has it (`Directories.current`).
+Servers check little before they change a name. RemoveFile removes an empty directory where the server calls
+remove(3). On NuttX a rename moves into a directory. A rename may replace a file that others made (servers.md
+9, 14.34). So the vehicle is asked what has a name before the name is changed (`Directories.current`).
 
-The session finds out whether a change happened. Here the remembered listings follow it.
+The session finds out whether a change happened. Here the remembered listings are updated.
 
-A new file is renamed to a name that is free, and never over anything. A file that exists is replaced by one
-rename where the server does that in one step; else (FAT refuses it, NuttX removes the target first) the old
-file is moved aside, and removed when the new one has its name. `repair` says how an interruption is mended.
-Between these two requests the name lacks its file, so the second one is sent even if the vehicle was armed
-meanwhile. If it cannot be sent (the link is lost), the replacement is unfinished (`replacements`): programs
-go on seeing the name, and the next listing gives it its file; the first one comes when the link is back.
+A new file is renamed to a free name, never over another file. An existing file is replaced by one rename
+where the server does that in one step. Else (FAT refuses it, NuttX removes the target first) it takes three
+requests: the old file is moved aside, the new one gets the name, the old one is removed. After the first
+request the name has no file. So the second one is sent even if the vehicle was armed meanwhile. If it cannot
+be sent because the link is lost, the replacement is unfinished (`replacements`): programs still see the name,
+and when the link is back a listing is made and the name gets a file again (`repair`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG
 """Refusals that mean what they say. Others may mean that the server never renames over a file."""
 
 _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
-"""Takes all bytes beyond ASCII for one."""
+"""Maps all bytes beyond ASCII to one."""
 
 
 class Names:
@@ -63,8 +63,8 @@ class Names:
     async def size(self, path: bytes) -> int:
         """Return the size of a file on the vehicle, asked just now.
 
-        Opening it needs the server's one session. Where OpenFileWO empties files that costs an upload beside
-        it all it sent: there the directory is listed.
+        Opening a file takes the server's one session. Where OpenFileWO empties files, an upload that gives
+        way for that loses all it sent. There the directory is listed instead.
 
         Raises:
             As VehicleStore.stat_size.
@@ -78,7 +78,7 @@ class Names:
         return await context.store.stat_size(path)
 
     async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
-        """Return whether nothing has a name, asked just now by opening it, so in any spelling.
+        """Return whether a name is free, in every spelling that the card takes for it: it is opened now.
 
         perhaps_directory: it may be another spelling of a directory, which does not open either.
 
@@ -95,10 +95,10 @@ class Names:
         return False
 
     async def require_new(self, path: bytes) -> None:
-        """Refuse a new name that the card takes for one that is there.
+        """Refuse a new name that the card takes for an existing one.
 
-        FAT knows names in any case, and without dots and blanks at their end (servers.md 9). Where a listing
-        shows a name that differs in that alone, the new one is opened.
+        FAT ignores case, and dots and blanks at the end of a name (servers.md 9). If a listing shows a name
+        that differs only in that, the new name is opened to find out.
 
         Raises:
             AlreadyExists. Else as entry and is_free.
@@ -115,10 +115,10 @@ class Names:
             raise AlreadyExists(f"{path!r} is the name of another file on this card")
 
     async def require_empty(self, path: bytes) -> None:
-        """Check by a listing asked for just now that nothing is in a directory.
+        """Check by a new listing that a directory is empty.
 
-        A directory that looks empty may hold reserved names: of a file of ours that is open though it was
-        unlinked, or of another mount that is perhaps at work.
+        A directory that looks empty may hold reserved names: those of an unlinked file that a program here
+        has open, or those of another mount that may be at work.
 
         Raises:
             DirectoryNotEmpty; FileBusy: only reserved names are in it. Else as Directories.ask.
@@ -161,8 +161,8 @@ class Names:
         self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
     async def discard(self, path: bytes) -> None:
-        """Remove a reserved name that is not needed any more. If that fails the next listing of its directory
-        has it removed, or `purge`, when the name that it belongs to goes."""
+        """Remove a reserved name that is not needed any more. If that fails, it is removed after the next
+        listing of its directory, or by `purge`."""
         try:
             await self.remove_if_there(path)
         except MavftpfsError as error:
@@ -178,15 +178,15 @@ class Names:
         over: bool = False,
         compared: bool = False,
     ) -> None:
-        """Rename; both paths fit a request. A listing confirms it until this server was seen to rename, and
-        in doubt.
+        """Rename; both paths fit a request. A listing confirms it in doubt, and until this server was seen to
+        rename.
 
-        completes: see VehicleStore. over: a file has the new name. compared: the caller looks at the file
-        itself, so no listing does.
+        completes: see VehicleStore. over: a file has the new name. compared: the caller compares the file
+        afterwards, so no listing is needed.
 
         Raises:
-            NotSupported: the card cannot rename, though its server may say that it did. AlreadyExists: the
-            new name is not free, though not `over`. Else as VehicleStore.
+            NotSupported: the card cannot rename, even if its server says that it did. AlreadyExists: the new
+            name is taken, and not `over`. Else as VehicleStore.
         """
         store = self._context.store
         if store.traits.rename_works is False:
@@ -213,20 +213,20 @@ class Names:
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
-        """See on an empty file of ours whether the card can rename. Raises as RenameTrial.begin."""
+        """Find out with an empty file of ours whether the card can rename. Raises as RenameTrial.begin."""
         trial = await self.begin_trial(near)
         await trial.rename()
         await trial.end()
 
     async def begin_trial(self, near: bytes) -> RenameTrial:
-        """Begin to find that out. Raises as RenameTrial.begin."""
+        """Begin to find out whether the card can rename. Raises as RenameTrial.begin."""
         context = self._context
         trial = RenameTrial(context.store, context.directories, context.own, near)
         await trial.begin()
         return trial
 
     async def purge(self, path: bytes) -> None:
-        """Before a path loses its name, remove what an earlier replacement left and would bring it back.
+        """Before a name goes, remove what earlier replacements left: it would bring the name back.
 
         Raises:
             As VehicleStore: then the name has to stay.
@@ -255,15 +255,15 @@ class Names:
     ) -> bytes | None:
         """Rename over a file that exists. compared: see rename.
 
-        keep_old: return the reserved name that this file has from now on, which is in `OwnNames.in_use`; None
-        if it was gone.
+        keep_old: keep the old file, and return its reserved name, which is in `OwnNames.in_use`; None if the
+        old file was gone.
 
-        One rename does where the server never leaves the name without a file. NuttX, where storages are
-        mounted at /fs/NAME, removes the old one first (servers.md 9).
+        One rename is enough where the server never leaves the name without a file. NuttX, which mounts
+        storages at /fs/NAME, removes the old file first (servers.md 9).
 
         Raises:
-            NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
-            again then, unless the replacement is unfinished.
+            NotSupported: the server does not rename. Else as VehicleStore.rename. After an error the old file
+            has its name again, unless the replacement is unfinished.
         """
         traits = self._context.store.traits
         if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
@@ -274,7 +274,7 @@ class Names:
             except FtpNak as nak:
                 if errno_for(nak) in _HONEST:
                     raise
-                if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
+                if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
         await self._forget_old(target)
@@ -313,8 +313,8 @@ class Names:
     # --- inside
 
     async def _discard_old(self, target: bytes, aside: bytes) -> None:
-        """Remove the file that a new one replaced. In doubt a listing has to show the new one first: a copy
-        of the first rename may have moved it over the old one. `Cleaner.remove_old` goes on."""
+        """Remove the file that a new one replaced. In doubt a listing has to show the new one first: a late
+        copy of the first rename may have moved it over the old one. `Cleaner.finish` sees to that."""
         context = self._context
         if not context.store.in_doubt():
             await self.discard(aside)
@@ -323,7 +323,7 @@ class Names:
         context.retry_later()
 
     async def _forget_old(self, path: bytes) -> None:
-        """Remove the old file of this name that is kept, if one is: the name is about to change again."""
+        """Remove the old file that is kept for a name, if there is one: the name is about to change again."""
         own, unfinished = self._context.own, self._context.unfinished
         record = unfinished.get(path)
         if record is None or not record.placed:
@@ -334,7 +334,8 @@ class Names:
             await self.remove_if_there(record.aside)
 
     def _note_unfinished(self, path: bytes, aside: bytes, *, placed: bool | None) -> None:
-        """The file of a name may lie aside for now: go on showing it, and have its directory listed."""
+        """Note that the file of a name may lie aside: go on showing the name, and have its directory
+        listed."""
         context = self._context
         entry = context.directories.entry(path) or context.directories.entry(aside)
         if entry is not None:
@@ -346,7 +347,7 @@ class Names:
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
-        """After an unknown outcome of the body, what is remembered of these names proves nothing."""
+        """If the outcome of the body is unknown, expire the listings of these names."""
         try:
             yield
         except (OutcomeUnknown, trio.Cancelled):
@@ -365,7 +366,7 @@ class Names:
 
 
 def _plain(name: bytes) -> bytes:
-    """Return a key that is equal for all names which a card may take for one name. A card ignores the case of
+    """Return a key that is equal for all names that a card may take for one name. A card ignores the case of
     letters, and beyond ASCII it folds bytes by its code page (by page 850 FatFs folds the UTF-8 of ä and å).
     """
     return name.rstrip(b". ").lower().translate(_ONE_LETTER)

@@ -1,12 +1,12 @@
-"""mkdir, rmdir, unlink and rename on the vehicle, as rename(2) and its kin have it. Layer: cache.
+"""mkdir, rmdir, unlink and rename on the vehicle, by the rules of rename(2) and its kin. Layer: cache.
 
 Servers check little: some remove files by rmdir, or move into directories by rename (servers.md 9). So types
-and targets are looked up in listings first. A change holds its paths alone (`pathlocks`). Before a path
-changes, what a draft of it has undelivered is delivered.
+and targets are looked up in listings first. A change holds its paths alone (`pathlocks`). A rename first
+delivers the drafts of what it moves.
 
 A program that has a file open reads on when the file loses its name. If the file was written here whole, its
-bytes are here. Else it is kept on the vehicle under a reserved name until its last handle is closed. Where
-the card cannot rename (LittleFS), a file that is cached whole is kept here, too; else the change of the name
+bytes are here. Else it is hidden: kept on the vehicle under a reserved name until its last handle is closed.
+Where the card cannot rename (LittleFS), a file that is cached whole is kept here; else the change of the name
 is refused (EBUSY).
 """
 
@@ -103,8 +103,8 @@ class Namespace:
             await self._rename(old, new, noreplace=noreplace)
 
     async def release(self, node: Node) -> None:
-        """The last handle of an unlinked file was closed: remove the file from the vehicle. If that fails the
-        next listing of its directory has it removed."""
+        """Remove an unlinked file from the vehicle, because its last handle was closed. If that fails, it is
+        removed after the next listing of its directory."""
         node.drop_draft()
         if not node.hidden:
             return
@@ -116,7 +116,7 @@ class Namespace:
 
     @asynccontextmanager
     async def _claim(self, path: bytes) -> AsyncIterator[None]:
-        """For the length of the body: take the name away from a file that is open, or not delivered."""
+        """Claim the file of a path, if it is open or not delivered, for a body that takes its name away."""
         nodes = self._context.nodes
         node = nodes.get(path)
         try:
@@ -135,7 +135,7 @@ class Namespace:
             await self._deliverer.abandon(node)
         entry = await context.directories.current(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
-        if draft is not None:  # what else has its name by now is not to be removed
+        if draft is not None:  # a file of others under its name is not to be removed
             there &= draft.base is not None or draft.sent_in_place or context.unfinished.is_unknown(path)
         elif entry is None:
             raise NotFound(f"{path!r} does not exist")
@@ -231,7 +231,8 @@ class Namespace:
     # --- inside: open files that lose their names
 
     def _keep_here(self, node: Node) -> bool:
-        """Keep a file's bytes here for the programs that have it open; return whether all of it is known."""
+        """Keep a file's bytes here for the programs that have it open; return whether all of them are
+        here."""
         context, version = self._context, self._context.files.whole(node.path)
         if version is None or node.draft is not None:
             return False
@@ -250,7 +251,7 @@ class Namespace:
         """Keep an unlinked file on the vehicle under a reserved name as long as a program has it open.
 
         Raises:
-            FileBusy: that cannot be. Else as VehicleStore.rename.
+            FileBusy: the card cannot do that. Else as VehicleStore.rename.
         """
         own, path = self._context.own, node.path
         try:
@@ -268,7 +269,7 @@ class Namespace:
         await self._on_hidden(node, hidden)
 
     async def _on_hidden(self, node: Node, hidden: bytes) -> None:
-        """The file was renamed to a reserved name, under which it is read on."""
+        """Note that a file was renamed to a reserved name. Its handles read it there."""
         node.lose_name()
         self._context.files.on_renamed(node.path, hidden)
         self._context.nodes.hide(node, hidden)

@@ -1,4 +1,4 @@
-"""What an open() of a file offers, whatever kind of file it is. Layer: cache."""
+"""What every open() of a file offers. Layer: cache."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from mavftpfs.shared.errors import LocalProtocolError
 
 
 class OpenFile:
-    """One open() of a file. What is not overridden is that of one opened for reading."""
+    """One open() of a file. Methods that are not overridden are those of a handle for reading."""
 
     @property
     def size(self) -> int:
-        """Bytes. Of a file being written it follows what was written, else it stays for the handle's life."""
+        """Bytes. While a file is written this follows the writes; else it stays for the handle's life."""
         raise NotImplementedError
 
     @property
@@ -25,7 +25,7 @@ class OpenFile:
 
     @property
     def writable(self) -> bool:
-        """Whether write, truncate and flush do something; fsync may, of any handle."""
+        """Whether write, truncate and flush do something. fsync may do something on any handle."""
         return False
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
@@ -53,10 +53,10 @@ class OpenFile:
         raise LocalProtocolError("truncate of a handle opened for reading")
 
     async def flush(self) -> None:
-        """One descriptor was closed: deliver what was written, unless that is nothing but an emptied file.
+        """Deliver what was written, because one descriptor was closed. A file that was only emptied waits.
 
         Raises:
-            The reason why bytes are still undelivered; as long as they are, at every call.
+            The reason why bytes are undelivered; as long as they are, at every call.
         """
 
     async def fsync(self) -> None:
@@ -67,7 +67,7 @@ class OpenFile:
         """
 
     async def release(self) -> None:
-        """The last descriptor was closed: deliver, and close whatever came of it. Twice is harmless.
+        """Deliver, and close in any case: the last descriptor was closed. Twice is harmless.
 
         Raises:
             As flush; what could not be delivered is kept.
@@ -75,16 +75,16 @@ class OpenFile:
         self.close()
 
     async def give_up(self) -> bool | None:
-        """Close, and take back what was written and is not on the vehicle: nothing of it is sent from now on.
+        """Close, and take back bytes that are not on the vehicle: none of them is sent from now on.
 
-        Returns whether the vehicle has the file as it was written; None if nobody can tell, or if others
-        write the same file, and deliver what was written here with theirs.
+        Returns whether the vehicle has the file as it was written. None: that is not known, or another handle
+        writes the same file, and delivers these bytes with its own.
         """
         self.close()
         return True
 
     def undo_open(self) -> None:
-        """Close; the call that opened it failed, so a file that was made by that is not wanted either."""
+        """Close, because the call that opened the file failed. If that call made the file, it goes, too."""
         self.close()
 
     def close(self) -> None:

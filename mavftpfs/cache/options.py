@@ -1,4 +1,4 @@
-"""What the caches are told by the mount's options. Layer: cache; pure."""
+"""The options of a mount that concern the caches. Layer: cache; pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MIN_CACHE_SIZE = MIB
 """Below this, a few of the kernel's read requests would not fit beside each other."""
 
 DIR_TIMEOUT = 20.0
-"""Seconds that a listing is fresh where the user did not say it."""
+"""Seconds that a listing is fresh if the user did not set it."""
 
 DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
 """What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
@@ -26,8 +26,8 @@ class CacheOptions:
     """Times in seconds, sizes in bytes.
 
     root: the vehicle's directory that is the mount's `/`. read_only: nothing there is changed or hidden.
-    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s,
-    and a listing that is expensive longer.
+    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s, and
+    longer for an expensive listing.
     attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.
     cache_size: budget for file blocks; max_entries: directory entries remembered over all listings.
     at_file_limit: largest `@` file that is read; at_cache_size: how much of such snapshots is kept.
@@ -40,7 +40,7 @@ class CacheOptions:
     sent in two minutes. link_rate: bytes per second that the link carries at most, where that is known before
     anything is measured.
     verify: auto, size, crc (see cache.verify) or none; verify_max: largest file whose CRC32 is
-    asked. write_armed: change things in flight too. force: change files that somebody else writes.
+    asked. write_armed: change things in flight too. force: change files that others are writing.
     inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the
     vehicle; local_max: bytes they may take.
 

@@ -4,15 +4,15 @@ In the order in which they are taken:
 1. The *file lock*, `nodes.Node.lock`. A writer or a delivery of a file has it, and a call that takes its name
    or content away (`Node.claim`).
 2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
-   Opening or delivering a file holds its path `shared`: beside others that share it, and not during a change
-   of its name, or it would have neither the old file nor the new one.
+   Opening or delivering a file holds its path `shared`: beside others that share it, but not during a change
+   of its name: then it would find neither the old file nor the new one.
 3. `versions.BlockCache.reads`, which bounds the memory of reads that wait for bytes. A delivery takes it
    below both, to fetch what its draft lies over. A reader that has it takes its path `shared`, to open the
    file. That waits only for a call that holds the path alone, and such a call never reads through the cache.
-A listing may be asked for under any lock, and what it has mended (`repair`) takes none.
+A listing may be asked for under any lock: the repair that follows it (`repair`) takes none.
 
-Two changes concern one another if they name the same path, in any case, or one names a directory above the
-other's. All others go on side by side, so that one that is not answered holds up nobody else.
+Two changes concern one another if they name the same path, whatever its case, or one names a directory above
+the other's. All other changes go on side by side, so a change that is not answered does not delay them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import trio
 from mavftpfs.shared.errors import RequestTimeout
 
 SLACK = 5.0
-"""Seconds that a change may take longer than its patience: to look what became of it."""
+"""Seconds that a change may take longer than its patience, to find out what became of it."""
 
 
 class Named(Protocol):
@@ -37,9 +37,9 @@ class Named(Protocol):
 
 
 class PathLocks:
-    """Locks on sets of paths. A call that shares one waits only for a call that holds it alone, not for one
-    that waits to: a delivery opens the file it delivers. Others get their turn in the order in which they
-    asked."""
+    """Locks on sets of paths. A call that shares a path waits for a call that holds it alone, but not for one
+    that waits to hold it: a delivery, which shares the path, has to open the file once more. All others get
+    the lock in the order in which they asked."""
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds to wait for a lock; with the change that follows SLACK more."""
@@ -49,7 +49,7 @@ class PathLocks:
 
     @asynccontextmanager
     async def hold(self, *paths: bytes, shared: bool = False, lasting: bool = False) -> AsyncIterator[None]:
-        """Hold the paths for the length of the body; one that had to wait may not last its full time.
+        """Hold the paths for the length of the body. A body that had to wait has only the rest of the time.
 
         shared: beside others that share them. lasting: the body bounds itself (a delivery may take minutes).
 
@@ -77,9 +77,9 @@ class PathLocks:
 
     @asynccontextmanager
     async def steady(self, file: Named, *, lasting: bool = False) -> AsyncIterator[bytes]:
-        """Open or deliver a file in the body: its path, which is yielded, and those above it do not change.
+        """Keep the path of a file, and those above it, unchanged for a body that opens or delivers the file.
 
-        The path may be another one by the time that begins. lasting: see hold.
+        Yields the path, which may have changed before the body begins. lasting: see hold.
 
         Raises:
             RequestTimeout: a change took too long.
@@ -92,7 +92,7 @@ class PathLocks:
                     return
 
     def _is_blocked(self, wanted: _Hold) -> bool:
-        """Return whether somebody who has a lock, or asked for it before, is in the way."""
+        """Return whether a call that has a lock, or asked for one before, is in the way."""
         came_before = True
         for held in self._held:
             if held is wanted:

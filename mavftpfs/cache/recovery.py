@@ -1,12 +1,16 @@
-"""What of undelivered files outlives a mount, and how it is found again. Layer: cache.
+"""How undelivered files outlive a mount, and how the next mount finds them. Layer: cache.
 
-A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory` beside `NNNNNN.json`, which says what it is:
-`path` on the vehicle, and either `unfinished` (a program was still writing: no close was confirmed or refused
-yet), or what `describe` tells of a file that could not be delivered. `needed` false: the vehicle has it all,
-or nobody wants it any more. A name is written before the first byte, so that whenever the process is killed
-the next mount can say what it found: `SpoolDirectory.rescue` moves both files to a recovery directory. A
-mount that ends does so itself with what it could not deliver. Nothing is written to a vehicle by itself:
-nobody knows what happened to the file since.
+A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a description beside it,
+`NNNNNN.json`:
+- `path`: its path on the vehicle;
+- `unfinished`: a program was still writing, no close was confirmed or refused yet; else what `describe` tells
+  of a file that could not be delivered;
+- `needed` false: the vehicle has all of it, or no program wants it any more.
+
+The description is written before the first byte. So the next mount can always say what it found, whenever the
+process was killed: `SpoolDirectory.rescue` moves both files to a recovery directory. A mount that ends moves
+there what it could not deliver. From there nothing is sent to a vehicle by itself, because the file on the
+vehicle may have changed since.
 """
 
 from __future__ import annotations
@@ -33,21 +37,21 @@ SLOTS = 64
 """Mounts of one vehicle by one user at the same time."""
 
 TOKENS = 256
-"""Mounts one after the other whose leftovers on the vehicle are known for ours."""
+"""So many past mounts are remembered, so that their leftovers on the vehicle are known to be ours."""
 
 LONGEST_NAME = 200
 """Bytes of the names in a recovery directory, so that every local disk takes what is added to them."""
 
 
 class SpoolDirectory:
-    """A directory on disk that one mount at a time uses; `owner` marks the mount's names on the vehicle.
+    """A directory on disk that one mount at a time uses; `owner` is the token in the mount's reserved names.
 
     Attributes:
-        dead_owners: tokens of mounts that ended here; what they left on the vehicle is nobody's.
+        dead_owners: tokens of mounts that ended here; no mount needs what they left on the vehicle.
     """
 
     def __init__(self, base: Path, rng: Random) -> None:
-        """Claim a slot below `base` that no mount uses, and in which none left anything.
+        """Claim a slot below `base` that no mount uses, and that has no files of an earlier one.
 
         Raises:
             OSError: it cannot be made, or every slot is taken.
@@ -87,7 +91,7 @@ class SpoolDirectory:
         return found
 
     def discard(self) -> None:
-        """Remove what this mount put here: the vehicle has it, though a program may not have closed it."""
+        """Remove the files of this mount: the vehicle has them, even if a program has not closed one."""
         for data in data_in(self.path):
             remove(data)
 
@@ -115,7 +119,8 @@ class SpoolDirectory:
         return os.pread(self._locks[slot], 8 * TOKENS, 0).split()
 
     def _new_token(self, slot: Path, rng: Random) -> bytes:
-        """Each mount has its own: other mounts that began before know the older ones for dead."""
+        """Make the token of this mount. It is a new one, because other mounts take the older ones for
+        dead."""
         token = new_owner(rng)
         while token in self.dead_owners:
             token = new_owner(rng)
@@ -132,7 +137,7 @@ def data_in(slot: Path) -> list[Path]:
 def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
     """Move a dead mount's spooled files to `recovery`; return their new paths, and why others stay.
 
-    What the vehicle has anyway is removed, and so is text that describes nothing.
+    Files that the vehicle has are removed, and so are descriptions without a file.
     """
     found, failed = [], []
     for data in data_in(slot):
@@ -153,7 +158,7 @@ def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
 
 
 def left_in(slot: Path) -> list[Path]:
-    """Return the files that the vehicle lacks and that nobody holds any more; none while a mount uses it."""
+    """Return the files of a slot that the vehicle lacks; none while a mount uses the slot."""
     try:
         descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CLOEXEC)
     except OSError:
@@ -194,7 +199,8 @@ def move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
 def describe(
     path: bytes, draft: Draft, error: Exception | None, wall: Callable[[], float]
 ) -> dict[str, object]:
-    """Return what a spooled file is, for people and JSON; `held` are the extents whose bytes are known."""
+    """Return the description of a spooled file, for people and JSON; `held`: the extents whose bytes are
+    here."""
     return {
         "path": path.decode(errors="surrogateescape"),
         "size": draft.size,
@@ -210,7 +216,7 @@ def describe(
 
 
 def _read_facts(data: Path) -> dict[str, object]:
-    """Return what was written down; nothing if that is not there or not what we write."""
+    """Return the description of a file; {} if there is none, or if it is damaged."""
     try:
         facts = json.loads(data.with_suffix(".json").read_text())
     except (OSError, ValueError, RecursionError) as exc:

@@ -17,35 +17,36 @@ class ReadSink(Protocol):
     """Where a reader's bytes go. All methods are synchronous and must not block."""
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the parts of [start, stop) not yet held."""
+        """Return the parts of [start, stop) that are not here yet."""
         ...
 
     def on_opened(self, at: float) -> None:
-        """What comes from now on is of the file that the server's session was opened on at that time (the
-        caches' clock). Told before the first byte of each session, and perhaps more than once."""
+        """The bytes that come from now on are of the file that the server opened at that time (the caches'
+        clock). Called before the first byte of each session, perhaps more than once."""
         ...
 
     def on_data(self, offset: int, data: bytes) -> None:
-        """Take proven-by-protocol bytes; what is already held must not be overwritten."""
+        """Take bytes that the engine believed. Bytes that are already here must not be overwritten."""
         ...
 
     def on_batch(self, count: int) -> None:
-        """A batch of on_data calls with so many bytes in all ended: wake the reads that wait. Called once per
-        batch, never per packet."""
+        """A batch of on_data calls ended, with `count` bytes in all: wake the reads that wait. Called once
+        for a batch, never for each packet."""
         ...
 
     def on_queued(self) -> None:
-        """The reader waits for its turn, and the queue before it moved: this is no silence of the vehicle."""
+        """The reader waits for its turn, and the queue before it moved. So the vehicle is not silent."""
         ...
 
     def on_suspect(self, reason: str) -> None:
-        """A session anomaly or a foreign FTP client was noticed while this file was read: what came is in
-        doubt (promise 1). This alone may be heard of a reader that was closed, for some seconds: a rival is
-        noticed late."""
+        """While this file was read the session went wrong, or another FTP client was noticed: the bytes that
+        came are in doubt (promise 1). Another client is noticed late. So this may be called up to some
+        seconds after Reader.close; nothing else is."""
         ...
 
     def on_failed(self, error: Exception) -> None:
-        """What is wanted cannot be had; waiters get the error. The reader stays usable for later wants."""
+        """The wanted bytes cannot be had: reads that wait get the error. The reader stays usable for later
+        wants."""
         ...
 
 
@@ -62,7 +63,7 @@ class Reader(Protocol):
         ...
 
     def drop_readahead(self) -> None:
-        """Forget wants that nobody waits for (a seek, a release)."""
+        """Forget wants for which no program waits (after a seek, or a release)."""
         ...
 
     def drop_wants(self) -> None:
@@ -78,9 +79,9 @@ class RemoteStore(Protocol):
     """The vehicle's files."""
 
     def why_lost(self) -> str | None:
-        """Return why the vehicle counts as lost, None if it does not: nothing was heard of it for 5 s, or
-        another one answers in its place. What begins now would wait for nothing; what is under way may go on
-        when it comes back."""
+        """Return why the vehicle counts as lost, None if it does not. It is lost if nothing was heard of it
+        for 5 s, or if another vehicle answers in its place. A request that begins now would wait in vain; one
+        that is under way may go on when the vehicle is back."""
         ...
 
     def others_heard(self) -> bool:
@@ -96,8 +97,8 @@ class RemoteStore(Protocol):
         ...
 
     async def open_reader(self, path: bytes, sink: ReadSink, *, expected_size: int | None = None) -> Reader:
-        """Open a regular file that is known to be one; `expected_size` avoids the open where it is already
-        the current one. The sink is called from the session's tasks until Reader.close (see on_suspect).
+        """Open a path that is known to be a regular file. With `expected_size` it is opened when bytes are
+        wanted. The sink is called from the session's tasks until Reader.close (see on_suspect).
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong.
@@ -122,11 +123,11 @@ class RemoteStore(Protocol):
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         """Ask the vehicle for a file's CRC32 (init 0, no final xor). size: in bytes, if known: it tells how
-        long the vehicle may need, before which the question is not repeated.
+        long the vehicle may need; the request is not repeated before.
 
         Raises:
-            Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost. SessionBusy: another client's
-            session kept the question out, so it may be asked again later.
+            Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost. SessionBusy: another client had
+            the session, so the request may be tried again later.
         """
         ...
 
@@ -141,8 +142,8 @@ class Upload(Protocol):
 
     @property
     def resent(self) -> bool:
-        """Whether CreateFile was sent more than once: a copy of it may come late and empty the file, so its
-        size is to be compared once more after it was renamed."""
+        """Whether CreateFile was sent more than once. A late copy of it may empty the file, so the caller
+        compares the size once more after the rename."""
         ...
 
     def wake(self) -> None:
@@ -168,9 +169,9 @@ class Upload(Protocol):
 class VehicleStore(RemoteStore, Protocol):
     """The vehicle's files, and how the caches change them.
 
-    Nothing below checks types or targets: the caller did. These raise FtpNak, RequestTimeout,
+    These calls do not check types or targets; their callers do. They raise FtpNak, RequestTimeout,
     VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change did not happen. Only
-    OutcomeUnknown says that nobody knows: a request was not answered, and no listing could tell.
+    OutcomeUnknown says that it is not known: a request was not answered, and no listing could tell.
     """
 
     @property
@@ -179,9 +180,9 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     def in_doubt(self, since: float = inf) -> bool:
-        """Return whether something of the last ten minutes, or after a time of the caches' clock, says that a
-        file may hold other bytes than the ACKs say: a late copy of a request, another FTP client, a lost
-        session, a restart."""
+        """Return whether there is doubt: something in the last ten minutes, or since a time of the caches'
+        clock, says that a file may have other bytes than the ACKs say. That is a late copy of a request,
+        another FTP client, a lost session, or a restart."""
         ...
 
     def address(self) -> tuple[int, int]:
@@ -194,14 +195,15 @@ class VehicleStore(RemoteStore, Protocol):
         """Write an `@` file by CreateFile, WriteFile in order and one at a time, and Terminate. A piece, of
         at most 64 bytes, is sent in one request. progress: told how many bytes were ACKed.
 
-        It is not tried again; what came until an error may have been carried out, and an ACK proves nothing.
+        It is not tried again. After an error a part of it may have been carried out, and an ACK proves
+        nothing.
         """
         ...
 
     async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Make a file by CreateFile and write it. Sends nothing before the source has something.
 
-        `path` is a temporary of ours, or, on cards that cannot rename, a name that is known to be free. An
+        `path` is a reserved name, or, on cards that cannot rename, a name that is known to be free. An
         upload that was interrupted goes on by OpenFileWO where that was seen to keep what the file has, else
         all of it is sent again.
         """
@@ -229,10 +231,11 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
-        """Rename; both paths together must fit one request (238 bytes). completes: without it a name stays
-        missing, so it is done though the vehicle was armed meanwhile. confirm: a listing has to show it.
+        """Rename; both paths together must fit one request (238 bytes). completes: without this rename a name
+        lacks its file, so it is done even if the vehicle was armed meanwhile. confirm: a listing has to show
+        it.
 
         Raises:
-            NotSupported: the listing shows that it was not done, though the server said so.
+            NotSupported: the listing shows that it was not done, though the server ACKed it.
         """
         ...

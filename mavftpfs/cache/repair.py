@@ -1,11 +1,11 @@
 """What becomes of reserved names that an interruption left on the card. Layer: cache.
 
 `leftovers` finds them in a listing, `Cleaner` acts on each:
-  what was sent, or was deleted  is removed: no close() reported it to be on the card
+  what was sent, or unlinked     is removed: no close() reported it to be on the card
   an old file, its name there    is removed: the new one has the name
   an old file, its name missing  gets its name again
   an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy
-Nothing is touched while its owner may be alive: see DEAD_AFTER.
+Nothing is touched while the mount that owns it may be alive: see DEAD_AFTER.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ MAX_LEFTOVERS = 128
 """Leftovers that are dealt with after one listing."""
 
 DEAD_AFTER = 600.0
-"""Seconds for which another mount's reserved name must have stayed the same before it counts as left."""
+"""Another mount's reserved name counts as left behind after it stayed the same for so many seconds."""
 
 MAX_SEEN = 1024
-"""How many such names are remembered, with the time since when they stayed the same."""
+"""How many such names are remembered, each with the time since which it stayed the same."""
 
 
 def leftovers(
     directory: bytes, entries: Iterable[DirEntry], is_dead: Callable[[bytes, bytes, DirEntry], bool]
 ) -> list[tuple[bytes, Reserved]]:
-    """Return the paths in a listing that interrupted work left, files whose name may be missing first.
+    """Return the paths in a listing that an interruption left, old files first: their names may have no file.
 
-    is_dead(path, owner, entry): whether nobody works with that name any more. Directories are never ours.
+    is_dead(path, owner, entry): whether no mount works with that name any more. Directories are never ours.
     """
     found = []
     for entry in entries:
@@ -62,7 +62,8 @@ class Cleaner:
         self._being_delivered: set[Node] = set()
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
-        """A directory was listed. Raises nothing of ours: the listing is right without us."""
+        """Clean up after a directory was listed. Raises no MavftpfsError: the listing is right in any
+        case."""
         unfinished = self._context.unfinished
         owners = {record.aside: owner for owner, record in unfinished if record.aside is not None}
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
@@ -84,10 +85,11 @@ class Cleaner:
             self._busy.discard(path)
 
     async def finish(self, *, at_once: bool = False) -> None:
-        """Give names that may lack their files what belongs to them, and remove old files that were kept long
-        enough, or `at_once`. A listing of their directories does both.
+        """End unfinished replacements. Names that may lack a file get theirs, and old files that were kept
+        long enough are removed; all of them `at_once`. A listing of their directories does both.
 
-        Of an old file that was removed already only a copy of a request can have made another one.
+        An old file that was removed at once can be there again only by a late copy of a request. So its
+        directory is listed only in doubt.
         """
         context, now = self._context, self._context.clock()
         directories = set()
@@ -110,7 +112,7 @@ class Cleaner:
                         context.unfinished.end(path)
 
     async def mend(self, node: Node) -> None:
-        """Mend the name of one file, whose lock the caller has."""
+        """Mend the name of one file by a listing. The caller has the file's lock."""
         self._being_delivered.add(node)
         try:
             await self._list(split(node.path)[0])
@@ -128,7 +130,8 @@ class Cleaner:
         return True
 
     def _on_found(self, path: bytes) -> None:
-        """The name has a file: if a draft wants to know whether it is the new one, it compares that."""
+        """Note that a name has a file. If a draft waits to be delivered there, its delivery compares that
+        file; else nothing is unfinished any more."""
         unfinished = self._context.unfinished
         record = unfinished.get(path)
         if record is not None and record.placed is None and self._is_asked_for(path):
@@ -162,7 +165,7 @@ class Cleaner:
         else:
             node = context.nodes.get(target)
             if node is not None and node.delivery is not None and node not in self._being_delivered:
-                return  # it is being written here: a later listing shows what came of it
+                return  # its delivery is under way: a later listing shows the outcome
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
             await self._names.rename(left, target, completes=owner is not None)
             if owner is not None:

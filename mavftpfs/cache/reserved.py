@@ -63,7 +63,7 @@ class Reserved:
 
 
 def is_reserved(name: bytes) -> bool:
-    """Return whether a name is hidden from programs."""
+    """Return whether a name is reserved, so that no program sees it."""
     return _RESERVED.fullmatch(name) is not None
 
 
@@ -105,7 +105,7 @@ class OwnNames:
 
     Attributes:
         owner: the mount's token.
-        in_use: names in use, so no listing's repair touches them.
+        in_use: names in use, which no repair touches.
     """
 
     def __init__(self, owner: bytes, rng: Random) -> None:

@@ -39,8 +39,8 @@ class SingleFlight(Generic[K, T]):
     async def run(self, key: K, work: Callable[[], Awaitable[T]], *, again: bool = False) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
 
-        A time-out of work that was under way before is not shared: a late caller starts anew, unless the
-        caller waited for it before (`again`).
+        A time-out of work that was under way before is not shared: a late caller starts the work again,
+        unless the same caller waited for it before (`again`).
 
         Raises:
             Exception: what the work raised; all its callers get the same object.

@@ -1,8 +1,9 @@
 """Keeps programs from writing more than the link carries. Layer: cache.
 
-close() cannot be killed, so what a close may have to wait for is bounded: about ten seconds of the measured
-rate, shared by the uploads under way, unless dirty_max says otherwise. A file of which a part is changed is
-sent again whole, so a change is refused (EFBIG) if that would take longer than two minutes.
+A program in close() cannot be killed, so the bytes that a close may wait for are limited: to those of about
+ten seconds at the measured rate, shared by the uploads under way, unless dirty_max is set. When a part of a
+file is changed, the whole file is sent again. So a change is refused (EFBIG) if fetching and sending would
+take longer than two minutes.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from mavftpfs.cache.versions import RateMeter
 from mavftpfs.shared.errors import FileTooLarge
 
 SECONDS = 10.0
-"""Of the measured rate that may wait, within LEAST and MOST bytes."""
+"""Seconds: what the measured rate carries in that time may be un-ACKed, within LEAST and MOST bytes."""
 
 LEAST, MOST = 64 * KIB, 8 * MIB
 UNMEASURED = 256 * KIB
-"""Bytes that may wait before the first were ACKed."""
+"""Bytes that may be un-ACKed before a rate is measured."""
 
 REWRITE_SECONDS = 120.0
 """How long it may take to fetch and send a file of which a part was changed."""
@@ -34,7 +35,7 @@ STALL = 5.0
 
 
 class WriteLimit:
-    """How many bytes may be un-ACKed over all uploads, and held in memory: as many as ten seconds bring.
+    """How many bytes may be un-ACKed over all uploads, and held in memory: those of ten seconds.
 
     Attributes:
         meter: how fast bytes are ACKed.
@@ -92,7 +93,7 @@ class Throttle:
         """Return whether the writers of a file have to wait."""
         draft = node.draft
         if draft is None or node.removed or draft.unacked <= LEAST:
-            return False  # nothing is delivered of a file without a name
+            return False  # a file without a name is not delivered
         if node.start_after == float("inf"):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
@@ -106,7 +107,7 @@ class Throttle:
         return False
 
     def on_acked(self, count: int) -> None:
-        """Bytes arrived."""
+        """Note that bytes were ACKed: writers that wait look again."""
         self._limit.meter.on_bytes(count, self._context.clock())
         self.waiting.unpark_all()
 
@@ -116,7 +117,8 @@ class Throttle:
         return self._limit.meter.shown.at(self._context.clock())
 
     def transfers(self) -> list[dict[str, object]]:
-        """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
+        """Return the files that are not delivered, those being sent first; eta: seconds at the measured
+        rate."""
         waiting = [node for node in self._context.nodes if node.undelivered]
         rate, before, found = self.speed, 0, []
         for node in sorted(waiting, key=lambda node: node.attempt is None):

@@ -8,10 +8,10 @@ import trio
 
 
 async def together(*calls: Callable[[], Awaitable[None]]) -> None:
-    """Await calls at once: the first is begun first, so what it asks for goes out first.
+    """Await several calls at the same time. The first one starts first, so its requests go out first.
 
     Raises:
-        What the first of them, in this order, failed with; when all have ended.
+        The error of the first call, in this order, that failed; after all have ended.
     """
     failures: dict[int, Exception] = {}
 

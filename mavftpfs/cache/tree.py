@@ -1,7 +1,7 @@
 """The remote tree as the FUSE layer sees it. Layer: cache.
 
-`Tree` decides what answers: remembered listings (`directories`), blocks of regular files (`files`), what is
-written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
+`Tree` decides which part answers: remembered listings (`directories`), blocks of regular files (`files`),
+what is written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
 (`localfiles`). It translates paths: callers name them below the mount's root, the modules behind it name them
 as the vehicle does.
 """
@@ -199,9 +199,9 @@ class Tree:
         append: bool = False,
         program: Callable[[], Program | None] = lambda: None,
     ) -> OpenFile:
-        """Open a file; with `truncate` it is empty for everybody from now on, here at once, there later.
+        """Open a file. `truncate` empties it: here at once, on the vehicle later.
 
-        Of texts: append: whatever is written is an end. program: the one that opens it.
+        For texts: append: what is written goes to the end. program: the program that opens it.
 
         Raises:
             NotFound, NotADirectory, IsADirectory, ReadOnly, Armed, FileBusy; else as RemoteStore.open_reader
@@ -231,10 +231,10 @@ class Tree:
         return await self._writing.open_reader(remote)
 
     async def crc32(self, path: bytes) -> int:
-        """Return the vehicle's CRC32 of a file (start value 0, no final xor). Where its clock was set
-        it is asked for again only when size or mtime changed.
+        """Return the vehicle's CRC32 of a file (start value 0, no final xor). If the vehicle's clock was set,
+        it is asked for again only after size or mtime changed.
 
-        Of an `@` file it is that of the bytes a reader gets: these are made anew at every open.
+        Of an `@` file it is the CRC32 of the bytes that a reader gets: the vehicle makes them at every open.
 
         Raises:
             NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
@@ -286,7 +286,7 @@ class Tree:
         return await self._writing.create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
-        """Cut or extend a file; done on the vehicle, unless somebody has it open for writing.
+        """Cut or extend a file, and deliver it, unless another program has it open for writing.
 
         Raises:
             NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
@@ -387,14 +387,14 @@ class Tree:
         return self.undelivered()
 
     async def tidy_up(self) -> None:
-        """Remove what is left on the vehicle of files that were replaced just now. For the end of a mount."""
+        """Remove the old files of replacements that are left on the vehicle. For the end of a mount."""
         await self._writing.tidy_up()
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
-        """Move what could not be delivered to a directory, which is made, with what is known of each file.
+        """Move undelivered files, each with its description, to a directory, which is made.
 
-        Returns the files, [] if there was nothing; what could not be moved stays held, and in the spool for
-        the next mount. Blocks: for the end of a mount.
+        Returns the files, [] if there was nothing. A file that cannot be moved stays in the spool for the
+        next mount. Blocks the event loop: only for the end of a mount.
 
         Raises:
             OSError, NoSpace, SpoolFailed: nothing could be moved.
@@ -402,7 +402,7 @@ class Tree:
         return self._writing.recover_to(directory)
 
     async def keep_whole_files(self) -> None:
-        """Keep what was read whole for the next mount, as this one ends (with `keep`)."""
+        """Keep files that were read whole for the next mount. For the end of this one (with `keep`)."""
         if self._kept is not None:
             await self._kept.keep_whole_files()
 
@@ -413,7 +413,7 @@ class Tree:
     # --- news and housekeeping
 
     def forget_caches(self) -> None:
-        """Drop everything that is not in use by an open file."""
+        """Drop everything that no open file uses."""
         self._directories.forget(ROOT)
         self._checksums.clear()
         self._files.forget_closed()

@@ -1,8 +1,8 @@
 """Whether the card can rename, as an empty file of ours shows. Layer: cache.
 
-The refusal of another rename does not tell: its number proves nothing (servers.md 12), and it may be that
-name which the card does not take. Nor does an ACK: the file has to be there under its new name. It is removed
-under that name, so this is seen.
+The refusal of another file's rename does not tell: its error number proves nothing (servers.md 12), and the
+card may refuse only that name. An ACK does not tell either: the file has to be there under its new name. So
+the empty file is removed under its new name. If that works, the rename worked.
 
 There are three steps, so that a delivery can send its file in between: `begin`, `rename` and `end`.
 """
@@ -89,7 +89,7 @@ class RenameTrial:
             self.leave()
 
     def leave(self) -> None:
-        """Nothing more comes of it; what is left there is for the next listing to clean up."""
+        """End the trial. The next listing cleans up what is left."""
         self._place = None
         self._own.in_use -= {self._first, self._second}
         self._directories.expire(split(self._near)[0])

@@ -1,17 +1,18 @@
 """Versions of remote files: what is known of them, their bytes, and the budget of all. Layer: cache.
 
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
-one version share its bytes and its remote reader. When the file turns out to have become another one the
-version is REPLACED: its handles get FileChanged, and later opens start a new version. If it was
-replaced by others, its handles never get what has the path now, even if we wrote that.
+one version share its bytes and its remote reader. When another file turns out to have the path, the version
+is REPLACED: its handles get FileChanged, and later opens start a new version. If others replaced the file,
+its handles never read the file that has the path now, even if we wrote that one.
 
 A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
 atomic (trio); nothing here awaits while state is half changed.
 
-Doubtful bytes (promise 1). Servers share session ids between clients, so perfectly matching replies can carry
-another file. When the session layer notices that this may have happened (`on_suspect`), every byte is
-dropped, and what still comes from the present reader is ignored: the next read opens a new one.
+Bytes in doubt (promise 1). Servers share session ids between clients, so a reply that matches in every field
+can carry bytes of another file. When the session layer notices that this may have happened (`on_suspect`),
+every byte is dropped, and bytes that still come from the present reader are ignored: the next read opens a
+new one.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from mavftpfs.shared.speed import Speed
 NEVER = float("-inf")
 
 BLOCK_SIZE = 128 * 1024
-"""Bytes: what malloc still keeps apart well. Blocks of 64 KiB, and the replies put together from them (the
-kernel asks for 256 KiB), left a quarter of the cache's size in unusable holes."""
+"""Bytes. Blocks of 64 KiB, and the replies put together from them (the kernel asks for 256 KiB), left holes
+in malloc's heap that nothing fitted: a quarter of the cache's size."""
 
 PIECE = 2 * BLOCK_SIZE
 """A read is served in pieces of at most so many bytes (what the kernel asks for at once)."""
 
 AHEAD_SECONDS = 3.0
-"""How much of the link's measured rate may lie ahead of a reader."""
+"""Seconds: what the measured rate carries in that time may be fetched ahead of a reader."""
 
 SMALL_SECONDS = 2.0
 """A file that the link carries in this time is small: it is wanted whole."""
@@ -96,8 +97,9 @@ class BlockCache:
         self.meter = RateMeter()
         self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
-        """Held by each read that waits for a piece: its piece is not evicted, and all pieces take at most
-        half. A lock: see `pathlocks`. A task that holds a path alone must not wait for it."""
+        """Each read that waits for a piece has it: its piece is not evicted, and all such pieces take at most
+        half of the budget. It is a lock, see `pathlocks`: a task that holds a path alone must not wait for
+        it."""
         self.bytes_cached = 0
         self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
 
@@ -111,7 +113,7 @@ class BlockCache:
         return limit, max(SMALL_FILE, min(limit, int(rate * SMALL_SECONDS)))
 
     def add(self, owner: Version, index: int, size: int) -> None:
-        """Account for a new block, evicting older ones that nobody waits on."""
+        """Account for a new block, evicting older ones that no read waits for."""
         for _ in range(len(self.used)):
             if self.bytes_cached + size <= self.budget:
                 break
@@ -148,11 +150,11 @@ class VersionState(Enum):
     """What is known of a version."""
 
     CURRENT = "current"
-    """The path was known to be this file after the server last opened it."""
+    """The path was proven to be this file since the server last opened it."""
     UNPROVEN = "unproven"
-    """The server opened the path again since, or restarted."""
+    """The server opened the path again after the last proof, or restarted."""
     REPLACED = "replaced"
-    """The path is another file now. It stays so."""
+    """Another file has the path now. This state is final."""
 
 
 class Version:
@@ -161,14 +163,15 @@ class Version:
 
     Attributes:
         state: see VersionState.
-        path: what it is called by now. size: in bytes, by the open reply. mtime: None if not known to belong
-            to this size. ours: we wrote it. given: a program got bytes of it.
-        proven_at: when the path was last known to be this file; NEVER after the vehicle restarted.
-        opened_at: when the server opened the file for the session that bytes come from now.
-        compare_after: no listing is asked for before, only to compare.
-        by_others: somebody else replaced it.
+        path: its present path. size: in bytes, by the open reply. mtime: None if not known to belong to this
+            size. ours: we wrote it. given: a program got bytes of it.
+        proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
+        opened_at: when the server opened the file for the present session.
+        compare_after: until then no listing is asked for only to compare it.
+        by_others: others replaced it.
         reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
-            local disk, if it may have one. shown: the kernel may hold pages of it, and all of them are good.
+            local disk, if it may have one. in_kernel: the kernel may have pages of it, and all of them are
+            right.
         ignores_data: what comes from the present reader is ignored, until a new one is opened.
         drops: how often all bytes were dropped because they were in doubt, or another file's.
     """
@@ -204,41 +207,41 @@ class Version:
         self.received_at = NEVER
 
     def block(self, index: int) -> bytearray | None:
-        """Return a block if it is held. It is another object when it came anew."""
+        """Return a block if it is here. A block that was dropped and came again is another object."""
         return self._blocks.get(index)
 
     def blocks(self) -> dict[int, bytearray]:
-        """Return the blocks that are held, whole or in part, by their index."""
+        """Return the blocks that are here, whole or in part, by their index."""
         return dict(self._blocks)
 
     @property
     def waited_for(self) -> bool:
-        """Whether somebody waits for bytes."""
+        """Whether a read waits for bytes."""
         return bool(self._waiters)
 
     @property
     def done(self) -> int:
-        """How many of the file's bytes came, or are held from before."""
+        """How many of the file's bytes came, or were here before."""
         return min(self.size, max(self.received, self._present.total))
 
     @property
     def whole(self) -> bool:
-        """Whether every byte is held."""
+        """Whether every byte is here."""
         return self._present.covers(0, self.size)
 
     # --- the sink
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the parts of [start, stop) not yet held, within the file."""
+        """Return the parts of [start, stop) that are not here yet, within the file."""
         return self._present.missing(start, min(stop, self.size))
 
     def on_opened(self, at: float) -> None:
-        """What comes from now on is of the file that was opened at that time."""
+        """See ReadSink: the bytes from now on are of the file that was opened at that time."""
         self.opened_at = max(self.opened_at, at)
         self._look()
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep what is not held yet; what lies beyond the opened size is dropped."""
+        """Keep bytes that are not here yet, up to the opened size."""
         if self.ignores_data:
             return
         count = len(data)
@@ -252,7 +255,7 @@ class Version:
         self.preload(offset, data)
 
     def preload(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep bytes that did not come over the link, where none are held yet."""
+        """Keep bytes that did not come over the link, where none are here yet."""
         whole = memoryview(data)
         for at, stop in self._present.missing(offset, min(offset + len(data), self.size)):
             while at < stop:
@@ -269,7 +272,7 @@ class Version:
                 at = end
 
     def on_batch(self, count: int) -> None:
-        """Wake those whose range is complete; give those whose range grew more time."""
+        """Wake the reads whose bytes are all here; give more time to those that got some."""
         self.received += count
         self.received_at = self._cache.clock()
         self._cache.meter.on_bytes(count, self.received_at)
@@ -282,7 +285,7 @@ class Version:
             waiter.missing = missing
 
     def on_queued(self) -> None:
-        """The reader waits for its turn while the queue before it moves: reads that wait get more time."""
+        """Give reads that wait more time: the reader waits for its turn, and the queue before it moves."""
         for waiter in self._waiters:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
 
@@ -305,7 +308,7 @@ class Version:
                 waiter.done.set()
 
     def ask_again(self) -> None:
-        """Reads that wait look again, and ask anew for what is missing: their reader is gone."""
+        """Make reads that wait ask again for their missing bytes, because their reader is gone."""
         for waiter in self._waiters:
             waiter.done.set()
 
@@ -333,7 +336,7 @@ class Version:
             raise FileChanged(self._why)
 
     def prove(self, at: float) -> None:
-        """The path was known to be this file at that time."""
+        """Note a proof that the path was this file at that time."""
         self.proven_at = max(self.proven_at, at)
         self._look()
 
@@ -344,7 +347,8 @@ class Version:
         self.on_opened(at)
 
     def start_over(self, mtime: int | None, at: float) -> None:
-        """Nobody got a byte of it, so it is the file that a listing showed then, of this time."""
+        """Become the file that a listing showed at that time, with this mtime: no program got a byte of the
+        old one."""
         self.mtime, self.kept = mtime, None
         self.prove(at)
         self.on_suspect("another file has its name")
@@ -362,14 +366,14 @@ class Version:
             reader.close()
 
     def replace(self, why: str) -> None:
-        """It is not the path's file any more; readers that wait for its bytes are told so."""
+        """Become REPLACED, because another file has the path. Reads that wait get the error."""
         self.state, self.kept, self._why = VersionState.REPLACED, None, why
         self.close_reader()
         self.on_failed(FileChanged(why))
         self.clear()
 
     def clear(self) -> None:
-        """Forget every block that no reader waits on."""
+        """Forget every block that no read waits for."""
         pinned = self.pinned()
         for index in list(self._blocks):
             if index not in pinned:
@@ -378,7 +382,7 @@ class Version:
     # --- for the cache
 
     def pinned(self) -> set[int]:
-        """Return the blocks that somebody waits on."""
+        """Return the blocks that reads wait for."""
         found: set[int] = set()
         for waiter in self._waiters:
             found.update(range(waiter.start // BLOCK_SIZE, -(-waiter.stop // BLOCK_SIZE)))
@@ -394,7 +398,7 @@ class Version:
     # --- reading
 
     def get(self, start: int, stop: int) -> bytes | memoryview | None:
-        """Return [start, stop) if it is held; without a copy if it lies in one block.
+        """Return [start, stop) if all of it is here; without a copy if it lies in one block.
 
         0 <= start < stop <= size.
         """
@@ -411,9 +415,9 @@ class Version:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     async def wait_for(self, start: int, stop: int) -> None:
-        """Wait for what is missing of [start, stop), which was just asked for, at most a piece. `get` may
-        find nothing afterwards, where the bytes were dropped. What nobody waits for any more, because this
-        was cancelled or took too long, is not fetched.
+        """Wait for the missing bytes of [start, stop), at most a piece, which the caller has just asked for.
+        `get` may find nothing afterwards, if bytes were dropped. Bytes for which no read waits any more,
+        after a cancellation or a time-out, are not fetched.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.

@@ -50,13 +50,13 @@ UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
 PARAM_FILE = b"/@PARAM/param.pck"
 ANNOUNCERS = frozenset({b"@SYS", b"@ROMFS"})
 LIVE_TIME = 1.0
-"""Seconds for which a file of parameters or a mission is what the vehicle has: one `ls -l` and its opens."""
+"""Seconds for which a snapshot of parameters or of a mission is good: one `ls -l` and its opens."""
 
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
 MAX_SEEN = 4096
-"""Of how many files it is remembered how reading them went."""
+"""Of so many files it is remembered what reading them showed."""
 
 
 def tree_of(path: bytes) -> bytes:
@@ -68,7 +68,7 @@ def tree_of(path: bytes) -> bytes:
 class Seen:
     """What the last try to read an `@` file showed, and until when that holds.
 
-    data: all of it; it tells the size also when it does not hold any more. None: it did not open.
+    data: the whole file; its size is shown even later. None: the file did not open.
     """
 
     data: bytes | None
@@ -139,11 +139,11 @@ class VirtualTrees:
         return (tree_of(PARAM_FILE),) if self._has_parameters else ()
 
     async def probe(self, names: Iterable[bytes], *, asked_for: bool = False) -> None:
-        """Find out once whether a server that announces nothing opens its parameters. asked_for: somebody
-        wants them, so also beside another client.
+        """Find out, once, whether a server that announces no trees opens its parameters. asked_for: a program
+        wants them, so they are asked for even beside another client.
 
         Raises:
-            As RemoteStore.stat_size, but for a refusal; if it was asked for.
+            As RemoteStore.stat_size, but for a refusal; only if asked_for.
         """
         if self._has_parameters is not None or not ANNOUNCERS.isdisjoint(names):
             return
@@ -171,16 +171,15 @@ class VirtualTrees:
         return seen.until if seen.data is None else -math.inf
 
     async def stat(self, path: bytes) -> Stat:
-        """Return attributes; of a file with its true size, reading it where the listed one lies.
+        """Return attributes. A file whose listed size lies is read to know its true size.
 
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory and read_whole.
         """
         found = await self._find(path)
         seen = self._look(path)
-        stays = (
-            seen.data is not None and tree_of(path) in UNLISTABLE
-        )  # as it was read, until it is opened anew
+        # In these trees the size of the last read stays, until the file is opened again.
+        stays = seen.data is not None and tree_of(path) in UNLISTABLE
         if self._clock() >= seen.until and not stays and self._is_read_to_know(found.entry):
             try:
                 await self._read(path)
@@ -241,8 +240,8 @@ class VirtualTrees:
         return SnapshotHandle(await self._read(path))
 
     async def content(self, path: bytes, *, reread: bool) -> bytes:
-        """Return a file of a tree that no listing shows. reread: as it is now, by what was read within
-        LIVE_TIME; else as it was read last, if it was.
+        """Return a file of a tree that no listing shows. reread: read it now, unless that was done within
+        LIVE_TIME; else what was read last will do, if anything was.
 
         Raises:
             NotFound; else as RemoteStore.read_whole.
@@ -254,7 +253,7 @@ class VirtualTrees:
         return await self._read(path)
 
     def outdate(self, path: bytes) -> None:
-        """A file is about to change: reads from now on ask the vehicle."""
+        """Make later reads ask the vehicle, because a file is about to change."""
         seen = self._look(path)
         if seen.data is not None:
             self._seen[path] = Seen(seen.data, -math.inf)
@@ -279,10 +278,10 @@ class VirtualTrees:
         return self._seen.get(path, UNSEEN)
 
     async def _find(self, path: bytes) -> Found:
-        """Return what the listing says; where none can, that it is a file.
+        """Return the listed entry; in a tree that no listing shows, the entry of a file.
 
         Raises:
-            NotFound: also where it is listed, but was seen not to open. Else as Directories.find.
+            NotFound: also for a listed file that was seen not to open. Else as Directories.find.
         """
         tree = tree_of(path)
         if tree not in UNLISTABLE:
@@ -315,7 +314,7 @@ class VirtualTrees:
     # --- reading
 
     def _is_read_to_know(self, entry: DirEntry) -> bool:
-        """Return whether it is a file that is to be read to know its size, and whether it opens."""
+        """Return whether a file has to be read to know its size, and whether it opens."""
         return entry.kind is EntryKind.FILE and entry.size <= self._options.at_stat_limit
 
     async def _read_unread(self, founds: Mapping[bytes, Found]) -> None:
@@ -343,7 +342,7 @@ class VirtualTrees:
             unlistable = tree_of(path) in UNLISTABLE
             if nak.opcode != Opcode.OPEN_FILE_RO or not (unlistable or nak.code == NakCode.FILE_NOT_FOUND):
                 raise
-            # What is listed and does not open is hidden until the vehicle restarts.
+            # A listed file that does not open is not shown until the vehicle restarts.
             self._note(path, Seen(None, self._clock() + self._options.proof_time if unlistable else math.inf))
             raise NotFound(f"the vehicle does not open {path!r}") from nak
         now, before = self._clock(), self._look(path).data
@@ -356,7 +355,7 @@ class VirtualTrees:
         return data
 
     def _note(self, path: bytes, seen: Seen) -> None:
-        """Remember how reading a file went, of as many as the budget holds."""
+        """Remember what reading a file showed, for as many files as the budget allows."""
         self._seen.pop(path, None)
         self._seen[path] = seen
         while self.bytes_cached > self._options.at_cache_size or len(self._seen) > MAX_SEEN:

@@ -1,7 +1,7 @@
-"""Everything that differs from the vehicle's listings and blocks because of us. Layer: cache.
+"""Everything that differs from the vehicle's listings and blocks because we write. Layer: cache.
 
-The tree asks here first: what is open, or not delivered yet is answered from drafts; the rest is the
-vehicle's. Paths are the vehicle's, normalised; those below `@` never come here for a change.
+The tree asks here first. A file that has a draft is answered from it; all else is the vehicle's. Paths are
+the vehicle's, normalised; those below `@` never come here for a change.
 """
 
 from __future__ import annotations
@@ -42,10 +42,11 @@ RETRY_PAUSE = 1.0
 """Seconds between two rounds of delivering everything."""
 
 PAUSES = (2.0, 30.0)
-"""Seconds between two attempts to deliver what nobody has open: at first, and at most."""
+"""Seconds between two attempts to deliver what no program has open: at first, and at most."""
 
 REFUSALS = 3
-"""After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
+"""After so many rounds in which the vehicle answered, and refused all that is left, an unmount stops
+trying."""
 
 
 class Writeback:
@@ -67,9 +68,10 @@ class Writeback:
         nursery: trio.Nursery | None,
         spool_directory: SpoolDirectory | None,
     ) -> None:
-        """Stand on the reading half's parts, and have listings mended from now on.
+        """Build on the parts for reading. From now on leftovers in listings are repaired.
 
-        Without a spool directory what exceeds memory goes to one that does not outlive the process.
+        Without a spool directory, bytes beyond the memory's limit go to one that does not outlive the
+        process.
         """
         owner = new_owner(rng) if spool_directory is None else spool_directory.owner
         dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
@@ -162,7 +164,7 @@ class Writeback:
         if entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:
-            # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
+            # If the size is 0 there is nothing to do: so it has to be true, not remembered.
             base = Base(entry.size or await context.store.stat_size(path))
         else:
             handle = await context.files.open(path)  # its ACK tells the size better than a listing
@@ -207,8 +209,8 @@ class Writeback:
         return None if node is None else await self._deliverer.withdraw(node)
 
     async def _forget_draft(self, node: Node) -> None:
-        """The caller got an error, so its bytes are not wanted any more. If some of them may be on the
-        vehicle, the delivery is completed later."""
+        """Drop the draft of a call that failed: its bytes are not wanted any more. If the vehicle may have
+        some of them, the draft is kept, and delivered later."""
         async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
@@ -270,12 +272,13 @@ class Writeback:
         self.retry()
 
     def retry(self) -> None:
-        """The vehicle is back, or may be written again: deliver what nobody has open any more."""
+        """Deliver what no program writes any more: the vehicle is back, or may be written again."""
         if self._nursery is not None and (self._context.unfinished or self.undelivered()):
             self._nursery.start_soon(self._try_all)
 
     def status(self) -> dict[str, object]:
-        """Return counters; bytes_... in bytes. `undelivered`: of whole files; `held`: what they take here."""
+        """Return counters; bytes_... in bytes. bytes_undelivered: of whole files; bytes_held: what they take
+        here."""
         nodes = list(self._context.nodes)
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: readable(str(n.error)) for n in nodes if n.error is not None}
@@ -313,14 +316,14 @@ class Writeback:
                 self._context.nodes.maybe_forget(node)
 
     def _retry_later(self) -> None:
-        """Something was not delivered, or a replacement is unfinished: try again by and by."""
+        """Try again later: something was not delivered, or a replacement is unfinished."""
         if self._nursery is not None and not self._retrying:
             self._retrying = True
             self._nursery.start_soon(self._retry)
 
     async def _retry(self) -> None:
-        """Try again, ever more seldom, as long as that may help. No news tells of a link that fails and
-        returns between two heartbeats."""
+        """Try again, with growing pauses, as long as that may help. A link may fail and return between two
+        heartbeats, and nothing tells of that."""
         nodes, unfinished, (pause, longest) = self._context.nodes, self._context.unfinished, PAUSES
         try:
             while unfinished or any(n.undelivered and may_pass(n) for n in nodes):

@@ -1,9 +1,8 @@
 """Open files of a mount that can be written. Layer: cache.
 
-Every handle of a file shares its node, so that a reader sees at once what a writer wrote, whatever the
-vehicle has. A handle opened for reading keeps its own readahead and opens the vehicle's file anew after we
-changed it. If somebody else replaced the file it reads nothing more, whatever is written there later: what
-has the path now is another file.
+All handles of a file share its node, so a reader sees at once what a writer wrote. A handle for reading has
+its own readahead, and opens the vehicle's file again after we changed it. If others replaced the file, the
+handle reads nothing more, whatever is written under the path later: that belongs to another file.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ MAX_FILE = 2**32 - 1
 """Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
 ADOPTED_PART = 4
-"""A delivered file of up to this part of the block cache is kept in it."""
+"""A delivered file goes to the block cache if the cache is at least so many times as large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +93,13 @@ class ReadFile(OpenFile):
                 if self._handle is not None and state == (self._generation, None):
                     return await self._handle.read(offset, size)
                 return await self._read_changed(offset, size)
-            except (FileChanged, LocalProtocolError):  # the latter: what lay below was closed as delivered
+            except (FileChanged, LocalProtocolError):  # LocalProtocolError: a delivery closed the base
                 if self._closed or state == (node.generation, node.draft) or not tries_left:
                     raise
         raise AssertionError
 
     async def fsync(self) -> None:
-        """Deliver what was written by whomever; see OpenFile.fsync."""
+        """Deliver what was written through any handle; see OpenFile.fsync."""
         await self._parts.deliverer.deliver(self._node)
 
     async def release(self) -> None:
@@ -214,7 +213,7 @@ class WriteFile(ReadFile):
             return
         if self._closed:
             raise LocalProtocolError("truncate of a closed handle")
-        # What is under way to the vehicle is not wanted any more: no room is needed, either.
+        # The bytes under way to the vehicle are not wanted any more, and new ones need no room.
         with trio.move_on_after(self._context.options.op_deadline):
             async with node.claim():
                 await self._truncate(node, 0)
@@ -222,9 +221,9 @@ class WriteFile(ReadFile):
         raise FileBusy(f"{node.path!r} is just getting its place")
 
     async def flush(self) -> None:
-        """Deliver, unless all that happened is that the file was emptied: more is about to come.
+        """Deliver, but not a file that was only emptied: bytes are about to come.
 
-        A shell empties the file, closes that descriptor's twin, and only then writes.
+        A shell empties the file, closes a copy of the descriptor, and only then writes.
 
         Raises:
             Why it is not delivered.
@@ -234,7 +233,7 @@ class WriteFile(ReadFile):
             await self._parts.deliverer.deliver(self._node)
 
     async def give_up(self) -> bool | None:
-        """See OpenFile.give_up. Takes as long as requests that are not answered."""
+        """See OpenFile.give_up. May take as long as a request that is not answered."""
         try:
             return await self._parts.deliverer.withdraw(self._node)
         finally:
@@ -246,13 +245,13 @@ class WriteFile(ReadFile):
         node = self._node
         wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
         if self._made and not wanted and node.undelivered and node.draft is not None and not node.draft.size:
-            node.drop_draft()  # nobody learnt of the new file
+            node.drop_draft()  # no program learnt of the new file
         self._context.nodes.maybe_forget(node)
 
     # --- inside
 
     async def _have_room(self, size: int) -> None:
-        """Wait until not too much is un-ACKed. size: of the file, in bytes, if nobody else writes to it.
+        """Wait until not too much is un-ACKed. size: bytes that the file will have.
 
         Raises:
             FileTooLarge, Armed. Else as Deliverer.deliver, when nothing moves.
