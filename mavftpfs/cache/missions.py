@@ -71,7 +71,7 @@ class Missions(Texts[Items]):
         self._shown[name] = raw, shown
         return shown
 
-    async def carry_out(self, save: Save[Items]) -> Saved[Items] | None:
+    async def carry_out(self, save: Save[Items]) -> Saved[Items]:
         """See Texts."""
         if save.appended:
             raise problems_refused(
@@ -85,9 +85,9 @@ class Missions(Texts[Items]):
             raise problems_refused(save.name, problems)
         kind = KINDS[save.name]
         if not differences(wanted, (await self.show(save.name, reread=True)).base, kind):
-            return None
+            return Saved()
         found = await self._replace(save.name, wanted)
-        return Saved(None, [f"{one.text} (the vehicle does not keep it)" for one in found])
+        return Saved(sent=True, notes=[f"{one.text} (the vehicle does not keep it)" for one in found])
 
     async def _replace(self, name: bytes, wanted: Items) -> list[Difference]:
         """Replace all items, read them back, and return the differences that the vehicle cannot keep.

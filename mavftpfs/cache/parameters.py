@@ -170,13 +170,13 @@ class Parameters(Texts[Values]):
 
     # --- saving
 
-    async def carry_out(self, save: Save[Values]) -> Saved[Values] | None:
+    async def carry_out(self, save: Save[Values]) -> Saved[Values]:
         """See Texts."""
         lines, notes = self._parse(save)
         base = pick_base(lines, save.bases, rereads=save.rereads)
         changed = [line for line in lines if base is None or not unchanged(line, base)]
         if not changed:
-            return None
+            return Saved(notes=notes)
         before = (await self._read(reread=True)).values
         plan = make_plan(changed, base, before, meant=save.appended)
         if plan.problems:
@@ -185,10 +185,10 @@ class Parameters(Texts[Values]):
             raise Refused(NotTaken(plan.conflicts[0]), [*plan.conflicts, "nothing was set"])
         # From now on each line that the program changed itself counts, also if it is changed back.
         names = {line.name for line in changed}
-        known = None if base is None else {name: one for name, one in base.items() if name not in names}
+        known = [{name: one for name, one in read.items() if name not in names} for read in save.bases]
         if plan.wanted:
             notes += (await self._set(save.name, plan.wanted, known)).notes
-        return Saved(known, notes + plan.notes)
+        return Saved(known, bool(plan.wanted), notes + plan.notes)
 
     def _parse(self, save: Save[Values]) -> tuple[list[Line], list[str]]:
         """Return a text's lines, and notes.
@@ -208,7 +208,7 @@ class Parameters(Texts[Values]):
         others = sorted({line.system for line in lines if line.system not in (None, system)} - {None})
         return lines, [f"the lines are of system {other}, this is system {system}" for other in others]
 
-    async def _set(self, name: bytes, wanted: Sequence[Parameter], known: Values | None) -> Verdict:
+    async def _set(self, name: bytes, wanted: Sequence[Parameter], known: Sequence[Values]) -> Verdict:
         """Set values, and read back whether they hold. known: for Refused.
 
         Raises:

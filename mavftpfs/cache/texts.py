@@ -54,11 +54,13 @@ class Shown(Generic[B]):
 
 @dataclass(slots=True)
 class Reads(Generic[B]):
-    """What a program read, the oldest first. rereads: the program tried to make another file beside the text,
-    as an editor does that is about to read the text again for a backup.
+    """What a program read, the oldest first: the texts that it got, and what it still knows of them. rereads:
+    the program tried to make another file beside the text, as an editor does that is about to read the text
+    again for a backup.
     """
 
     bases: list[B] = field(default_factory=list)
+    texts: list[bytes] = field(default_factory=list)
     rereads: bool = False
 
 
@@ -79,12 +81,13 @@ class Save(Generic[B]):
 
 @dataclass(frozen=True, slots=True)
 class Saved(Generic[B]):
-    """A save that was carried out. known: what its program still knows of the vehicle, None if it had read
-    nothing. notes: lines for people.
+    """A save that was carried out. known: what its program still knows of what it had read, None: as before.
+    sent: whether the vehicle was changed. notes: lines for people.
     """
 
-    known: B | None
-    notes: Sequence[str]
+    known: Sequence[B] | None = None
+    sent: bool = False
+    notes: Sequence[str] = ()
 
 
 @dataclass(slots=True)
@@ -124,6 +127,7 @@ class Texts(ABC, Generic[B]):
         self._wall = wall
         self._require_writable = require_writable
         self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
+        self._failed: Program | None = None  # its save was the last, and was refused
         self._saving = trio.Lock()
         self._upload: TextUpload | None = None
 
@@ -147,8 +151,8 @@ class Texts(ABC, Generic[B]):
         """Forget what was read: the vehicle restarted, or a user wants it read again."""
 
     @abstractmethod
-    async def carry_out(self, save: Save[B]) -> Saved[B] | None:
-        """Change the vehicle as a text asks. Returns None if it asks for no change.
+    async def carry_out(self, save: Save[B]) -> Saved[B]:
+        """Change the vehicle, where a text asks for it.
 
         Raises:
             Refused: the vehicle did not take it, or not all of it. Else as RemoteStore.read_whole.
@@ -211,7 +215,7 @@ class Texts(ABC, Generic[B]):
 
     # --- what handles ask
 
-    def note_read(self, program: Program | None, base: B) -> None:
+    def note_read(self, program: Program | None, text: bytes, base: B) -> None:
         """Note what a program read."""
         if program is None:
             return
@@ -219,6 +223,8 @@ class Texts(ABC, Generic[B]):
         self._reads.move_to_end(program)
         if not any(known is base for known in reads.bases):
             reads.bases = [*reads.bases, base][-MAX_READ:]
+        if text not in reads.texts:
+            reads.texts = [*reads.texts, text][-MAX_READ:]
         while len(self._reads) > MAX_PROGRAMS:
             self._reads.popitem(last=False)
 
@@ -238,6 +244,7 @@ class Texts(ABC, Generic[B]):
         """
         async with self._saving:
             reads: Reads[B] = self._reads.get(program, Reads())
+            puts_back = program is not None and program == self._failed and text in reads.texts
             bases = [] if appended else reads.bases
             if base is not None and not any(known is base for known in bases):
                 bases = [*bases, base]
@@ -245,20 +252,25 @@ class Texts(ABC, Generic[B]):
                 self._require_writable()
                 done = await self.carry_out(Save(name, text, bases, reads.rereads, appended))
             except Refused as refused:
+                self._failed = None if puts_back else program
                 self._know(program, refused.known)
-                self._tell(name, refused.lines)
+                self._tell(name, refused.lines, more=puts_back)
                 raise refused.error from refused.__cause__
             except MavftpfsError as error:
-                self._tell(name, [f"nothing was set: {error}"])
+                self._failed = None if puts_back else program
+                self._tell(name, [f"nothing was set: {error}"], more=puts_back)
                 raise
-            if done is not None:
-                self._know(program, done.known)
+            self._failed = None
+            self._know(program, done.known)
+            if not puts_back:
                 self._tell(name, done.notes)
+            elif done.sent:
+                self._tell(name, ["the program put back what it had read", *done.notes], more=True)
 
-    def _know(self, program: Program | None, known: B | None) -> None:
+    def _know(self, program: Program | None, known: Sequence[B] | None) -> None:
         """Note what a program still knows after its save."""
-        if known is not None and program is not None:
-            self._reads[program] = Reads([known])
+        if known is not None and program in self._reads:
+            self._reads[program] = Reads(list(known), self._reads[program].texts)
 
     async def upload(self, store: VehicleStore, name: bytes, file: bytes, pieces: Sequence[bytes]) -> None:
         """Send what a save makes, with its progress in `transfers`.
@@ -277,19 +289,24 @@ class Texts(ABC, Generic[B]):
         """Return the upload that is under way, if one is, in the form of `Throttle.transfers`."""
         return [] if self._upload is None else [self._upload.facts()]
 
-    def refuse_missing_newline(self, name: bytes, text: bytes) -> InvalidText:
+    def refuse_missing_newline(self, name: bytes, text: bytes, program: Program | None) -> InvalidText:
         """Note in last_error.txt that a text ends in the middle of a line, and return the error."""
         number = text.count(b"\n") + 1
         line = f"{name.decode()}:{number}: the last line has no end, so nothing was set"
+        self._failed = program
         self._tell(name, [line])
         return InvalidText(line)
 
-    def _tell(self, name: bytes, lines: Sequence[str]) -> None:
-        """Make last_error.txt say what came of the last save."""
+    def _tell(self, name: bytes, lines: Sequence[str], *, more: bool = False) -> None:
+        """Make last_error.txt say what came of the last save; more: and leave there what it says.
+
+        An editor that could not save puts back what it had read (vim): why it could not is to be read then.
+        """
         now = self._wall()
         when = datetime.fromtimestamp(now, UTC)
         head = f"# {when:%Y-%m-%d %H:%M:%S} UTC, {name.decode()}"
-        self.error_text = ("\n".join([head, *lines]) + "\n").encode() if lines else b""
+        before = self.error_text if more else b""
+        self.error_text = before + ("\n".join([head, *lines]) + "\n").encode() if lines else before
         self._error_at = int(now * SECOND)
 
 
@@ -364,7 +381,7 @@ class TextHandle(OpenFile, Generic[B]):
     async def read(self, offset: int, size: int) -> bytes:
         """Return bytes, fewer only at the end."""
         if not self._changed and self._before:
-            self._texts.note_read(self._program, self._shown)
+            self._texts.note_read(self._program, self._before, self._shown)
         content = self._before + self._content if self._append else self._content
         return bytes(content[offset : offset + size])
 
@@ -416,7 +433,7 @@ class TextHandle(OpenFile, Generic[B]):
             return
         text = bytes(self._content)
         if text and not text.endswith(b"\n"):
-            raise self._texts.refuse_missing_newline(self._name, text)
+            raise self._texts.refuse_missing_newline(self._name, text, self._program)
         self._changed, self._error = False, None
         if not text:
             return

@@ -72,7 +72,11 @@ async def test_a_mission_that_is_there_sends_nothing() -> None:
         tree = here.mount()
         await save(tree, MISSION, PLAN)
         for text in (PLAN, (await read_file(tree, MISSION)).decode()):
+            with pytest.raises(InvalidText):
+                await save(tree, MISSION, PLAN + "x\n")
+            assert await read_file(tree, ERRORS) != b""
             await save(tree, MISSION, text)
+            assert await read_file(tree, ERRORS) == b""
         assert here.count(Opcode.CREATE_FILE) == 1
 
 

@@ -255,6 +255,35 @@ async def test_an_editor_that_reads_again_for_its_backup(profile: str) -> None:
         assert number(here, "LEARNED_01") > 10
 
 
+@MARKS
+@pytest.mark.parametrize("bad", ["MODE_002,rubbish", "CLAMPED,70"])
+async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: str, bad: str) -> None:
+    """vim does: what failed stays said, and nothing else is set than what the failed save had set."""
+    table = [*many(), parameter("CLAMPED", FLOAT, 1, limits=(0, 10))]
+    async with vehicle(profile, parameters=table) as (here, tree):
+        editor = await Editor(tree).read()
+        edited = editor.edit("MODE_001", "5").edit(*bad.split(",")).lines
+        await trio.sleep(20)
+        with pytest.raises(ReadOnly):
+            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: id(editor))
+        backup = (await editor.read()).lines
+        editor.lines = edited
+        with pytest.raises((InvalidText, NotTaken)):
+            await editor.save()
+        said = await errors(tree)
+        await trio.sleep(20)
+        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
+        editor.lines = backup
+        await editor.save()
+        for one in table_of(here).visible(here.server.firmware.now):
+            assert one.number >= before[one.name] or one.name in (b"MODE_001", b"CLAMPED"), one.name
+        assert (number(here, "MODE_001"), number(here, "CLAMPED")) == (1, 1)
+        assert (await errors(tree)).startswith(said)
+        assert ("put back" in await errors(tree)) is (bad == "CLAMPED,70")
+        await editor.save()
+        assert await errors(tree) == ""
+
+
 async def test_what_a_program_reads_again_is_its_base() -> None:
     """Others set it, the program saw that, and goes back to what it had read first."""
     async with vehicle("px4-2026", parameters=many(drifting=0)[:-1]) as (here, tree):
@@ -375,6 +404,11 @@ async def test_bad_lines_are_named_and_nothing_is_sent(text: str, said: str) -> 
         await file.release()
         assert said in await errors(tree)
         assert writes(here) == 0
+        await Editor(tree).save("# nothing to set\n", append=True)
+        assert await errors(tree) == ""
+        with pytest.raises(InvalidText):
+            await Editor(tree).save("rubbish\n")
+        assert await errors(tree) != ""
         await Editor(tree).save(good.decode())
         assert await errors(tree) == ""
 
