@@ -19,7 +19,7 @@ import trio._core._run as scheduler
 from hypothesis import HealthCheck, settings
 
 from mavftpfs.cache.pathlocks import PathLocks
-from mavftpfs.session.serversession import ServerSession
+from mavftpfs.session.scheduler import Scheduler, Turn
 
 TIERS = ("unit", "property", "sim", "ops", "conformance", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
@@ -84,23 +84,23 @@ def order_of_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 def nobody_waits_in_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Assert that no task that has the session waits for a path, a node or memory for reads: whoever has one
     of these may wait for the session."""
-    holders: weakref.WeakSet[ServerSession] = weakref.WeakSet()
-    note = ServerSession.note_turn
+    schedulers: weakref.WeakSet[Scheduler] = weakref.WeakSet()
+    hold = Scheduler._hold
 
-    def noting(server: ServerSession, *turn: Any) -> None:
-        holders.add(server)
-        note(server, *turn)
+    def noting(one: Scheduler, turn: Turn | None) -> None:
+        schedulers.add(one)
+        hold(one, turn)
 
     def guarded(wait: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(wait)
         def waiting(*args: Any, **kwargs: Any) -> Any:
-            for server in list(holders):
-                server.assert_no_turn()
+            for one in list(schedulers):
+                one.assert_no_turn()
             return wait(*args, **kwargs)
 
         return waiting
 
-    monkeypatch.setattr(ServerSession, "note_turn", noting)
+    monkeypatch.setattr(Scheduler, "_hold", noting)
     for owner, name in ((PathLocks, "hold"), (trio.Lock, "acquire"), (trio.Semaphore, "acquire")):
         monkeypatch.setattr(owner, name, guarded(getattr(owner, name)))
 

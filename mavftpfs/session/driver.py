@@ -54,7 +54,6 @@ class Driver:
     Attributes:
         peer: the network address that the vehicle is known by; None where the link has only one.
         second: where somebody else says that he is the vehicle, too.
-        on_batch: called after each batch of replies, with the time, by whoever reads or writes a file now.
     """
 
     def __init__(
@@ -75,7 +74,6 @@ class Driver:
         self.second: NetAddress | None = None
         self.last_reply_at = clock()
         self._heard_at = clock()
-        self.on_batch: Callable[[float], None] | None = None
         self._clock = clock
         self._trace = trace
         self._addresses = AddressBook()
@@ -83,7 +81,7 @@ class Driver:
         self._scope: trio.CancelScope | None = None
         self._deadline = inf  # of `pump`
         self._may_send = False
-        self._under_way: dict[Operation, Callable[[], None]] = {}
+        self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
         self._silences = 0
         self._changed = trio.lowlevel.ParkingLot()  # what is under way, or silence, ended
         self._budget = engine.flow.budget
@@ -120,8 +118,9 @@ class Driver:
             self._pass_on(now)
             if identity.heard_at == now and identity.standing is not Standing.STRANGER:
                 self.link.keep_peer()
-            if self.on_batch is not None:
-                self.on_batch(now)
+            for _, on_batch in list(self._under_way.values()):
+                if on_batch is not None:
+                    on_batch(now)
             self.kick()
 
     async def run(self, operation: Operation) -> None:
@@ -139,12 +138,17 @@ class Driver:
         if operation.error is not None:
             raise operation.error
 
-    async def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
+    async def start(
+        self,
+        operation: Operation,
+        on_finished: Callable[[], None],
+        on_batch: Callable[[float], None] | None = None,
+    ) -> None:
         """Begin an operation, once nobody wants silence any more. `on_finished` is called from the pump when
-        it is done or failed."""
+        it is done or failed, and `on_batch` until then after each batch of input, with the time."""
         while self._silences:
             await self._changed.park()
-        self._under_way[operation] = on_finished
+        self._under_way[operation] = on_finished, on_batch
         self.engine.start(operation, self._clock())
         self.kick()
 
@@ -180,11 +184,11 @@ class Driver:
         now = self._clock()
         self._refill(now)
         for operation in self.engine.take_finished():
-            on_finished = self._under_way.pop(operation, None)
+            callbacks = self._under_way.pop(operation, None)
             if isinstance(operation.error, RequestTimeout):
                 self.vehicle.note_timeout()
-            if on_finished is not None:
-                on_finished()
+            if callbacks is not None:
+                callbacks[0]()
                 self._changed.unpark_all()
         due = self.engine.next_deadline()
         deadline = inf if due is None else due

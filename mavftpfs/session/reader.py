@@ -10,19 +10,13 @@ from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.scheduler import RECENT, Future, Scheduler, SessionUser, Turn
-from mavftpfs.session.serversession import OpenSession
+from mavftpfs.session.serversession import REOPENS, OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 
-STALL = 2.0
-"""Seconds without any reply during a read after which the server's session is no longer believed in."""
-
 FIRST_WANT = 0.05
 """Seconds an opened file is kept open for its first read although another file waits."""
-
-REOPENS = 5
-"""How often one want may lose its session without a byte of progress before it fails."""
 
 _OFTEN = 0.25
 
@@ -118,6 +112,10 @@ class FileStream(SessionUser):
         """See SessionUser."""
         return session.path == self.path and not session.writing and self.opened.done
 
+    def on_queued(self) -> None:
+        """See SessionUser."""
+        self._sink.on_queued()
+
     def on_removed(self) -> None:
         """Nothing more of this file can be had, and of its successor nothing may."""
         self._removed = True
@@ -148,13 +146,11 @@ class FileStream(SessionUser):
                 await self._wanted.wait()
                 continue
             try:
-                async with self._scheduler.turn(self, self._sink.on_queued) as turn:
+                async with self._scheduler.turn(self) as turn:
                     await self._open(turn)
                     await self._read(turn)
             except SessionLost as error:  # the next turn goes on at the same offset (promise 5)
-                server.abandon()
-                if error.by_server:
-                    server.doubt.raise_it(str(error))
+                server.lose(error)
                 self._lost += 1
                 if self._lost > REOPENS:
                     self._fail(error)
@@ -201,16 +197,15 @@ class FileStream(SessionUser):
         began, driver, engine = server.clock(), server.driver, server.engine
         server.transfer = self._transfer = transfer
         self._received = 0
-        driver.on_batch = self._on_batch
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = engine.in_flight > 0
         try:
-            await driver.start(transfer, server.wake)
+            await driver.start(transfer, server.wake, self._on_batch)
             while not (transfer.done or transfer.idle or self.closed or server.session is None):
                 rival = turn.rival
                 if rival is not None and self.gives_way(rival, began, server.clock(), engine.rtt):
                     break
-                if server.is_excluded(self.path) or (rival is not None and self._demand.empty):
+                if self._scheduler.is_excluded(self.path) or (rival is not None and self._demand.empty):
                     break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
@@ -219,12 +214,10 @@ class FileStream(SessionUser):
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 driver.kick()
                 await server.sleep(_OFTEN)
-                heard_at = max(driver.last_reply_at, transfer.progress_at)  # `bwlimit=` is no silence
-                limit = max(STALL, 4.0 * (engine.rtt or 0.0))
-                if not transfer.idle and server.clock() - heard_at > limit:
+                if server.is_stalled(transfer):
                     raise SessionLost("no answer for a while during a read", by_server=False)
         finally:
-            server.transfer = self._transfer = driver.on_batch = None
+            server.transfer = self._transfer = None
             if transfer.idle:  # everything wanted has come
                 self._demand, self._ahead = ExtentSet(), ExtentSet()
             driver.cancel(transfer)

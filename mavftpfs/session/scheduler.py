@@ -14,8 +14,9 @@ waited for long goes first all the same: one small file after another slows a co
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
@@ -23,20 +24,11 @@ import trio
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.protocol.reading import ReadToEof
-from mavftpfs.protocol.writing import Pieces, WriteTransfer
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import OPENING, took_session
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
-from mavftpfs.shared.errors import (
-    DataUnproven,
-    LocalProtocolError,
-    MavftpfsError,
-    RequestTimeout,
-    SessionBusy,
-    SessionLost,
-)
+from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
@@ -68,7 +60,6 @@ IDLE_CLOSE = 1.5
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
 
 _MAYBE_OPEN_RETRY = 5.0
-_OFTEN = 0.25
 _KEPT = "the vehicle's only session is kept by another transfer"
 _OTHERS = "another client of the vehicle may have a file open, which is not ended for ours"
 
@@ -107,11 +98,10 @@ class SessionUser:
         writing: its turns are refused while nothing may be written.
     """
 
-    writing = False
-
-    def __init__(self, path: bytes, asked_at: float | None = None) -> None:
+    def __init__(self, path: bytes, asked_at: float | None = None, *, writing: bool = False) -> None:
         self.path = path
         self.asked_at = asked_at
+        self.writing = writing
         self._used = 0.0
         self._until = 0.0
 
@@ -128,6 +118,9 @@ class SessionUser:
     def goes_on(self, session: OpenSession) -> bool:
         """Return whether it uses what is open and opens nothing."""
         return False
+
+    def on_queued(self) -> None:
+        """It waits, and the vehicle answered in another user's turn, so this is no silence of the vehicle."""
 
     def on_removed(self) -> None:
         """The file of its path was removed or replaced."""
@@ -169,21 +162,20 @@ class Turn:
     """The session, as long as it is one user's; before that, the user's place in the queue.
 
     Attributes:
-        task: the user's. called: it has the session, or `error` is why not. ended: it gave it back, or left
-            the queue. patience: how long it waits. on_moved: called when the vehicle answered in another's
-            turn.
+        user, task: whose it is. granted: the wait for it; it fails where the user cannot have it. ended: it
+            was given back. patience: how long the user waits.
     """
 
-    def __init__(self, scheduler: Scheduler, on_moved: Callable[[], None]) -> None:
+    def __init__(self, scheduler: Scheduler, user: SessionUser) -> None:
+        self.user = user
         self.task = trio.lowlevel.current_task()
-        self.error: MavftpfsError | None = None
-        self.called, self.ended = trio.Event(), trio.Event()
+        self.granted, self.ended = Future(), trio.Event()
         self.patience = trio.CancelScope()
-        self.on_moved = on_moved
         self._scheduler = scheduler
 
     async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
         """Close what is open and open another file; raises what ServerSession.open does."""
+        assert self._scheduler.held is self
         return await self._scheduler.server.open(path, opcode)
 
     @property
@@ -191,6 +183,17 @@ class Turn:
         """How much the lightest user that waits used lately, in seconds; None if nobody waits."""
         now = self._scheduler.clock()
         return min((user.used(now) for user in self._scheduler.waiting(now)), default=None)
+
+
+@dataclass(eq=False)
+class _Excluded:
+    """Paths that are about to change. below: with all that lies below the first."""
+
+    paths: tuple[bytes, ...]
+    below: bool
+
+    def covers(self, path: bytes) -> bool:
+        return path in self.paths or (self.below and path.startswith(self.paths[0].rstrip(b"/") + b"/"))
 
 
 class Scheduler:
@@ -201,7 +204,7 @@ class Scheduler:
 
     Attributes:
         users: the readers and uploads there are. gone: readers that were closed, with the time when.
-        serving: set once `serve` runs.
+        held: the turn that was granted and is not over. serving: set once `serve` runs.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
 
@@ -222,9 +225,12 @@ class Scheduler:
         self.users: dict[SessionUser, None] = {}
         self.serving = trio.Event()
         self.gone: deque[tuple[float, SessionUser]] = deque()
+        self.held: Turn | None = None
         self._driver = driver
+        self._op_deadline = op_deadline
         self._patience = 1.02 * op_deadline  # if no request is answered, that is news before
         self._queue: dict[SessionUser, Turn] = {}
+        self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
         self._used_at = clock()
         self._touched_at = -inf
@@ -247,51 +253,53 @@ class Scheduler:
         """If it waits for a turn, raise an error there."""
         turn = self._queue.pop(user, None)
         if turn is not None:
-            turn.error = error
-            turn.called.set()
+            turn.granted.end(error)
         self.server.wake()
 
     def renew(self, user: SessionUser) -> None:
         """From now on somebody waits for it, and for no longer than that."""
         user.asked_at = self.clock()
-        self._be_patient(user)
+        if user in self._queue:
+            self._be_patient(self._queue[user])
 
-    def _be_patient(self, user: SessionUser) -> None:
-        if user.awaited and user in self._queue:
-            self._queue[user].patience.deadline = trio.current_time() + self._patience
+    def _be_patient(self, turn: Turn) -> None:
+        if turn.user.awaited:
+            turn.patience.deadline = trio.current_time() + self._patience
 
     @asynccontextmanager
-    async def turn(
-        self, user: SessionUser, on_moved: Callable[[], None] = lambda: None
-    ) -> AsyncIterator[Turn]:
+    async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
         """Wait for the session, and have it for the length of the body.
 
         The body must not wait for a path, a node or memory for reads: others that have them may wait for the
         session. If it is cancelled while it opens or closes, something may be open, which `serve` closes.
 
-        on_moved: called while it waits, when the vehicle answered in another user's turn.
-
         Raises:
             VehicleLost, Armed: it cannot be used now. RequestTimeout, SessionBusy: others keep it.
         """
-        turn = self._queue[user] = Turn(self, on_moved)
+        turn = self._queue[user] = Turn(self, user)
         self.server.wake()
         try:
-            self._be_patient(user)
+            self._be_patient(turn)
             with turn.patience:
-                await turn.called.wait()
-            if not turn.called.is_set():
+                await turn.granted.wait()
+            if self.held is not turn:
                 raise SessionBusy(_OTHERS) if self.clock() < self.held_until else RequestTimeout(_KEPT)
-            if turn.error is not None:
-                raise turn.error
             self.server.vehicle.require(self.clock(), writing=user.writing)
             yield turn
         finally:
             if self._queue.get(user) is turn:
                 del self._queue[user]
-            elif turn.error is None:
-                self.server.note_turn()
+            if self.held is turn:
+                self._hold(None)
             turn.ended.set()
+
+    def _hold(self, turn: Turn | None) -> None:
+        self.held = turn
+        self.server.changed.unpark_all()
+
+    def assert_no_turn(self) -> None:
+        """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
+        assert self.held is None or self.held.task is not trio.lowlevel.current_task(), "not in a turn"
 
     def waiting(self, now: float) -> list[SessionUser]:
         """Return the users that somebody waits for, and that could use the session now."""
@@ -314,7 +322,7 @@ class Scheduler:
 
     def _may_use(self, user: SessionUser, now: float) -> bool:
         """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
-        if self.server.is_excluded(user.path):
+        if self.is_excluded(user.path):
             return False
         session = self.server.session
         return now >= self.held_until or (session is not None and user.goes_on(session))
@@ -325,67 +333,53 @@ class Scheduler:
         several = self._driver.engine.traits.several_sessions
         return -inf if several else self.server.others.file_open_until
 
-    # --- what others ask for
+    # --- paths that are about to change
+
+    def is_excluded(self, path: bytes) -> bool:
+        """Return whether somebody changes this path now."""
+        return bool(self._excluded) and any(excluded.covers(path) for excluded in self._excluded)
 
     @asynccontextmanager
-    async def opened(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> AsyncIterator[OpenSession]:
-        """Have a file open for the length of the body, in a turn; then terminate.
+    async def excluded(self, *paths: bytes, below: bool = False) -> AsyncIterator[None]:
+        """Keep the session off paths for the length of the body; below: off all below the first, too.
 
         Raises:
-            What `turn`, opening or closing fail with.
+            RequestTimeout: it could not be closed in time.
         """
-        user = SessionUser(path, self.clock())
-        user.writing = opcode != Opcode.OPEN_FILE_RO
-        self.server.vehicle.require(self.clock(), writing=user.writing)
-        async with self.turn(user) as turn:
-            yield await turn.open(path, opcode)
-            await self.server.close()
-
-    async def read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read a file to EOF whatever its size claims; once more if the session was lost or in doubt.
-
-        Raises:
-            DataUnproven: another FTP client may have used the session each time, so that the bytes may be
-                another file's. Else as `opened`.
-        """
+        self.assert_no_turn()
+        excluded, server = _Excluded(paths, below), self.server
+        self._excluded.append(excluded)
         try:
-            return await self._read_whole(path, limit)
-        except (SessionLost, DataUnproven):
-            return await self._read_whole(path, limit)
+            with trio.move_on_after(self._op_deadline) as scope:
+                while any(map(excluded.covers, self._used_paths())):
+                    server.wake()
+                    await server.changed.park()
+            if scope.cancelled_caught:
+                raise RequestTimeout("our own session on these paths could not be closed")
+            yield
+        finally:
+            self._excluded.remove(excluded)
+            server.wake()
 
-    async def _read_whole(self, path: bytes, limit: int) -> bytes:
-        async with self.opened(path) as session:
-            began = self.clock()
-            operation = ReadToEof(session.id, self.read_chunks.size, limit)
-            await self._driver.run(operation)
-            if self.server.session is not session:
-                raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
-            if self.doubt.reads_arose_since(began):
-                raise DataUnproven(f"another FTP client was active while {path!r} was read")
-            return operation.data
+    def _used_paths(self) -> list[bytes]:
+        """Return where something is open, may be open, or may be opened at any time."""
+        used = list(self.server.maybe_open.values())
+        if self.server.session is not None:
+            used.append(self.server.session.path)
+        if self.held is not None:
+            used.append(self.held.user.path)
+        return used
 
-    async def write_whole(
-        self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
-    ) -> None:
-        """See cache.remote.VehicleStore."""
-        server, size = self.server, min(self.read_chunks.size, self.write_chunks.size)
-        async with self.opened(path, Opcode.CREATE_FILE) as session:
-            transfer = WriteTransfer(
-                session.id, Pieces(pieces, progress), ChunkSize(size), in_flight=1, on_starved=server.wake
-            )
-            try:
-                await self._driver.start(transfer, server.wake)
-                while not transfer.done and not transfer.starved:
-                    if server.session is not session:
-                        raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
-                    server.vehicle.require(self.clock(), writing=True)
-                    self._driver.kick()
-                    await server.sleep(_OFTEN)
-                if transfer.error is not None:
-                    raise transfer.error
-            finally:
-                transfer.finish()
-                self._driver.cancel(transfer)
+    async def _close_excluded(self) -> None:
+        """Close what is open, or may be open, where a path is about to change. The task that waits for that
+        is told of a failure by its time-out."""
+        if not self._excluded:
+            return
+        server = self.server
+        if server.session is not None and self.is_excluded(server.session.path):
+            await server.close_quietly()
+        if any(map(self.is_excluded, server.maybe_open.values())):
+            await server.close_maybe_open()
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path. What
@@ -449,7 +443,7 @@ class Scheduler:
             self.serving.set()
             while True:
                 await trio.lowlevel.checkpoint()
-                await server.close_excluded()
+                await self._close_excluded()
                 user, session = self.first(), server.session
                 if user is None:
                     await self._idle(self.clock())
@@ -462,22 +456,22 @@ class Scheduler:
         """Give it the session, and wait until it is given back. If the vehicle answered meanwhile, those that
         wait for a later turn have not waited in vain."""
         turn, began = self._queue.pop(user), self.clock()
-        self.server.note_turn(turn.task, user.path)
-        turn.called.set()
+        self._hold(turn)
+        turn.granted.end()
         await turn.ended.wait()
         self._used_at = self.clock()
         if self._driver.last_reply_at >= began:
-            for user, other in list(self._queue.items()):
-                self._be_patient(user)
-                other.on_moved()
+            for user, other in self._queue.items():
+                self._be_patient(other)
+                user.on_queued()
 
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
         server, news_in = self.server, inf
         if self._queue and now < self.held_until:
             await server.find_out_sessions()
-            for turn in self._queue.values():
-                turn.on_moved()
+            for user in self._queue:
+                user.on_queued()
             news_in = max(0.0, self.held_until - now)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.

@@ -7,9 +7,7 @@ Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (Ar
 soon keeps a stale session alive. So there is one list of remedies: close what may be ours, be silent, reset
 if nobody else was heard. After those it is busy.
 
-Whoever is about to change a path excludes the session from it: the session is closed if it is open there,
-and stays off that path until the change was made. Requests that carry a path and need no session (`ask`) run
-beside it, and carry its id (docs/servers.md 1).
+Requests that carry a path and need no session (`ask`) run beside it, and carry its id (docs/servers.md 1).
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import LEFT_OPEN, STAYS_ITS_OWN, OtherClients
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
 from mavftpfs.shared.model import wire_path
 
 SILENCE_ARDUPILOT = 3.5
@@ -41,6 +39,12 @@ SILENCE_PX4 = 10.5
 
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate that is sent for somebody else's sake."""
+
+STALL = 2.0
+"""Seconds without a reply, while a file is read or written, after which its session is not believed in."""
+
+REOPENS = 5
+"""How often a reader or an upload may lose the session without progress before it fails."""
 
 _LOST_ACKS = 4
 """How often an open is tried again whose ACKs are lost one after the other."""
@@ -100,17 +104,6 @@ class OpenSession:
     writing: bool = False
     seq: int = -1
     resent: bool = False
-
-
-@dataclass(eq=False)
-class _Excluded:
-    """Paths that are about to change. below: with all that lies below the first."""
-
-    paths: tuple[bytes, ...]
-    below: bool
-
-    def covers(self, path: bytes) -> bool:
-        return path in self.paths or (self.below and path.startswith(self.paths[0].rstrip(b"/") + b"/"))
 
 
 @dataclass
@@ -179,6 +172,7 @@ class ServerSession:
         maybe_open: files that may be open over there by our doing, by session id.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
+        changed: where tasks park until the state is another one.
     """
 
     def __init__(
@@ -202,11 +196,8 @@ class ServerSession:
         self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
-        self._holder: trio.lowlevel.Task | None = None  # the task that has the turn, and the path it is for
-        self._turn_on: bytes | None = None
-        self._excluded: list[_Excluded] = []
         self._news = trio.Event()
-        self._changed = trio.lowlevel.ParkingLot()  # the state did
+        self.changed = trio.lowlevel.ParkingLot()
 
     def _enter(self, state: State, session: OpenSession | None = None) -> None:
         """Go on to a state; to CLOSED only if nothing may be open by our doing, else to MAYBE_OPEN."""
@@ -218,7 +209,7 @@ class ServerSession:
         assert state in SESSION_NEXT[self.state], f"{self.state} does not become {state}"
         assert (session is not None) == (state is State.OPEN)
         self.state, self.session = state, session
-        self._changed.unpark_all()
+        self.changed.unpark_all()
 
     # --- waiting
 
@@ -371,6 +362,23 @@ class ServerSession:
             self._enter(State.MAYBE_OPEN)
         self.wake()
 
+    def lose(self, lost: SessionLost) -> None:
+        """Who used it found it lost: abandon it, and where the server ended it, doubt what was read."""
+        self.abandon()
+        if lost.by_server:
+            self.doubt.raise_it(str(lost))
+
+    def require_open(self, session: OpenSession) -> None:
+        """Raise SessionLost unless what was opened then is still open."""
+        if self.session is not session:
+            raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
+
+    def is_stalled(self, transfer: Operation) -> bool:
+        """Return whether answers to a transfer are due, and none of any kind came for a while."""
+        # Requests of the transfer that wait for `bwlimit=` are no silence.
+        heard_at = max(self.driver.last_reply_at, transfer.progress_at)
+        return not transfer.idle and self.clock() - heard_at > max(STALL, 4.0 * (self.engine.rtt or 0.0))
+
     # --- requests beside the session, and what to do when it is taken
 
     async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
@@ -461,58 +469,3 @@ class ServerSession:
 
     def _others_heard(self) -> bool:
         return self.vehicle.foreign_client(self.clock())
-
-    # --- paths that are about to change
-
-    def assert_no_turn(self) -> None:
-        """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
-        assert self._holder is not trio.lowlevel.current_task(), "not in a turn"
-
-    def note_turn(self, task: trio.lowlevel.Task | None = None, path: bytes | None = None) -> None:
-        """A user of this path has the session now, and may open it at any time; or none has."""
-        self._holder, self._turn_on = task, path
-        self._changed.unpark_all()
-
-    def is_excluded(self, path: bytes) -> bool:
-        """Return whether somebody changes this path now."""
-        return bool(self._excluded) and any(excluded.covers(path) for excluded in self._excluded)
-
-    @asynccontextmanager
-    async def excluded(self, *paths: bytes, below: bool = False) -> AsyncIterator[None]:
-        """Keep the session off paths for the length of the body; below: off all below the first, too.
-
-        Raises:
-            RequestTimeout: it could not be closed in time.
-        """
-        self.assert_no_turn()
-        excluded = _Excluded(paths, below)
-        self._excluded.append(excluded)
-        try:
-            with trio.move_on_after(self.op_deadline) as scope:
-                while True:
-                    used = list(self.maybe_open.values())
-                    if self.session is not None:
-                        used.append(self.session.path)
-                    if self._turn_on is not None:
-                        used.append(self._turn_on)
-                    if not any(map(excluded.covers, used)):
-                        break
-                    self.wake()
-                    await self._changed.park()
-            if scope.cancelled_caught:
-                raise RequestTimeout("our own session on these paths could not be closed")
-            yield
-        finally:
-            self._excluded.remove(excluded)
-            self.wake()
-
-    async def close_excluded(self) -> None:
-        """Close what is open, or may be open, where a path is about to change. Who waits for that is told of
-        a failure by its time-out."""
-        if not self._excluded:
-            return
-        if self.session is not None and self.is_excluded(self.session.path):
-            await self.close_quietly()
-        for path in list(self.maybe_open.values()):
-            if self.is_excluded(path):
-                await self.close_maybe_open()

@@ -3,7 +3,7 @@
 Did that change happen? A request whose answer may have been lost can be carried out twice, and the second
 answer is then a refusal (docs/servers.md 14.4). Such a refusal, and a silence, are never interpreted: a
 listing tells what became of it. While there is doubt (session.doubt) the network may do the same to a request
-that we sent once. Then names rest between two changes: `_rest` is the one place that waits for late copies.
+that we sent once. Then names rest between two changes: `settle` is the one place that waits for late copies.
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ from math import inf
 import trio
 
 from mavftpfs.cache.remote import ReadSink
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.reading import ReadToEof
+from mavftpfs.protocol.writing import Pieces, WriteTransfer
 from mavftpfs.session.reader import FileStream
-from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.scheduler import Scheduler, SessionUser
+from mavftpfs.session.serversession import OpenSession
 from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errors import (
     Armed,
+    DataUnproven,
     FtpNak,
     MavftpfsError,
     NotSupported,
@@ -31,6 +36,7 @@ from mavftpfs.shared.errors import (
     PathTooLong,
     RemoteProtocolError,
     RequestTimeout,
+    SessionLost,
 )
 from mavftpfs.shared.model import (
     DOT,
@@ -67,6 +73,9 @@ COPY_RATE = 100_000.0
 VERIFY_LIMIT = 4.0
 """Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
 an answer within `op_deadline`, and this comes after it."""
+
+_OFTEN = 0.25
+"""Seconds after which a transfer looks up at the latest."""
 
 SWEEPS = 3
 """How often a directory is listed at most because names of it changed meanwhile."""
@@ -108,7 +117,6 @@ class Store:
     def __init__(self, scheduler: Scheduler) -> None:
         self.traits = scheduler.server.engine.traits
         self.in_doubt = scheduler.doubt.is_active
-        self.read_whole = scheduler.read_whole
         self._scheduler = scheduler
         self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
@@ -172,16 +180,46 @@ class Store:
     async def stat_size(self, path: bytes) -> int:
         """Open a file to know its size (see RemoteStore)."""
         wire_path(path)
-        async with self._scheduler.opened(path) as session:
+        async with self._opened(path) as session:
             size = session.size
         if size is None:
             raise RemoteProtocolError("the vehicle's open reply holds no size")
         return size
 
+    async def read_whole(self, path: bytes, limit: int) -> bytes:
+        """Read an `@` file to its end (see RemoteStore); once more if the session was lost or in doubt."""
+        try:
+            return await self._read_whole(path, limit)
+        except (SessionLost, DataUnproven):
+            return await self._read_whole(path, limit)
+
+    async def _read_whole(self, path: bytes, limit: int) -> bytes:
+        async with self._opened(path) as session:
+            began = self._clock()
+            operation = ReadToEof(session.id, self._scheduler.read_chunks.size, limit)
+            await self._server.driver.run(operation)
+            self._server.require_open(session)
+            if self._scheduler.doubt.reads_arose_since(began):
+                raise DataUnproven(f"another FTP client was active while {path!r} was read")
+            return operation.data
+
+    @asynccontextmanager
+    async def _opened(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> AsyncIterator[OpenSession]:
+        """Have a file open for the length of the body, in a turn of the caller's task; then terminate.
+
+        Raises:
+            What Scheduler.turn, opening or closing fail with.
+        """
+        user = SessionUser(path, self._clock(), writing=opcode != Opcode.OPEN_FILE_RO)
+        self._vehicle.require(self._clock(), writing=user.writing)
+        async with self._scheduler.turn(user) as turn:
+            yield await turn.open(path, opcode)
+            await self._server.close()
+
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         """Ask for a checksum (see RemoteStore); size: of the file, if known: the question is not repeated
         before so much can have been read."""
-        self._server.assert_no_turn()
+        self._scheduler.assert_no_turn()
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
         server_time, patience = CRC_TIME, CRC_PATIENCE
@@ -219,17 +257,35 @@ class Store:
         """Write an `@` file (see VehicleStore)."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self._rest(path)
+        await self.settle(path)
         try:
-            await self._scheduler.write_whole(path, pieces, progress)
+            async with self._opened(path, Opcode.CREATE_FILE) as session:
+                await self._write_in_order(session, Pieces(pieces, progress))
         finally:
             self._late.on_changed(path, self._clock())
+
+    async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
+        server, driver = self._server, self._server.driver
+        chunks = ChunkSize(min(self._scheduler.read_chunks.size, self._scheduler.write_chunks.size))
+        transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1, on_starved=server.wake)
+        try:
+            await driver.start(transfer, server.wake)
+            while not transfer.done and not transfer.starved:
+                server.require_open(session)
+                self._vehicle.require(self._clock(), writing=True)
+                driver.kick()
+                await server.sleep(_OFTEN)
+            if transfer.error is not None:
+                raise transfer.error
+        finally:
+            transfer.finish()
+            driver.cancel(transfer)
 
     async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self._rest(path)
+        await self.settle(path)
         upload = Upload(path, source, self._scheduler)
         self._scheduler.add(upload, upload.run)
         return upload
@@ -238,13 +294,13 @@ class Store:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self._rest(path)
-        async with self._scheduler.opened(path, Opcode.CREATE_FILE):
+        await self.settle(path)
+        async with self._opened(path, Opcode.CREATE_FILE):
             pass
 
     async def settle(self, path: bytes) -> None:
-        """Wait as long as a copy of the CreateFile of this name may come (see VehicleStore)."""
-        await self._rest(path)
+        """Wait until a late copy of an earlier request does this name no harm (session.doubt: LateCopies)."""
+        await trio.sleep(self._late.rest(path, self._clock()))
 
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
@@ -290,9 +346,9 @@ class Store:
         """
         self._vehicle.require(self._clock(), writing=not in_flight)
         with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
-            async with self._server.excluded(*paths, below=below):
+            async with self._scheduler.excluded(*paths, below=below):
                 for path in paths:
-                    await self._rest(path)
+                    await self.settle(path)
                 # closing our session may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
                 try:
@@ -302,10 +358,6 @@ class Store:
                         self._late.on_changed(path, self._clock())
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
-
-    async def _rest(self, path: bytes) -> None:
-        """Wait until the name may be changed (session.doubt: LateCopies)."""
-        await trio.sleep(self._late.rest(path, self._clock()))
 
     # --- did that change happen?
 

@@ -23,7 +23,7 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
-from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession
+from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
@@ -41,9 +41,6 @@ from mavftpfs.shared.sending import SendBuffer
 LONGEST_BACKOFF = 30.0
 """Most seconds between two attempts after a failure of the link."""
 
-REOPENS = 5
-"""How often the session may be lost without getting further in the file before the upload fails."""
-
 STARVE = 1.5
 """Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
 
@@ -53,9 +50,6 @@ BRIEF_STARVE = 0.05
 PATIENCE = 10.0
 """Seconds of the session after which one that cannot be interrupted, and has nothing to send at the moment,
 lets go of it for who waits: a log that trickles would keep it for ever."""
-
-STALL = 2.0
-"""Seconds without a reply after which a session that can be resumed is closed and opened anew."""
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
@@ -71,7 +65,6 @@ _REFUSED_ARM = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 class Stop(Enum):
     """Why an upload lets go of the session."""
 
-    FINISHED = "finished"
     STARVED = "starved"
     YIELD = "yield"
     DOUBT = "doubt"
@@ -90,10 +83,8 @@ class Upload(SessionUser):
         begun, resent: see cache.remote.Upload.
     """
 
-    writing = True
-
     def __init__(self, path: bytes, source: SendBuffer, scheduler: Scheduler) -> None:
-        super().__init__(path)
+        super().__init__(path, writing=True)
         self._source = source
         self.begun = self.resent = False
         self._scheduler = scheduler
@@ -220,12 +211,14 @@ class Upload(SessionUser):
         """Have a turn."""
         began = self._clock()
         try:
-            session = await self._open(turn)
-            stop = await self._write(turn, session)
-            # All that was given by now is in the file that is closed next; what comes later is not.
-            finishers = list(self._finishers)
-            await self._close(stop)
-            if stop in (Stop.FINISHED, Stop.STARVED):
+            try:
+                stop = await self._write(turn, await self._open(turn))
+                # All that was given by now is in the file that is closed next; what comes later is not.
+                finishers = list(self._finishers)
+                await self._close(stop)
+            finally:
+                self._end_transfer()
+            if stop is Stop.STARVED:
                 self._complete(finishers)
         except SessionLost as lost:  # begin again from what is proven, a bounded number of times
             self._on_lost(lost)
@@ -233,7 +226,6 @@ class Upload(SessionUser):
             await self._clean_up(error)
             raise
         finally:
-            self._end_transfer()
             self.on_turn(began, self._clock())
             self.asked_at = None
 
@@ -243,12 +235,10 @@ class Upload(SessionUser):
         Raises:
             MavftpfsError: it was lost again and again, without getting further.
         """
-        self._server.abandon()
-        if lost.by_server:
-            self._server.doubt.raise_it(str(lost))
+        self._server.lose(lost)
+        if self._source.reached > self._furthest:
+            self._furthest, self._failures = self._source.reached, 0
         self._roll_back()
-        if self._source.furthest > self._furthest:
-            self._furthest, self._failures = self._source.furthest, 0
         self._failures += 1
         if self._failures > REOPENS:
             raise lost.__cause__ if isinstance(lost.__cause__, MavftpfsError) else lost
@@ -350,12 +340,10 @@ class Upload(SessionUser):
                     session.id, self._source, chunks, in_flight=most, on_starved=server.wake
                 )
                 self._transfer = server.transfer = transfer
-                self._driver.on_batch = self._on_batch
                 try:
-                    await self._driver.start(transfer, server.wake)
+                    await self._driver.start(transfer, server.wake, self._on_batch)
                     stop = await self._watch(turn, session, transfer)
                 finally:
-                    self._driver.on_batch = None
                     if not transfer.trailing:
                         self._end_transfer()
                 if transfer.acked_bytes and rearmed:
@@ -386,14 +374,12 @@ class Upload(SessionUser):
         stop: Stop | None = None
         fed_at = clock()
         while not transfer.done:
-            if server.session is not session:
-                raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
+            server.require_open(session)
             if not transfer.starved:
                 fed_at = clock()
             rival = turn.rival
             stop = stop or self._reason_to_stop(session, transfer, fed_at, rival)
-            limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
-            if not transfer.idle and clock() - max(driver.last_reply_at, transfer.progress_at) > limit:
+            if server.is_stalled(transfer):
                 # The session may be somebody else's (servers.md 14.9). Where closing would cost the whole
                 # file, only if there is somebody else; the server tells the rest.
                 rivals = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
@@ -423,12 +409,12 @@ class Upload(SessionUser):
             return Stop.ABORTED
         if not self._vehicle.may_write:
             return Stop.ARMED
-        if self._server.is_excluded(self.path):
+        if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
         now, resumable = self._clock(), self._resumable()
         if transfer.starved:
             if self.awaited:
-                return Stop.FINISHED
+                return Stop.STARVED
             patience = STARVE
             if rival is not None and resumable:
                 patience = BRIEF_STARVE
@@ -449,7 +435,7 @@ class Upload(SessionUser):
         paths cause refusals, the answers are waited for: that alone sets it right."""
         if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
             return False
-        if self._engine.traits.paths_disarm or self._server.is_excluded(self.path):
+        if self._engine.traits.paths_disarm or self._scheduler.is_excluded(self.path):
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
@@ -521,7 +507,6 @@ class Upload(SessionUser):
 
     async def _clean_up(self, error: MavftpfsError) -> None:
         """Close what can be closed, and roll back what is not proven."""
-        self._end_transfer()
         written, session = False, self._server.session  # None where it failed before it got it
         if isinstance(error, REFUSALS) and session is not None and session.writing:
             with suppress(MavftpfsError):  # another failure is no news
@@ -534,7 +519,6 @@ class Upload(SessionUser):
             self._roll_back()
 
     def _roll_back(self) -> None:
-        self._end_transfer()
         self._source.roll_back(
             everything=self._engine.traits.wo_truncates is not False or not self._source.closed
         )

@@ -31,7 +31,6 @@ class SendBuffer:
         closed: a Terminate was ACKed, so the card has the proven bytes.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
         reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
-        furthest: the largest value of `reached` before the last rollback.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
     """
 
@@ -47,7 +46,7 @@ class SendBuffer:
         self._progress = progress
         self._read = read
         self._handed_out = 0  # one past the highest byte
-        self.reached = self.furthest = 0
+        self.reached = 0
         self._failed: MavftpfsError | None = None
         self._ahead = (0, b"")
 
@@ -123,7 +122,6 @@ class SendBuffer:
     def roll_back(self, *, everything: bool) -> None:
         """The session was lost. What was ACKed since the checkpoint is sent again; or everything, if
         reopening emptied the file."""
-        self.furthest = max(self.furthest, self.reached)
         self.acked = ExtentSet()
         if everything:
             self.closed = False

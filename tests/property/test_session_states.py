@@ -19,6 +19,7 @@ from mavftpfs.protocol.operations import OpenRequest, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.serversession import SESSION_NEXT, ServerSession, State
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
@@ -63,18 +64,19 @@ def test_all_goes_by_the_table(acts: list[tuple[str, list[str | int]]]) -> None:
 
 async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     driver = Answering([])
-    doubt = Doubt(trio.current_time)
-    server = ServerSession(cast(Driver, driver), doubt, trio.current_time, 10.0)
+    scheduler = Scheduler(cast(Driver, driver), clock=trio.current_time, op_deadline=10.0)
+    server = scheduler.server
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):
-            await _do(server, act, b"/f%d" % (number % 3))
+            await _do(scheduler, act, b"/f%d" % (number % 3))
         assert (server.session is not None) == (server.state is State.OPEN)
         if server.state in (State.CLOSED, State.MAYBE_OPEN):
             assert bool(server.maybe_open) == (server.state is State.MAYBE_OPEN)
 
 
-async def _do(server: ServerSession, act: str, path: bytes) -> None:
+async def _do(scheduler: Scheduler, act: str, path: bytes) -> None:
+    server = scheduler.server
     match act:
         case "read":
             await server.open(path)
@@ -91,15 +93,16 @@ async def _do(server: ServerSession, act: str, path: bytes) -> None:
             server.engine.forget_server()
         case "exclude":
             async with trio.open_nursery() as nursery:
-                nursery.start_soon(_change, server, path)
+                nursery.start_soon(_change, scheduler, path)
                 await trio.sleep(1)
-                await server.close_excluded()
+                await scheduler._close_excluded()
                 nursery.cancel_scope.cancel()
 
 
-async def _change(server: ServerSession, path: bytes) -> None:
-    async with server.excluded(path):
-        assert server.session is None or server.session.path != path
+async def _change(scheduler: Scheduler, path: bytes) -> None:
+    async with scheduler.excluded(path):
+        session = scheduler.server.session
+        assert session is None or session.path != path
 
 
 def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:

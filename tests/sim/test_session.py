@@ -18,9 +18,8 @@ from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import Opcode, decode_request, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN, OtherClients
-from mavftpfs.session.reader import REOPENS, STALL
-from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.serversession import SILENCE_ARDUPILOT
+from mavftpfs.session.scheduler import Scheduler, SessionUser
+from mavftpfs.session.serversession import REOPENS, SILENCE_ARDUPILOT, STALL
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
     FileChanged,
@@ -217,7 +216,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     monkeypatch.setattr(Scheduler, "first", counted)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
-        async with scheduler.server.excluded(b"/changing"):
+        async with scheduler.excluded(b"/changing"):
             nursery.start_soon(connection.store.stat_size, b"/changing")
             await trio.sleep(0.1)
             assert await read_file(connection, b"/big") == content(20_000)
@@ -247,7 +246,8 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn(autoju
     """It would wait for itself: a change waits until the session is off its path."""
     here = world("px4", LINK, f=DATA)
     async with here.connection() as connection:
-        async with connection.scheduler.opened(b"/d/f"):
+        async with connection.scheduler.turn(SessionUser(b"/d/f", trio.current_time())) as turn:
+            await turn.open(b"/d/f")
             with pytest.raises(AssertionError):
                 await connection.store.crc32(b"/d/f")
             with pytest.raises(AssertionError):
