@@ -1,7 +1,7 @@
 """Which network address each MAVLink sender is known by. Layer: link; pure.
 
-Anybody can send to a UDP port and say that he is the vehicle. So a sender is known by the address that it was
-first heard at, and counts from there only. Another address may take its place after 5 s of silence: the
+Any program can send to a UDP port and claim to be the vehicle. So a sender is known by the address at which
+it was first heard, and counts only from there. Another address may take its place after 5 s of silence: the
 vehicle's router restarted, or it comes over its other link.
 """
 

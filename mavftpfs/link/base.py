@@ -34,8 +34,8 @@ class LinkStats:
 
 @dataclass(frozen=True, slots=True)
 class Seat:
-    """Our place on a port that several of ours share: our MAVLink address there, and the link id that our
-    signatures carry, so that the times in them do not collide."""
+    """Our place on a shared port: our MAVLink address there, and the link id in our signatures, which keeps
+    their times apart from those of others."""
 
     own: Address
     number: int
@@ -45,7 +45,7 @@ class Link(Protocol):
     """A byte or datagram pipe.
 
     Attributes:
-        seat: our place there, where that is not ours to choose; it may change while the link is reopened.
+        seat: our place on a shared port, None on a port of our own. It may change when the link is reopened.
     """
 
     stats: LinkStats
@@ -98,11 +98,12 @@ class Link(Protocol):
         ...
 
     def keep_peer(self) -> None:
-        """The peer that is served was heard just now: its connection keeps its place some seconds more."""
+        """Note that the peer that is served was heard just now. For some seconds no new connection takes its
+        place."""
         ...
 
     def focus(self, system: int) -> None:
-        """From now on only one system matters: a port that is shared leaves out what concerns others only."""
+        """From now on only one system matters: a shared port leaves out frames that concern only others."""
         ...
 
     def descriptors(self) -> list[int]:

@@ -21,7 +21,7 @@ EVERYBODY = Address(0, 0)
 class Frame(NamedTuple):
     """One frame.
 
-    target: EVERYBODY where it names none. crc_fits: its CRC fits.
+    target: EVERYBODY where it names none. crc_fits: its CRC is known, and is right.
     """
 
     data: bytes
@@ -60,7 +60,8 @@ class Splitter:
         self.waiting = False
 
     def give_up(self) -> list[Frame]:
-        """The stream fell silent: what no byte behind proved counts, and the rest was no frame."""
+        """The stream fell silent. A last frame that only lacked the byte behind it counts; the rest was no
+        frame."""
         out: list[Frame] = []
         while self._tail:
             out += self._split(self._tail, stream=False)

@@ -9,8 +9,8 @@ check of the message's layout too. When the CRC does not fit, or cannot be known
 the message, the byte behind the claimed end decides: if a frame begins there, the claimed frame is
 skipped whole (it was corrupted, or foreign), else its first byte was garbage and the search goes on one
 byte further. Skipping whole matters: the payload may be a piece of a recorded flight, whose old
-heartbeats must not be taken for live ones. The verdict depends on the bytes alone, never on how they
-were split. What waits for its rest is at most one frame.
+heartbeats must not be taken for live ones. The verdict depends on the bytes alone, never on how they were
+split. At most one frame waits for its rest.
 
 A damaged length makes the search wait for up to 280 bytes, which on a link with nothing but heartbeats takes
 many seconds. So the reader of a stream says when it fell silent (`give_up`): frames come in one piece.
@@ -82,7 +82,7 @@ def _target_offsets() -> dict[int, tuple[int, int | None]]:
 
 
 TARGETS = _target_offsets()
-"""Of each message that is for somebody: where in its payload the system and the component stand."""
+"""For each message that names a target: where its payload has the target's system and component."""
 
 
 def is_known(message_id: int) -> bool:
@@ -141,8 +141,8 @@ def frame_at(
 
 @dataclass(slots=True)
 class FramerStats:
-    """Plain sums. bad_signature also counts unsigned frames refused, and bad_time those of them that the
-    right key signed, but too long ago. garbage_bytes: in no frame."""
+    """Plain sums. bad_signature also counts unsigned frames that were refused. bad_time: frames among these
+    that the right key signed, but too long ago. garbage_bytes: in no frame."""
 
     bad_crc: int = 0
     bad_signature: int = 0
@@ -155,7 +155,7 @@ class Framer:
 
     Args:
         source: our address in the frames we send.
-        stream: whether `feed` gets pieces of a stream, and no datagrams.
+        stream: whether `feed` gets pieces of a stream instead of datagrams.
         signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
             or the vehicle refuses us.
@@ -241,7 +241,8 @@ class Framer:
         self.waiting = False
 
     def give_up(self) -> list[Message]:
-        """The stream fell silent in mid-frame: there was none; return what is found behind its beginning."""
+        """The stream fell silent within a frame, so that was no frame. Return what is found behind its first
+        byte."""
         out: list[Message] = []
         self.stream = False  # as at the end of a datagram: nothing more decides
         try:

@@ -1,4 +1,4 @@
-"""A port that several of ours share: the link of one of them to the hub that has it. Layer: link.
+"""The link of a program to the hub that has the port. Layer: link.
 
 A Unix socket of whole messages (SOCK_SEQPACKET). The first of each side is a JSON object: a request to join,
 and the hub's reply. So are the few later ones that begin with `{`. All others are frames: `F`, the length of
@@ -97,8 +97,8 @@ def set_buffers(sock: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What a client wants of a port: the address that it would like, where else its frames are to go, its
-    name for people. beats: only heartbeats, and not what they are about."""
+    """What a client wants of a port: the address that it would like, the endpoints for `forward=`, its name
+    for people. beats: it wants only heartbeats."""
 
     own: Address
     forward: tuple[str, ...] = ()
@@ -131,7 +131,8 @@ class HubLink:
         return self._outbox.size
 
     async def receive(self) -> list[bytes]:
-        """Wait for frames and return them, as they came together; none says that the port was reopened.
+        """Wait for frames and return them, as they came together; an empty list says that the port was
+        reopened.
 
         Raises:
             LinkClosed: the hub is gone, or aclose was called.
@@ -171,7 +172,7 @@ class HubLink:
         self.tell({"answer": address})
 
     def keep_peer(self) -> None:
-        """The hub itself hears what is there."""
+        """Nothing to do: the hub hears its peers itself."""
 
     def focus(self, system: int) -> None:
         """Have the hub leave out what concerns only other systems."""
@@ -271,7 +272,7 @@ async def join(
 ) -> HubLink:
     """Ask the hub at the other end of a socket to be let in, and return the link.
 
-    seat: what we had until now. again: the hub that we had is gone, so its endpoints may take their time.
+    seat: what we had until now. again: our last hub is gone, so the endpoints may take their time.
 
     Raises:
         Refused: and why.

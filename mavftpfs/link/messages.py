@@ -118,7 +118,7 @@ class CommandAck:
 
     @property
     def refuses_to_arm(self) -> bool:
-        """Whether somebody wanted to arm or disarm the vehicle, and it does not."""
+        """Whether the vehicle refused a command to arm or to disarm."""
         return self.command == MAV_CMD_COMPONENT_ARM_DISARM and self.result not in (_ACCEPTED, _IN_PROGRESS)
 
 
@@ -131,7 +131,7 @@ class StatusText:
 
     @property
     def refuses_to_arm(self) -> bool:
-        """Whether it says that the vehicle is not armed though somebody wanted it."""
+        """Whether it says that the vehicle refuses to be armed."""
         return self.text.startswith(_DENIALS)
 
 

@@ -2,7 +2,7 @@
 
 A program that has a port open also has its *door* open: a Unix socket in the user's private directory, named
 after the port. A second program that wants the port knocks there. A door is only a listening socket, so a hub
-that takes over inherits it with all that wait before it.
+that takes over inherits it with all programs that wait there.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def hubs() -> list[Path]:
 
 
 def peer_uid(sock: socket.socket) -> int:
-    """Return whose process is at the other end of a Unix socket."""
+    """Return the user id of the process at the other end of a Unix socket."""
     layout = struct.Struct("3i")
     _, uid, _ = layout.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size))
     return int(uid)
@@ -96,7 +96,7 @@ class Door:
         self._ours = path.lstat().st_ino
 
     async def knocked(self) -> None:
-        """Wait until somebody stands before it."""
+        """Wait until another program connects."""
         await trio.lowlevel.wait_readable(self.sock)
 
     def accept(self) -> socket.socket | None:
@@ -111,12 +111,12 @@ class Door:
         return sock
 
     def turn_away(self) -> None:
-        """Send off all that wait before it."""
+        """Close the connections of all programs that wait."""
         while (sock := self.accept()) is not None:
             sock.close()
 
     def is_hubs(self) -> None:
-        """Have its name say that a hub is behind it."""
+        """Make its name say that a hub is behind it."""
         path = self._path.with_suffix(HUB)
         self._path.rename(path)
         self._path = path

@@ -1,9 +1,9 @@
 """A port that we open ourselves, or share with other programs of ours through a hub. Layer: link.
 
-Alone, the port is ours, and its door is open beside it. When a second program knocks, we start the hub, which
-inherits port and door, and become its first client. Whose hub is gone opens the port again, and starts
-another one. The port goes from one process to the other as an open descriptor: no datagram is lost, no serial
-line falls, and no third program takes it.
+A program alone has the port itself, and its door open beside it. When a second program knocks, the first one
+starts the hub, which inherits port and door, and becomes its first client. A client whose hub is gone opens
+the port again, and starts another hub. The port goes from one process to the other as an open descriptor: no
+datagram is lost, no serial line falls, and no third program takes it.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from mavftpfs.shared.errors import LinkClosed
 log = logging.getLogger("mavftpfs.link")
 
 GRACE = 2.0
-"""Seconds in which a port that is taken may be one that a hub is just letting go of."""
+"""Seconds to wait for a port that is taken, because a hub may be just closing it."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
 _PAUSE = 0.1
 _LONG_PAUSE = 1.0
 _START_PATIENCE = 60.0
 _PACKAGES = str(Path(__file__).parents[2])
-"""Where this program was imported from: the hub is to be the same, whatever its working directory."""
+"""Where this program was imported from: the hub is to be the same program, whatever its working directory."""
 
 
 class SharedLink:
@@ -92,7 +92,8 @@ class SharedLink:
             log.warning("the hub of %s is gone; starting another one", self.description)
 
     async def _obtained(self) -> HubLink:
-        """Return the link to the hub of the port. As long as nobody else wants the port we have it alone."""
+        """Return the link to the hub of the port. As long as no other program wants the port, we have it
+        alone."""
         deadline = trio.current_time() + GRACE
         while True:
             try:
@@ -116,7 +117,8 @@ class SharedLink:
             raise _Taken(str(exc)) from exc  # it ended just now, or could not start the hub
 
     async def _alone(self) -> HubLink:
-        """Have the port to ourselves until somebody knocks, or at once hand it to a hub if we need one."""
+        """Have the port to ourselves until another program knocks, or hand it to a hub at once if we need
+        one."""
         name = port_name(self._spec)
         async with AsyncExitStack() as stack:
             with await only_one(name):
@@ -143,7 +145,7 @@ class SharedLink:
         return self._opened or bool(self._wish.forward) or self._wish.beats
 
     async def _handed_over(self, link: Link, door: Door | None) -> HubLink | None:
-        """Wait until somebody wants to share the port, and start the hub; None if that cannot be done.
+        """Wait until another program wants to share the port, and start the hub; None if that cannot be done.
 
         Raises:
             LinkClosed: we need it ourselves.
@@ -169,7 +171,7 @@ class SharedLink:
 
     @property
     def _has_name(self) -> bool:
-        """Whether others can find the port: port 0 is another one for each."""
+        """Whether other programs can find the port. Port 0 is a different one for each."""
         return self.is_serial or self._spec.port != 0
 
     def _use(self, link: Link) -> None:

@@ -51,7 +51,7 @@ class SignatureCheck:
         return max(self._newest, self._clock() if self._clock is not None else 0)
 
     def accept(self, frame: bytes, source: Address) -> bool:
-        """Return whether a whole frame that says it is signed (incompat flag 1) is, and is not a replay."""
+        """Return whether the signature of a whole frame (with incompat flag 1) is right, and is no replay."""
         digest = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
         if not hmac.compare_digest(digest, frame[-6:]):
             return False

@@ -1,7 +1,7 @@
-"""Byte streams that come back by themselves: what TCP and serial links share. Layer: link.
+"""Byte streams that are reopened when they fail: what TCP and serial links share. Layer: link.
 
 A `Pipe` is an open, non-blocking file descriptor. When it fails, what waited to be sent is dropped and
-counted: a stale request is worse than a lost one. A helper task then asks the opener for a new pipe until it
+counted: an old request is worse than a lost one. A helper task then asks the opener for a new pipe until it
 gets one, with growing pauses. After that `receive` returns an empty list once: the caller resets its parser.
 """
 
@@ -44,7 +44,7 @@ Opener = Callable[[], Awaitable[Pipe]]
 
 
 class StreamLink:
-    """Implements link.base.Link over whatever `opener` opens; without one somebody calls `replace`.
+    """Implements link.base.Link over whatever `opener` opens; without one, the owner calls `replace`.
 
     Args:
         pipe: the first one, where it is already open.
@@ -144,7 +144,7 @@ class StreamLink:
         """Nothing to choose: what we send goes to the peer."""
 
     def keep_peer(self) -> None:
-        """The present peer is the one to be served, and it is not silent."""
+        """Note that the present peer is served, and was heard just now."""
         self._vouched_at = trio.current_time()
 
     def focus(self, system: int) -> None:

@@ -34,7 +34,7 @@ async def open_tcp(
     """Connect to a listening vehicle or bridge, and again whenever the connection is lost.
 
     inherited: what `descriptors` of another process's link gave: a connection that is used first.
-    patient: return at once and connect as soon as somebody listens.
+    patient: return at once, and connect as soon as a peer listens.
 
     Raises:
         LinkClosed: the first attempt failed.
@@ -56,7 +56,7 @@ async def open_tcp(
 
 @asynccontextmanager
 async def open_tcp_server(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[StreamLink]:
-    """Listen; the link is usable at once and drops what is sent before somebody connects.
+    """Listen. The link is usable at once, and drops what is sent before a peer connects.
 
     inherited: what `descriptors` of another process's link gave: where it listens, and its connection.
 

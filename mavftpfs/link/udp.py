@@ -122,7 +122,7 @@ class UdpLink:
             self._pinned = True
 
     def keep_peer(self) -> None:
-        """Nothing to do: nobody waits, all are heard."""
+        """Nothing to do: all senders are heard."""
 
     def focus(self, system: int) -> None:
         """Nothing to leave out."""
@@ -154,7 +154,7 @@ class UdpLink:
         await trio.lowlevel.checkpoint()
 
     def _drain(self) -> list[bytes]:
-        """Take what is there. Errors of the socket are other people's ICMP messages: go on."""
+        """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
         receive, buffer = self._sock.recvfrom_into, self._buffer
         chunks: list[bytes] = []
         senders: list[NetAddress] = []

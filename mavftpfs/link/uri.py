@@ -1,4 +1,4 @@
-"""What SOURCE says, and why what it names could not be opened. Layer: link; pure.
+"""What SOURCE means, and why a link could not be opened. Layer: link; pure.
 
     udpin:0.0.0.0:14550  udp:...  udpout:host:port  tcp:host:port  tcpin:host:port  /dev/ttyUSB0,57600
     udpin://0.0.0.0:14550  udpout://  tcp://  tcpout://  tcpin://  serial:///dev/ttyUSB0:57600
@@ -172,7 +172,7 @@ def _number(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() and len(text) <= 9 else None
 
 
-# -- why it could not be opened --------------------------------------------------------------------
+# -- why a link could not be opened --------------------------------------------------------------------
 
 
 def cannot_open(spec: LinkSpec, problem: OSError) -> LinkClosed:

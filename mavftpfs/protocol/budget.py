@@ -2,7 +2,8 @@
 
 Every byte counts that would not be on the link without us: our frames, and the vehicle's replies to them,
 both ways together, because they share a radio's airtime. A read's reply is paid for when the read goes out;
-what else comes back is paid for when it comes. What has to wait for that is not sent yet, so no timer runs.
+other replies are paid for when they come. A request that has to wait for the budget is not sent yet, so no
+timer runs.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ _ACK = int(Opcode.ACK)
 
 
 class Budget:
-    """Allows `rate` bytes a second, whatever was saved up: only 10 ms are.
+    """Allows `rate` bytes a second. Unused bytes are saved up for 10 ms only.
 
     Small requests of people (listings, opens) may go ahead by 0.1 s or two frames, whichever is more; bulk
     work then waits for it. overhead: bytes of a frame beside the 251 of its payload.
 
     Attributes:
-        held: somebody wanted to send and was not allowed to, since `begin`.
+        exhausted: since `begin` a request had to wait.
     """
 
     def __init__(self, rate: float, overhead: int = FRAME_OVERHEAD) -> None:
@@ -56,7 +57,7 @@ class Budget:
         self._wanted = None
 
     def room(self, now: float, *, urgent: bool) -> int:
-        """Return how many requests may go out now. urgent: somebody waits for a small answer."""
+        """Return how many requests may go out now. urgent: a program waits for a small answer."""
         self._refill(now)
         self._lent = self._debt if urgent else 0.0
         balance = self._balance + self._lent

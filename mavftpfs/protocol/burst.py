@@ -1,16 +1,15 @@
 """Reading an open file by bursts (`read_mode=burst`). Layer: protocol; pure.
 
 One BurstReadFile brings many packets of data, which saves the uplink of a half-duplex radio. `BurstTransfer`
-asks for a burst where the first wanted byte is missing. What a burst left out, and everything while others
-wait for answers, it reads by a window of ReadFile requests, as ReadTransfer does; never both at once, because
-a ReadFile during a burst moves MAVSDK's stream. A burst that was asked for cannot be stopped: ArduPilot sends
-500 to 2000 packets, and answers nothing else until then.
+asks for a burst where the first wanted byte is missing. It reads what a burst left out by a window of
+ReadFile requests, as ReadTransfer does; while others wait for answers it reads everything so. It never does
+both at once, because a ReadFile during a burst moves MAVSDK's stream. A burst that was asked for cannot be
+stopped: ArduPilot sends 500 to 2000 packets, and answers nothing else until then.
 
 `Burst` follows one stream. A packet belongs when seq and offset agree: offset == start + k * packet size and
 seq == request seq + 1 + k (mod 2^16). The packet size is what the server sends, not what was asked (PX4
 ignores that). The end is an EOF NAK, the end of the file, `burst_complete` followed by quiet, or quiet alone
-(servers.md 14.15):
-the flag may be garbage, the NAK's offset may be wrong, and MAVSDK sends no NAK.
+(servers.md 14.15): the flag may be garbage, the NAK's offset may be wrong, and MAVSDK sends no NAK.
 """
 
 from __future__ import annotations
@@ -206,7 +205,7 @@ class BurstTransfer(ReadTransfer):
             self._end_burst(burst)
 
     def drop_readahead(self) -> None:
-        """Forget wants that nobody waits for; what is on its way still arrives."""
+        """Forget wants for which no program waits; what is on its way still arrives."""
         super().drop_readahead()
         self._gaps = ExtentSet(
             part for start, stop in self._gaps for part in self._demand.intersection(start, stop)

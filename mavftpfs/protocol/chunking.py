@@ -55,7 +55,7 @@ class ChunkSize:
         """Whether full and short chunks take turns, so that each request needs a size of its own."""
         self._short_until = inf
         self._lost = 0  # full chunks in a row; while trying: beside the short ones
-        self._since = -inf  # what was sent before proves nothing: a later one passed, or the link was away
+        self._since = -inf  # older requests prove nothing: a later one passed, or the link was away
         self._first_lost_at = 0.0
         self._shortest_lost = 0  # bytes: what is shorter proves nothing when it is answered
         self._answered = 0  # short chunks, while trying
@@ -71,8 +71,8 @@ class ChunkSize:
         return self.size
 
     def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
-        """Requests for `size` bytes each, sent then, were answered: so many of them at the first attempt.
-        Others prove nothing: a server that is late answers full ones, too, in the end."""
+        """Note that requests for `size` bytes each, sent then, were answered, `count` of them at the first
+        attempt. The others prove nothing: a late server answers full ones, too, in the end."""
         if size > self._least:
             if size >= self._shortest_lost:
                 self.trying, self._lost = False, 0
@@ -84,8 +84,8 @@ class ChunkSize:
             self._settle(now)
 
     def on_lost(self, size: int, sent_at: float, now: float) -> bool:
-        """A request for `size` bytes, sent then, is to be repeated; return whether its bytes go out in other
-        chunks."""
+        """Note that a request for `size` bytes, sent then, is to be repeated; return whether its bytes go out
+        in other chunks."""
         if size > self._least and sent_at > self._since:
             if not self._lost:
                 self._first_lost_at = now

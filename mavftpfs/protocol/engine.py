@@ -1,9 +1,9 @@
 """The client engine: matches replies, repeats what is lost, keeps the window. Layer: protocol; pure.
 
 Theory of operation. Operations say what to ask (`next_requests`) and are told of believed answers. A reply
-is found by its seq (request + 1) and believed when req_opcode, and where servers echo them session and
-offset, are the request's; what is not believed changes nothing. A loss is known by later
-answers (see `ledger`) or by a timer. Lost requests go out before new ones of the same operation. While
+belongs to the request whose seq is one less. It is believed if it has the request's req_opcode and, where
+servers echo them, its session and offset. A reply that is not believed changes nothing. A loss is known by
+later answers (see `ledger`) or by a timer. Lost requests go out before new ones of the same operation. While
 burst packets arrive timers stand still, because ArduPilot answers nothing else then (servers.md 4).
 
 Nothing that comes in can raise: `receive` takes any payload at any time.
@@ -39,10 +39,10 @@ _NAK = int(Opcode.NAK)
 class EngineStats:
     """Plain counters since the engine was made.
 
-    requests: transmissions, by_opcode too. retransmissions: those of them that repeat a request, spurious:
-    and those that turned out to be needless. replies: believed ones, burst packets included.
-    unknown: replies that fit nothing outstanding (late, duplicate, not ours), unexplained: and those of them
-    that no repetition of ours explains.
+    requests: transmissions, also by_opcode. retransmissions: transmissions that repeat a request. spurious:
+    retransmissions that turned out to be needless. replies: believed ones, burst packets included. unknown:
+    replies that fit no outstanding request (late, duplicate, not ours). unexplained: unknown replies that no
+    repetition of ours explains.
     """
 
     requests: int = 0
@@ -65,8 +65,8 @@ class Engine:
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
-        on_unexplained: told of each answer that nobody waits for and that no repetition of ours explains,
-            with the seconds since its request went out (0 where that is not known).
+        on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
+            explains, and with the seconds since its request went out (0 where that is not known).
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Engine:
         self.flow.set_queue_limit(self.traits.queue_limit)
 
     def forget_server(self) -> None:
-        """The server restarted, perhaps as another one: nothing that was learned of it holds."""
+        """Forget what was learned of the server: it restarted, perhaps as another one."""
         self.traits.forget()
         self.session = self.home_session
         self.flow.set_queue_limit(self.traits.queue_limit)
@@ -148,7 +148,7 @@ class Engine:
         return finished
 
     def drop(self, op: Operation) -> None:
-        """An operation ended, or is to be forgotten: late replies are discarded. Harmless when it was."""
+        """Forget an operation, ended or not; late replies to it are discarded. A second call is harmless."""
         if op not in self._ops:
             return
         self._ops.remove(op)
@@ -213,7 +213,8 @@ class Engine:
             flow.on_loss(lost.order)
 
     def _on_unknown(self, reply: Payload, now: float) -> None:
-        """An answer fits nothing outstanding. What comes of a burst that was given up is no news."""
+        """Count a reply that fits no outstanding request. Packets of a burst that was given up are
+        explained."""
         self.stats.unknown += 1
         duplicates = self._ledger.duplicates
         if not duplicates.explains(reply.seq) and reply.req_opcode != _BURST:
@@ -221,9 +222,10 @@ class Engine:
             self.on_unexplained(reply, duplicates.late_by(reply.seq, now))
 
     def _on_replay(self, request: Request) -> None:
-        """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""
+        """The server replays an earlier reply under this seq, so it will never answer this one (servers.md
+        2)."""
         request.replays += 1
-        # It may not be a replay but the rest of an abandoned burst: each new seq may be one more execution.
+        # It may also be a packet of an abandoned burst: then each new seq is one more execution.
         limit = _MAX_SIDE_EFFECT_REPLAYS if request.manner.same_seq else _MAX_REPLAYS
         if request.replays <= limit and request.flying:
             request.fresh_seq = True
@@ -324,7 +326,7 @@ class Engine:
         if first.opcode == _BURST:
             self._burst_op = first.op
             ledger.leave(first)  # its packets tell what became of it, and it is never repeated
-            # Whatever they use as seq must not be a seq of ours (servers.md 2, collision).
+            # The seqs of its packets must not be seqs of ours (servers.md 2, collision).
             ledger.jump(first.op.on_burst_sent(first, now))
         else:
             self._due = min(self._due, first.timer)
@@ -333,14 +335,14 @@ class Engine:
     # --- timers
 
     def next_deadline(self) -> float | None:
-        """Return when `on_deadline` wants to be called, or None if nothing is pending."""
+        """Return when `on_deadline` is to be called, or None if nothing is pending."""
         deadline = min(self._due if self._ledger.flying else inf, self.flow.next_room_at())
         for op in self._ops:
             deadline = min(deadline, op.timer, op.progress_at + op.patience)
         return None if deadline == inf else deadline
 
     def on_deadline(self, now: float) -> None:
-        """Ask again for what is overdue, and end operations that took too long, or of which one request did.
+        """Repeat what is overdue, and end operations that took too long, or that have a request which did.
         Harmless when called early or late."""
         silent: list[str] = []
         late: set[Operation] = set()

@@ -1,23 +1,24 @@
 """How many requests may be in flight, and how evenly they go out. Layer: protocol; pure.
 
-Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more of them
-only wait in a queue, ours and everybody else's. So the window aims at what the path holds: its rate (the best
-recent rate of answers) times its base round trip (the least one seen lately), and a little more. Every few
+Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more requests
+only wait in a queue, and delay all others. So the window aims at what fills the path: its rate (the best
+recent rate of answers) times its shortest round trip (of those seen lately), and a little more. Every few
 rounds it asks for a quarter more, to find out when the path improves. Requests go out evenly, at hardly more
-than that rate, so that a short queue holds them.
+than that rate, so that a short queue takes them.
 
-Loss alone shrinks nothing, because it changes neither rate nor round trip: radios lose frames. It is made up
-for by as many more requests, but not in every round: what is lost because we send too much ceases then. Loss
-while a queue stands (even the quickest answer of a round took long) is congestion, and narrows the window.
-When nothing at all is heard for a retransmission timeout, two requests probe until something is. At first
-the window grows by one with every answer, which doubles it each round, until the rate stops growing, a queue
-stands, or much is lost.
+Radios lose frames. So loss alone does not narrow the window: it changes neither rate nor round trip. As many
+more requests make up for it, but not in every round: in the others, losses that we cause by sending too much
+cease. Loss while a queue stands (even the quickest answer of a round took long) is congestion, and narrows
+the window. When nothing at all is heard for a retransmission timeout, two requests probe until an answer
+comes. At first the window grows by one with every answer, which doubles it each round, until the rate stops
+growing, a queue stands, or much is lost.
 
-A serial port has a receive buffer of unknown size in front of a slow server, and what overflows it is lost
+A serial port has a receive buffer of unknown size in front of a slow server. Bytes that overflow it are lost
 silently. There the window grows from one, by one a round, and goes back by one when more is lost than usual.
 
 A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
-pauses some answers are kept in the link's queue, and requests go on, at a third of the pace, while it pauses.
+pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
+pace.
 
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
 stand `pacing`, for servers that queue five requests, and `budget`, for the user's `bwlimit=`."""
@@ -33,63 +34,66 @@ from mavftpfs.protocol.pacing import Pacer
 # The table of constants: all that decide the window. Requests, unless a unit is given.
 
 FIRST = 8
-"""The window at first: as much as two packets of an ordinary TCP connection. A server pauses when no answer
-comes for as long as so many take."""
+"""The window at first: as much as two packets of an ordinary TCP connection. A server pauses if no answer
+comes for the time that so many usually take."""
 
 LEAST = 4
-"""The narrowest window: fewer are no load, and with fewer it takes long to notice a loss."""
+"""The narrowest window: so few are no load, and with fewer a loss is noticed late."""
 
 MOST, MOST_SERIAL = 2048, 16
-"""The widest: 1 MB/s over 500 ms. At a serial port, whose receive buffers hold fewer, the second."""
+"""The widest window: 1 MB/s over 500 ms. The second is for serial ports, whose receive buffers take fewer."""
 
 PROBE, SILENT = 2, 3
 """The window while nothing is heard; so many transmissions without any answer are a silence."""
 
 SLACK = 2
-"""The window is wider than the path by so many: so the slowest part is busy between two answers."""
+"""The window is wider than the path by so many, which keeps the slowest part busy between two answers."""
 
 DEPTH, DEPTH_SERIAL = 3, 2
-"""So many may go out at once, at a serial port the second, or what the path takes in TICK."""
+"""So many may go out at once (the second at a serial port), or as many as the path carries in TICK."""
 
 ROUNDS = 10
-"""The best rate of so many rounds is the path's: enough for a bad round, few enough for a changed link. Each
-has at least as many answers: the best of shorter ones would be the luckiest."""
+"""The path's rate is the best one of so many rounds: enough to outlast a bad round, few enough to notice a
+changed link. Each round has at least so many answers: the best of shorter rounds would be the luckiest
+one."""
 
 FLAT_ROUNDS = 3
-"""So many rounds in which the rate has not grown end the start: a wider window takes two to show."""
+"""The start ends after so many rounds in which the rate did not grow: a wider window takes two rounds to
+show."""
 
 CYCLE, STEP = 5, 0.25
-"""One round in so many, and any after the rate has grown, asks for a quarter more than the path carries. The
-round after that one in so many makes up for no losses: those of a queue that we overflow cease. The start
-goes on while the rate grows by a quarter."""
+"""One round in CYCLE, and each one after the rate grew, asks for a quarter (STEP) more than the path carries.
+The round after the one in CYCLE makes up for no losses, so that losses of a queue that we overflow cease. The
+start goes on while the rate grows by a quarter."""
 
 START = 4.0
 """At the start the window grows by one with each answer, to at most four times what fills the path as far as
 it is known."""
 
 TICK = 0.005
-"""Seconds: less than a queue, and the shortest round. Timers and batches on both ends are no more precise."""
+"""Seconds: a shorter delay is no queue, and no round is shorter. Timers and batches on both ends are not more
+precise."""
 
 LITTLE = 0.05
-"""Seconds that an answer may take longer before it is said to have waited in a queue. A usual round trip
-counts for the window up to that more than the least one, or twice that: where answers come in bunches (Wi-Fi,
-a modem that gathers), the least would leave it too narrow."""
+"""Seconds by which an answer may be late before it counts as one that waited in a queue. The window counts by
+the usual round trip, but at most by so much more than the shortest one, and at most by twice that. Where
+answers come in bunches (Wi-Fi, a modem that gathers frames), the shortest one would leave it too narrow."""
 
-BASE_LEAST = 0.0005
-"""Seconds: no round trip counts for less. Both ends of a fast path work in batches, and what is on its way
-in such a time keeps them busy; more only waits, and costs them time."""
+LEAST_TRIP = 0.0005
+"""Seconds: no round trip counts for less. Both ends of a fast path work in batches. The requests of so long a
+time keep them busy; more would only wait, and cost them time."""
 
 KNOWN = 30.0
-"""Seconds for which it is believed that a server pauses, and that the base round trip is the way's. Then two
-rounds of a STEP less than fills the path look for it."""
+"""Seconds for which it is believed that a server pauses, and that the shortest round trip is right. Then two
+rounds with a STEP less than fills the path measure that again."""
 
 QUEUE_SHARE = 0.15
-"""A queue stands when the quickest answer of a round took longer than the base round trip: by 15 % of that or
-LITTLE, whichever is less, by TICK, and by twice what the answers of the round differ. Jitter is no queue."""
+"""A queue stands if the quickest answer of a round took longer than the shortest round trip: by 15 % of that
+(LITTLE at most), plus TICK, plus twice the jitter of the round, which is no queue."""
 
 QUEUE = 0.1
-"""Seconds of answers that wait in a link's queue: at most at a serial port, because a listing
-waits behind them; by intent where a server pauses, because the link sends them meanwhile."""
+"""Seconds of answers that wait in a link's queue. At a serial port no more may wait, because a listing waits
+behind them. Where a server pauses so many wait on purpose, because the link sends them meanwhile."""
 
 SMOOTHING = 0.2
 """What one round counts for in an average, at most."""
@@ -98,27 +102,27 @@ LOSS_MEMORY = 100
 """Requests over which the share of losses is averaged, at least."""
 
 LOSS_RISE, MOST_LOSS = 0.1, 0.34
-"""The share that a wider window and a higher pace make up for rises so many times as slowly as it falls
-(losses of a link stay, those of a queue of ours go), and is at most that of 19 % each way. A round of the
-start that loses more ends it."""
+"""The share of losses that a wider window and a higher pace make up for rises more slowly than it falls, by
+LOSS_RISE: losses of a link stay, those of a queue of ours go. The share is at most MOST_LOSS: 19 % each way.
+A round of the start that loses more ends the start."""
 
 UNUSUAL = 3.0
-"""A round lost more than usual when that many standard deviations would have to be chance."""
+"""A round lost more than usual if its loss is so many standard deviations above the usual one."""
 
 BOLDER = 0.06
-"""Of what the window has beyond the path, and of the reserve for pauses, a share is used. Each round adds so
-much, one that lost more than usual takes a STEP of it: then a short queue overflows."""
+"""Only a share is used of what the window has beyond the path, and of the reserve for pauses. Each round adds
+so much to the share. A round that lost more than usual takes a STEP of it away: a short queue overflowed."""
 
 PAUSE, LONGEST_PAUSE = 0.02, 0.4
-"""Seconds without an answer that are a pause, and beyond which they are a silence."""
+"""Seconds without an answer after which it is a pause, and after which it is a silence."""
 
 BRIDGE = 0.35
-"""While a server pauses, requests go on at this share of its rate: else it has nothing to do for a round trip
-after that. Most of them overflow its buffer."""
+"""While a server pauses, requests go on at this share of its rate. Else it would have nothing to do for a
+round trip after the pause. Most of these requests overflow its buffer."""
 
 BRIDGE_FROM = 0.03
-"""Seconds: below that round trip there is no reserve and no bridge. What a server's buffer holds lasts for
-that."""
+"""Seconds: with a shorter round trip there is no reserve and no bridge. The requests in a server's buffer
+last for so long."""
 
 
 class Flow:
@@ -133,8 +137,8 @@ class Flow:
         window: requests that may be in flight. cap: the widest window now.
         loss: the share of requests that are lost, 0..1.
         alone: no other FTP client was heard lately.
-        pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`:
-            there was room and nothing to send.
+        pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`.
+        starved: there was room and nothing to send.
     """
 
     def __init__(
@@ -184,7 +188,7 @@ class Flow:
     # --- what may go out
 
     def begin(self) -> None:
-        """A look at all operations begins: `room` follows for each that has something to send."""
+        """Begin to look at all operations: `room` is called for each that has something to send."""
         self._hurried = self._blocked = False
         self._wake = inf
         if self._pacer is not None:
@@ -193,11 +197,11 @@ class Flow:
             self.budget.begin()
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
-        """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
+        """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
         room = self.window - in_flight
         if urgent:
             self._hurried = True
-        elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
+        elif self._hurried:  # an urgent answer should not queue behind our slack
             room -= min(SLACK + 1, self.window // 2)
         elif self.pause:
             room += int(self._beyond(now, paced) * self._rate)
@@ -221,7 +225,7 @@ class Flow:
     ) -> int:
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         pacer.blocked = False
-        # How evenly others send is not ours to say: beside them the queue is all there is.
+        # Others send as they like: beside them no more may be sent than the queue takes.
         beyond = pacer.room_for_urgent if urgent else pacer.room
         return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
 
@@ -232,7 +236,7 @@ class Flow:
         silence = now - self._answered_at
         if silence > PAUSE:
             bridge = min(LONGEST_PAUSE, silence)
-        else:  # those of a pause that just ended are not answered before a round trip later
+        else:  # after a pause its requests are answered a round trip later
             bridge = self.pause if now < self._paused_at + self._shortest else 0.0
         if silence < LONGEST_PAUSE:
             self._wake = now + FIRST / self._rate
@@ -254,13 +258,13 @@ class Flow:
 
     @property
     def most_beside(self) -> int:
-        """How many may be in flight if somebody waits: none more where a server holds but a few of them."""
+        """How many may be in flight for the sake of metadata; 0 where a server takes only a few."""
         return 0 if self._serial or self._pacer is not None else self.cap
 
     # --- what happens
 
     def on_sent(self, count: int, now: float) -> None:
-        """So many requests, at least one, go out, which there was room for."""
+        """Note that so many requests, at least one, go out. There was room for them."""
         if self.budget is not None:
             self.budget.on_sent(count)
         if self._pacer is not None:
@@ -268,19 +272,19 @@ class Flow:
         self._tokens = max(-float(DEPTH), self._tokens - count)
 
     def on_starved(self) -> None:
-        """There was room in the window and nothing to send: this round's rate says little."""
+        """Note that there was room in the window and nothing to send: this round's rate says little."""
         self.starved = True
         self._answered_at = inf
         if self._pacer is not None:
             self._pacer.on_starved()
 
     def on_replies(self, now: float, rtt: float | None, count: int, newest: int, next_order: int) -> None:
-        """So many requests that went out together were answered together. rtt: None if nobody knows which of
-        their transmissions were; newest: the order of the last of those; next_order: what the next one will
-        get."""
+        """Note that `count` requests, which went out together, were answered together. rtt: None if it is not
+        known which of their transmissions were. newest: the order of the last of those. next_order: the order
+        that the next transmission will get."""
         self._answered += count
         gap, self._answered_at = now - self._answered_at, now
-        # What ends a pause waited for its end; after a run of losses nothing waited.
+        # An answer that ends a pause has waited for its end. After a run of losses none has.
         waited = rtt is not None and rtt > self._shortest + gap / 2 and self._rate > 0.0
         if waited and gap > PAUSE + FIRST / self._rate and not self._serial and self._pacer is None:
             self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
@@ -307,7 +311,7 @@ class Flow:
         self._round += 1  # it is over
         if self._round_end >= 0 and now > self._round_start:
             self._learn(now, now - self._round_start)
-        if not self._starting and self._rate > 0.0 and self._shortest >= BASE_LEAST:
+        if not self._starting and self._rate > 0.0 and self._shortest >= LEAST_TRIP:
             self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
         else:
             self._pace = inf
@@ -317,17 +321,17 @@ class Flow:
         self.starved = False
 
     def on_loss(self, order: int) -> None:
-        """The transmission numbered `order` is taken to be lost."""
+        """Note that the transmission numbered `order` is taken to be lost."""
         self._lost += 1
         if self._pacer is not None:
             self._pacer.on_loss(order)
 
     def on_spurious(self) -> None:
-        """What was taken to be lost was answered after all."""
+        """Note that a transmission which was taken to be lost was answered after all."""
         self._lost = max(0, self._lost - 1)
 
     def on_silence(self, unheard: int = SILENT) -> None:
-        """Nothing at all was heard for a retransmission timeout, after so many transmissions."""
+        """Note that nothing at all was heard for a retransmission timeout, after so many transmissions."""
         if unheard < SILENT:
             return
         if not self._before_silence:
@@ -340,8 +344,8 @@ class Flow:
 
     def _learn(self, now: float, took: float) -> None:
         total = self._answered + self._lost
-        # What arrives while a server pauses overflows its buffer, and its answers wait: that says nothing of
-        # the link. It shows for a round trip after that.
+        # Requests that arrive while a server pauses overflow its buffer, and answers wait. That says nothing
+        # of the link. It shows until a round trip after the pause.
         paused = self.pause > 0.0 and self._paused_at + self._shortest >= self._round_start
         waits = self._reserve() if self.pause else 0.0
         congested = self._lost > 0 and not paused and self._queued(1.0, waits)
@@ -351,7 +355,7 @@ class Flow:
             now, total, losses=not (paused or self._queued() or (self._serial and lost_too_much))
         )
         if congested and not self.starved and self._queued(2.0, waits):
-            self._rates.clear()  # only what came now is the path's
+            self._rates.clear()  # the path has the rate of this round
         rate, before = self._answered / took, self._rate
         if rate > before or not self.starved:
             self._rates.append(rate)
@@ -403,8 +407,8 @@ class Flow:
         self._spread += (min(spread, LITTLE) - self._spread) * SMOOTHING
 
     def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
-        """Whether even the quickest answer of the round waited in a queue, so many times as long as a little;
-        reserve: seconds that it waited for another reason."""
+        """Return whether even the quickest answer of the round waited in a queue: `times` as long as what
+        counts as a little. reserve: seconds that it waited for another reason."""
         if self._least == inf:
             return False
         little = min(QUEUE_SHARE * self._shortest, LITTLE) + TICK
@@ -415,4 +419,4 @@ class Flow:
         """Return how many requests fill the path, as far as is known."""
         if self._shortest == inf:
             return LEAST
-        return self._rate * max(self._shortest, BASE_LEAST) * self._per_answer
+        return self._rate * max(self._shortest, LEAST_TRIP) * self._per_answer

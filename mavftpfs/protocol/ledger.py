@@ -1,10 +1,10 @@
 """Which requests are out, under which seqs, and which of them are lost. Layer: protocol; pure.
 
-Every transmission has a seq, by which its reply is found, and an *order* number, by which losses are
-found: servers answer in order (servers.md 3), so once a request sent `reorder` or more transmissions
-later was answered, an idempotent request is lost. Old seqs stay valid as aliases until the request is
-answered. A lost request waits in `again`; one whose operation was cancelled becomes a ghost, which keeps
-its place in the window, because the server still has it in its queue.
+Every transmission has a seq, by which its reply is found, and an *order* number, by which losses are found.
+Servers answer in order (servers.md 3). So an idempotent request is lost once a request was answered that was
+sent `reorder` or more transmissions later. Old seqs stay valid as aliases until the request is answered. A
+lost request waits in `again`. A request whose operation was cancelled becomes a ghost: it keeps its place in
+the window, because the server still has it in its queue.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ LAST_SEQ = 65534
 
 BURST_JUMP = 4096
 FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
-"""Further on come the seqs just used, whose late replies may still be about."""
+"""A longer jump would reach seqs that were just used, and whose late replies may still come."""
 
 _ACK = int(Opcode.ACK)
 _MIN_REORDER = 2
-"""So many later answers tell that a request is lost: it keeps one of a short queue's places until then."""
+"""A request is lost after so many later answers. Few, because until then it takes a place of a short
+queue."""
 
 _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 20
@@ -48,17 +49,17 @@ class DuplicateDetector:
         self._sent: dict[int, float] = {}
 
     def on_sent(self, request: Request) -> None:
-        """A request that changes names goes out under a new seq."""
+        """Note when a request that changes names goes out under a new seq."""
         self._sent.pop(request.seq + 1, None)
         self._sent[request.seq + 1] = request.sent_at
         if len(self._sent) > _MOST_REMEMBERED:
             del self._sent[next(iter(self._sent))]
 
     def on_settled(self, request: Request, answered: int | None) -> None:
-        """A request is over. answered: the seq of the answer that came, if one did."""
+        """Note that a request is over. answered: the seq of the answer that came, if one did."""
         seqs = {request.seq + 1, *(request.aliases or ())}
         for seq in seqs:
-            # With several seqs nobody knows how often each was sent.
+            # With several seqs it is not known how often each was sent.
             left = request.sends - (len(seqs) - 1) - (seq == answered)
             if left > 0:
                 self._expected.pop(seq, None)
@@ -67,7 +68,7 @@ class DuplicateDetector:
             del self._expected[next(iter(self._expected))]
 
     def explains(self, seq: int) -> bool:
-        """Return whether an answer that nobody waits for was still to come; it is not expected again."""
+        """Return whether an answer to no outstanding request was still to come; it is not expected again."""
         left = self._expected.get(seq, 0)
         if left > 1:
             self._expected[seq] = left - 1
@@ -81,10 +82,11 @@ class DuplicateDetector:
 
 
 class Ghost(Operation):
-    """Owns the requests of cancelled operations until they are answered or given up. No engine asks it."""
+    """Owns the requests of cancelled operations until they are answered or given up. It is asked for
+    nothing."""
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nobody wants to know."""
+        """Nothing to do: the answer is not wanted any more."""
 
 
 class Ledger:
@@ -92,11 +94,12 @@ class Ledger:
 
     Attributes:
         again: lost requests which go out again as soon as there is room.
-        newest_answered: order of the last transmission that was answered. first: no older one may be lost.
+        newest_answered: order of the last transmission that was answered. first: order of the oldest
+            transmission that may still be found lost.
         flying: the requests on their way by the order of their transmission, oldest first, ghosts included.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
-        duplicates: knows which answers that nobody waits for are due to repetitions of ours.
+        duplicates: see DuplicateDetector.
     """
 
     def __init__(self, next_seq: int) -> None:
@@ -114,9 +117,11 @@ class Ledger:
         self.reorder = _MIN_REORDER
 
     def unheard(self) -> int:
-        """Return how many that carry no bytes were repeated in vain: perhaps nobody will ever answer them.
+        """Return how many requests other than reads, writes and listings were repeated in vain: they may
+        never be answered.
 
-        A checksum is waited for two minutes: it would keep a window that losses made narrow from everybody.
+        A checksum is waited for two minutes. So long it would take a place of a narrow window from all
+        others.
         """
         return sum(request.sends > 1 and not request.manner.ordered for request in self.flying.values())
 
@@ -132,8 +137,8 @@ class Ledger:
         return seq
 
     def jump(self, packets: int) -> None:
-        """Leave out the seqs that a server may use by itself in a burst of so many packets, and as many more:
-        the rest of it may come long after it was given up (servers.md 14.3)."""
+        """Skip the seqs that a server may use by itself in a burst of so many packets, and as many more:
+        packets of a burst may come long after it was given up (servers.md 14.3)."""
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
 
@@ -188,10 +193,12 @@ class Ledger:
     # --- coming in
 
     def settle_run(self, replies: list[Fields], at: int, after: float) -> Run:
-        """Take out requests as long as replies, from index `at` on, are usual ones; return what they answer.
+        """Take out the requests that a row of usual replies, from index `at` on, answers; return them with
+        their data.
 
-        Usual is the ACK, as `Engine.receive` would believe it, to the only transmission of a request with the
-        opcode `bulk` of its operation, sent later than `after`. The run ends where operation or time change.
+        A usual reply is an ACK that `Engine.receive` would believe, to the only transmission of a request
+        with the opcode `bulk` of its operation, sent later than `after`. The row ends where operation or time
+        change.
         """
         table, flying = self._table, self.flying
         request = table.get(replies[at][0])
@@ -264,7 +271,7 @@ class Ledger:
         return lost
 
     def lose(self, request: Request) -> None:
-        """This transmission will not be answered: ask again, unless nobody would want to know."""
+        """Give up a transmission. The request goes out again, unless its answer is not wanted any more."""
         request.flying = False
         del self.flying[request.order]
         if request.op is self.ghost or request.manner.once:

@@ -134,7 +134,7 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
             continue
         strings += 1
         kind, (name, *fields) = _KINDS.get(text[:1]), text[1:].split(b"\t")
-        # A tab in a name (MAVSDK lists those) shows as a field that is no number: it is unshown.
+        # A tab in a name (MAVSDK lists those) shows as a field that is no number: it is not shown.
         understood = kind is not None and usable_name(name)
         for field in fields:
             understood = understood and field.isdigit() and len(field) <= _MAX_DIGITS
@@ -236,8 +236,8 @@ class ListDirectory(Operation):
     def _on_first_page_again(self) -> None:
         """The server seems to ignore the offset, so what is behind its first page is not known.
 
-        MAVSDK repeats a first page, too, where it leaves out more entries than it shows (servers.md 6); that
-        is told from this by a page with much room left that comes twice only.
+        MAVSDK repeats a first page, too, where it leaves out more entries than it shows (servers.md 6). But
+        such a page has much room left, and comes only twice.
         """
         self._first_page_again += 1
         if self._first_page_again > 1 or len(self._first_page) > MAX_DATA // 2:

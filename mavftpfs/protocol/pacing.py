@@ -1,19 +1,19 @@
 """More requests on their way than the server queues. Layer: protocol; pure.
 
 Theory. ArduPilot queues five requests for everybody and drops the rest silently, but it empties that queue
-every few milliseconds (servers.md 3, 15). So what must stay small is not what is on its way but what
-arrives between two looks at the queue. Requests that are spread evenly in time may fill a long way, which
-four at a time leave empty for most of each round trip.
+every few milliseconds (servers.md 3, 15). So only few requests may arrive between two looks at the queue, but
+many may be on their way. Requests that are spread evenly in time can fill a long way. Four at a time leave it
+empty for most of each round trip.
 
 How often the server looks is not known, so the rate is raised while that helps: each *trial* compares the
-answers per second with those of the trial before. Where a raise brings next to nothing, the server or the
-link is the limit: if more was lost than before it was the queue, of which a fifth is then left to others.
-Random loss does not matter, because it takes the same share of both.
+answers per second with those of the trial before. If a raise brings next to nothing, the server or the link
+is the limit. If more was lost than before, it was the queue, and a fifth of the rate is left to others.
+Random loss does not matter, because it takes the same share of both trials.
 
-The window holds what is on its way at that rate and hardly more, by the least round trip that was seen: what
-a raise leaves in a link's queue must not pass for the way. So where the way becomes longer, the link slower
-or the loss much larger, all begins again with as few requests as at first: no queue of ours falsifies what
-they tell.
+The window is what is on its way at that rate, by the shortest round trip that was seen, and hardly more: what
+a raise leaves in a link's queue must not pass for the way. If the way becomes longer, the link slower or the
+loss much larger, all begins again with as few requests as at first. Those make no queue that would falsify
+the measurement.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ _WORTH = 0.5
 """The share of a raise that must show in the answers for the raise to be kept."""
 
 _SHARE_TAKEN = 0.8
+"""The share of the rate that is used after the queue overflowed."""
+
 _UNUSUAL_LOSS = 0.04
 _UNLIKELY = 1.5
 """Standard deviations beyond that: a queue that a raise of a quarter overflows loses a fifth more."""
@@ -65,12 +67,12 @@ class Pacer:
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
         self._usual_loss = 0.0
-        self._seen = 0.0  # so many requests would tell it as well
+        self._seen = 0.0  # how many requests that average stands for
         self._shortest_rtt = inf
         self._least_rtt = inf
         self._hold_until = -inf
         self._failed_once = False
-        self._longer = 1.0  # the quickest of the last trial took so many least round trips
+        self._longer = 1.0  # the quickest answer of the last trial, in shortest round trips
         self._tokens = 0.0
         self._tokens_at = 0.0
         self._from = 0  # the trial: of transmissions from here on, timed from the first answer
@@ -97,8 +99,8 @@ class Pacer:
         return min(tokens, self.window - in_flight)
 
     def room_for_urgent(self, in_flight: int, now: float) -> int:
-        """Return whether one may go out that somebody waits for: a little later than what was sent last, for
-        it would be dropped by the queue that is full of that. Until then nothing else goes out."""
+        """Return 1 if an urgent request may go out now, else 0. It goes out a little later than what was sent
+        last: the queue, which is full of that, would drop it. Until then nothing else goes out."""
         if self.rate is None or in_flight >= self.window:
             return 0
         due = self._sent_at + self.queue / self._best
@@ -159,7 +161,7 @@ class Pacer:
         self.rate, self.window, self.blocked = None, self.queue, False
         self._raise = _BOLD
         self._hold_until = -inf
-        # What was usual need not be so any more, and the few that are sent now find no queue of ours.
+        # The usual loss may have changed, and the few requests that are sent now find no queue of ours.
         self._usual_loss = self._seen = 0.0
         self._shortest_rtt = self._least_rtt = inf
         self._starved = True
@@ -197,7 +199,7 @@ class Pacer:
         elif now < self._hold_until:
             self._watch(answers, loss)
         elif self._hold_until > -inf and self._longer > self.queue + 2:
-            self._begin_again()  # before the slowest link so few make no such queue: the way is longer
+            self._begin_again()  # so few make no such queue, even at the slowest link: the way is longer
         elif self._hold_until > -inf:
             self._hold_until = -inf  # the last trial of a hold is what the next raise is compared with
             self._accept(answers, loss)
@@ -219,14 +221,15 @@ class Pacer:
         self._learn(loss)
 
     def _learn(self, loss: float) -> None:
-        """This is usual."""
+        """Average a loss into the usual one."""
         new = _SMOOTHING if self._seen else 1.0
         self._usual_loss += (loss - self._usual_loss) * new
         before = (1.0 - new) ** 2 / self._seen if self._seen else 0.0
         self._seen = 1.0 / (before + new**2 / (self._answered + self._lost))
 
     def _scatter(self, loss: float) -> float:
-        """Return by how much a trial's loss, the larger one, differs from the usual one by mere chance."""
+        """Return by how much a trial's loss may exceed the usual one by mere chance (one standard
+        deviation)."""
         return sqrt(loss * (1.0 - loss) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
 
     def _is_overflow(self, loss: float) -> bool:
@@ -239,13 +242,13 @@ class Pacer:
         self._failed_once = False
         if overflowed or self._longer > _STANDING:
             self._hold_until = now + _HOLD
-        else:  # no reason is seen why it should not be faster: chance may have spoken
+        else:  # nothing shows a limit: it may have been chance
             self._hold_until = now + _SHORT_HOLD
             self._raise = _BOLD
 
     def _watch(self, answers: float, loss: float) -> None:
-        """While holding: somebody else may have come, the server or the link become slower, the way longer,
-        or all of it worse. Which of these, only those tell that are sent as at first."""
+        """While the rate is held, begin again if too few answers come. Another sender may have come, the
+        server or the link may be slower, or the way longer. Only a start with few requests tells which."""
         expected = (self.rate or 0.0) * (1.0 - loss)
         if loss <= self._usual_loss + _ALARMING_LOSS and answers >= _SHORT * expected:
             self._failed_once = False

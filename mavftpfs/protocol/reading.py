@@ -38,11 +38,12 @@ class DataSink(Protocol):
     """Where the bytes go."""
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the parts of [start, stop) not yet held."""
+        """Return the parts of [start, stop) that are not here yet."""
         ...
 
     def on_data(self, offset: int, data: bytes) -> None:
-        """Take bytes, which may be more than was wanted; what is already held must not be overwritten."""
+        """Take bytes, which may be more than was wanted. Bytes that are already here must not be
+        overwritten."""
         ...
 
 
@@ -90,7 +91,7 @@ class ReadTransfer(Operation):
                     self._ahead.add(ahead_start, ahead_stop)
 
     def drop_readahead(self) -> None:
-        """Forget wants that nobody waits for; what is on its way still arrives."""
+        """Forget wants for which no program waits; what is on its way still arrives."""
         self._ahead = ExtentSet()
 
     def drop_wants(self) -> None:
@@ -120,13 +121,13 @@ class ReadTransfer(Operation):
 
     @property
     def priority(self) -> Priority:
-        """DEMAND while somebody waits."""
+        """DEMAND while a program waits."""
         return Priority.READAHEAD if self._demand.empty else Priority.DEMAND
 
     # --- requests
 
     def next_requests(self, most: int, now: float) -> list[Request]:
-        """Return ReadFile requests for a row of chunks; what somebody waits for goes first."""
+        """Return ReadFile requests for a row of chunks; demand goes first."""
         chunk = self.chunks.next_size(now)
         limit = chunk if self.chunks.trying else most * chunk
         row = self._demand.take_first(limit) or self._ahead.take_first(limit)
@@ -202,7 +203,7 @@ class ReadTransfer(Operation):
         return nak
 
     def takes_back(self, request: Request, now: float) -> bool:
-        """See Operation: the bytes of one that was too long are asked for by others."""
+        """See Operation: the bytes of a chunk that was too long are asked for in shorter ones."""
         if request.opcode != _READ or not self.chunks.on_lost(request.size, request.sent_at, now):
             return False
         del self._unanswered[request]

@@ -1,8 +1,9 @@
 """One request on its way, and the manner in which each opcode is repeated. Layer: protocol; pure.
 
-A manner says what a lost answer may cost. Reads, writes and listings may be executed twice, so each
-transmission gets its own seq and can be told apart. Everything that changes the server goes out
-again under the *same* seq first, because PX4 and ArduPilot replay their last reply (servers.md 2).
+A manner says how a request is repeated after its answer was lost. Reads, writes and listings may be executed
+twice. So each of their transmissions has its own seq, and can be told apart. A request that changes the
+server goes out again under the *same* seq first, because PX4 and ArduPilot replay their last reply
+(servers.md 2).
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from mavftpfs.shared.model import Traits
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
 _LONG_FROM = 3
-"""The first transmission of a request that is sent in full length, however short it is."""
+"""From this transmission on, every second one of a short request has full length (see `encode`)."""
 
 
 class Manner(NamedTuple):
     """How requests of one opcode are timed and repeated.
 
-    family: whose round trips are alike. same_seq: repeat under the same seq. ordered: servers answer
+    family: opcodes with similar round trips. same_seq: repeat under the same seq. ordered: servers answer
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
-    offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions
-    on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38); of the
-    family "work", what the slowest server needs.
-    once: never repeated, and the engine tells nobody of its loss.
+    offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions on,
+    wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38). In the
+    family "work" `patience` is the time that the slowest server needs. once: never repeated, and its loss is
+    not reported.
     """
 
     family: str
@@ -77,7 +78,7 @@ class Transmission(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """What is asked, and what became of it so far.
+    """A request, and what became of it so far.
 
     follows: carries the engine's session. aliases: earlier transmissions by the seq of their replies.
     seq, order, sent_at, single, outrun: of the present transmission (see Transmission).
@@ -118,7 +119,7 @@ class Request:
 def encode(requests: Sequence[Request]) -> list[bytes]:
     """Return the 251 wire bytes of each under its present seq; its data must fit.
 
-    A parser that a damaged frame told a wrong length takes up to 255 bytes of what comes next for the rest of
+    After a frame whose length was damaged, a parser takes up to 255 bytes of the next frames for the rest of
     it. So every second of the later repetitions has full length, by a last byte that no server reads.
     """
     wires = []
@@ -171,7 +172,7 @@ class Operation:
 
     The engine sets `progress_at` (inf while nothing is wanted of the server) and fails the operation
     with RequestTimeout when there was no progress for `patience` seconds (inf: the engine's deadline).
-    `timer` is when `on_timer` wants to be called. An operation ends by `finish` or `fail`, once.
+    `timer` is the time at which `on_timer` is to be called. An operation ends by `finish` or `fail`, once.
     """
 
     rank = Priority.METADATA
@@ -210,7 +211,8 @@ class Operation:
         return False
 
     def waits(self, now: float) -> bool:
-        """Return whether something is wanted of the server: since now, if nothing was before."""
+        """Return whether something is wanted of the server. If nothing was before, its patience starts
+        now."""
         if self.idle:
             self.progress_at = inf
             return False
@@ -232,7 +234,7 @@ class Operation:
         raise NotImplementedError
 
     def takes_back(self, request: Request, now: float) -> bool:
-        """One was lost; return whether its bytes are asked for by other requests in its place."""
+        """Return whether the bytes of a lost request are asked for by other requests in its place."""
         return False
 
     def on_burst_sent(self, request: Request, now: float) -> int:
@@ -244,7 +246,7 @@ class Operation:
         return False
 
     def on_timer(self, now: float) -> None:
-        """`timer` has passed; set it anew."""
+        """Act, because `timer` has passed, and set the next one."""
         self.timer = inf
 
     def finish(self) -> None:

@@ -22,21 +22,23 @@ _MAX_DOUBLINGS = 7
 _FIRST_WAITS = {"list": 0.5}
 """Seconds to wait while no round trip is known, where that is not INITIAL_RTO.
 
-A mount begins with a listing, whose loss somebody waits for. Each transmission of one has its own seq: where
-it is repeated in vain its answer tells the round trip all the same, and a second execution changes nothing.
+A mount begins with a listing, and a user waits if it is lost. Each transmission of a listing has its own seq.
+So after a needless repetition the answer tells the round trip all the same, and a second execution changes
+nothing.
 """
 
 _MOVING = ("data", "write")
 _WORK = "work"
 _NO_WORK = 0.1
-"""Seconds of work that count as none: what takes no longer times the way and the server's readiness."""
+"""Seconds of work that count as none: a request that takes no longer measures the way and the server's
+readiness."""
 _USUAL_PACE = 0.1
-"""Cards read a megabyte per second and more: a checksum is asked for again when one of those would have had
-it. It is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md 2), and
-MAVSDK, which works again, is a computer."""
+"""Usual cards read a megabyte per second and more. A checksum is asked for again when a usual card would have
+answered. That is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md
+2). MAVSDK computes it again, but it is a computer."""
 
 _USUAL_SENDS = 3
-"""Transmissions that may go out so; then the slowest card gets its time."""
+"""So many transmissions go out like that; then the slowest card gets its time."""
 
 
 class RttEstimator:
@@ -90,8 +92,8 @@ class RttEstimator:
 
 
 class Timers:
-    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first; moving: that of
-    the data that moved last, read or written, if any did."""
+    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first. moving: the
+    estimator of the data that moved last, read or written."""
 
     def __init__(self) -> None:
         self.of = {
@@ -146,7 +148,8 @@ class Timers:
             if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
                 work = max(work * _USUAL_PACE, min(work, _NO_WORK))
             base, rto = base + work, rto + work
-        # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
+        # Under the same seq a repetition does not tell the round trip. If that is not known yet, it may be
+        # long.
         free = manner.free_sends if timer.samples or not manner.same_seq else 1
         doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
         wait = max(rto, min(base * (1 << doublings), LONGEST_BACK_OFF))

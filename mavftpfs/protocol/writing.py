@@ -1,6 +1,6 @@
 """Writing an open file by a window of WriteFile requests. Layer: protocol; pure.
 
-The source gives chunks in ascending order and hears what became of each: ACKed, or not sent after all.
+The source gives chunks in ascending order, and is told what became of each: ACKed, or not sent after all.
 A lost request goes out again with the same bytes at the same offset, so executing it twice changes nothing.
 """
 
@@ -43,7 +43,7 @@ _ROW = 64
 
 _BARREN_TOLERATED = 3
 _NO_FILE_ERRNOS = frozenset((0, 9))
-"""PX4 says errno 0, or EBADF, of a write to a session that somebody reset."""
+"""PX4 says errno 0, or EBADF, to a write in a session that another client reset."""
 
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
@@ -67,8 +67,8 @@ class ChunkSource(Protocol):
 
 
 class Pieces:
-    """A source that is sent once, in order. No request ends within a piece, but where one piece is longer
-    than a request. progress: told how many bytes were ACKed.
+    """A source that is sent once, in order. No request ends within a piece, unless the piece is longer than a
+    request. progress: called with the bytes of each ACK.
     """
 
     def __init__(self, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None) -> None:
@@ -105,8 +105,8 @@ class WriteTransfer(Operation):
     Args:
         session: id of the file open for writing. chunks: the size of requests.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
-        on_starved: called when the source has nothing more, which after a full window shows only once all of
-            that was answered.
+        on_starved: called when the source has nothing more. After a full window that shows only when all of
+            it was answered.
 
     Attributes:
         acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
@@ -143,7 +143,7 @@ class WriteTransfer(Operation):
         self.trailing = False
         self._starved = False
         self._barren = 0
-        self._usual: bytes | None = None  # what says that a full chunk was written
+        self._usual: bytes | None = None  # the data of an ACK to a full chunk
 
     # --- what the owner says and sees
 
@@ -152,7 +152,8 @@ class WriteTransfer(Operation):
         self._starved = False
 
     def repeat_nothing(self) -> None:
-        """The file is closed behind what is on its way: what of it is lost stays so until `finish`."""
+        """Stop repeating, because the file is closed right behind what is on its way. Lost bytes stay lost
+        until `finish`."""
         self.paused = self.trailing = True
         for request in self._unanswered:
             request.manner = LAST_WRITE_MANNER
@@ -281,7 +282,7 @@ class WriteTransfer(Operation):
         return nak
 
     def takes_back(self, request: Request, now: float) -> bool:
-        """See Operation: the bytes of one that was too long go out in others."""
+        """See Operation: the bytes of a chunk that was too long go out in shorter ones."""
         if not self.chunks.on_lost(request.size, request.sent_at, now):
             return False
         del self._unanswered[request]
@@ -293,7 +294,8 @@ class WriteTransfer(Operation):
         return True
 
     def finish(self) -> None:
-        """End; what was not ACKed goes back to the source. Its late effects are those of a repetition."""
+        """End; what was not ACKed goes back to the source. A request that arrives late does no more than a
+        repetition."""
         if self.done:
             return
         pieces = ExtentSet()
