@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from mavftpfs.client.status import said_of_double
 from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
 from mavftpfs.link.rendezvous import hubs, port_name
 from mavftpfs.link.uri import parse_source
@@ -91,10 +92,7 @@ def status_lines(facts: Status) -> Iterator[str]:
         heard = "not heard" if ago is None else f"heard {readable_time(ago)} ago"
         yield f"  forward {endpoint['endpoint']}: {endpoint['problem'] or heard}"
     for double in facts["doubles"]:
-        yield (
-            f"  a second vehicle has the system id {double['system']}: it is ignored at {double['address']}; "
-            "give each an id of its own"
-        )
+        yield f"  {said_of_double(double['system'], double['address'])}"
 
 
 def _hubs(source: str | None, request: Facts) -> Iterator[tuple[Path, Status]]:

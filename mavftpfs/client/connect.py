@@ -32,7 +32,7 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.link.peers import describe_peer
-from mavftpfs.link.rendezvous import same_link
+from mavftpfs.link.rendezvous import leads_back
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
@@ -154,7 +154,7 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
     own = Address(options.source_system, options.source_component)
     wish = Wish(own, options.forward, process_name(), beats)
     for place in options.forward:
-        if same_link(parse_source(place), spec):
+        if leads_back(parse_source(place), spec):
             raise UsageError(
                 f"forward={place} is SOURCE itself; name another place, such as udpout:127.0.0.1:14551"
             )
@@ -282,9 +282,13 @@ def others_heard(connection: Connection, options: Options) -> str:
 
 
 def process_name() -> str:
-    """Return what a hub shows people of this program: its words, and its number."""
-    words = [word for word in sys.argv[1:4] if not word.startswith("-")]
-    return f"{' '.join(words)} (process {os.getpid()})"
+    """Return what a hub shows people of this program: its name, or the words of a command of ours; and its
+    number."""
+    path = Path(sys.argv[0] if sys.argv else "")
+    name = path.parent.name if path.name == "__main__.py" else path.name
+    if name == "mavftpfs":
+        name = " ".join(word for word in sys.argv[1:4] if not word.startswith("-"))
+    return f"{'python' if name in ('', '-c') else name} (process {os.getpid()})"
 
 
 @asynccontextmanager

@@ -216,7 +216,15 @@ def told_by(mountpoint: str) -> Status | None:
 def second_vehicle(status: Status) -> str:
     """Return what is said of a second vehicle with the system id of the one that counts."""
     system, address = status["vehicle"]["system"], status["link"]["second"]
-    return f"a second vehicle has the system id {system}, at {address}: it is ignored; give each its own id"
+    return said_of_double(system, address)
+
+
+def said_of_double(system: int, address: str) -> str:
+    """Return what is said of an address that speaks with a system id that is another one's."""
+    return (
+        f"a second vehicle has the system id {system}, or a router sends frames back: ignored at {address}; "
+        "give each vehicle its own id"
+    )
 
 
 def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -> str:

@@ -33,7 +33,7 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door, same_link
+from mavftpfs.link.rendezvous import Door, leads_back
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
 
@@ -47,6 +47,7 @@ FIRST_PATIENCE = 10.0
 """Seconds for the first client to join."""
 HELLO_PATIENCE = 10.0
 
+_DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or frames that a router sends back"
 _POLL = 0.003
 _LOOK = 1.0
 _RETRY = 2.0
@@ -275,7 +276,7 @@ class Hub:
             if text in self._endpoints:
                 continue
             spec = parse_source(text)
-            if same_link(spec, self.spec):
+            if leads_back(spec, self.spec):
                 raise UsageError(f"forward={text} is SOURCE itself")
             self._sides += 1
             endpoint = self._endpoints[text] = _Endpoint(self._sides, text, spec)
@@ -440,8 +441,7 @@ class Hub:
             for sender, where in self.router.doubles.items():
                 if sender not in self._said_doubles:
                     self._said_doubles.add(sender)
-                    text = "%s says that it is %d/%d, too: two vehicles with one system id? Give each its own"
-                    log.warning(text, readable_address(where), *sender)
+                    log.warning(_DOUBLE, readable_address(where), *sender)
             await trio.sleep(_LOOK)
 
     def _end_if_done(self) -> None:

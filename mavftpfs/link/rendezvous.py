@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import ipaddress
 import os
 import socket
 import struct
@@ -17,13 +18,15 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.link.uri import LOOPBACK, LinkKind, LinkSpec
 from mavftpfs.shared.private import own_directories, private_directory
 
 HUB = ".hub"
 ALONE = ".port"
 """The end of a door's name tells what is behind it: a hub, or a program that has the port alone."""
 
+_ANYWHERE = {"0.0.0.0", "::"}
+_LISTENING = {LinkKind.UDP_OUT: LinkKind.UDP_IN, LinkKind.TCP_OUT: LinkKind.TCP_IN}
 _QUEUE = 64
 _NETWORK = "/proc/self/ns/net"
 _LOCK_PATIENCE = 30.0
@@ -49,7 +52,31 @@ def same_link(one: LinkSpec, other: LinkSpec) -> bool:
     if one.port != other.port:
         return False
     listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
+    return one.host == other.host or (listens and bool({one.host, other.host} & _ANYWHERE))
+
+
+def leads_back(endpoint: LinkSpec, source: LinkSpec) -> bool:
+    """Return whether frames for an endpoint would be SOURCE's own: it is the same link, or one of them sends
+    to where the other listens."""
+    return same_link(endpoint, source) or _reaches(endpoint, source) or _reaches(source, endpoint)
+
+
+def _reaches(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether one link sends to where the other listens."""
+    if _LISTENING.get(one.kind) is not other.kind or one.port != other.port:
+        return False
+    host = LOOPBACK if one.host == "localhost" else one.host
+    return host == other.host or (other.host in _ANYWHERE and _is_here(host))
+
+
+def _is_here(host: str) -> bool:
+    """Return whether a numeric address is one of this computer's."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.bind((str(ipaddress.ip_address(host)), 0))
+        except (OSError, ValueError):
+            return False
+        return True
 
 
 def knock(name: str) -> socket.socket | None:

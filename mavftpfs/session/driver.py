@@ -27,7 +27,7 @@ log = logging.getLogger("mavftpfs.session")
 _MOVED = "the vehicle is not heard at %s any more; asking who it is at %s"
 _IGNORED = (
     "%s says that it is %d/%d, too: ignored as long as the vehicle is heard where it was; "
-    "if these are two vehicles, give each a system id of its own"
+    "if these are two vehicles, and not frames that a router sends back, give each a system id of its own"
 )
 
 QUIET = 0.5

@@ -276,14 +276,45 @@ def test_a_vehicle_that_floods_does_not_slow_the_other(field: Field) -> None:
         assert sent > 1000
 
 
+class Mirror:
+    """A router beside the mount that sends what it gets back to SOURCE's port."""
+
+    def __init__(self, port: int, back: int) -> None:
+        self.sent = 0
+        self._back = back
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind((HOST, port))
+        self._sock.settimeout(0.5)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Mirror:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._sock.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with suppress(TimeoutError):
+                self._sock.sendto(self._sock.recv(65536), (HOST, self._back))
+                self.sent += 1
+
+
 def test_dead_endpoints_and_loops_harm_nobody(field: Field) -> None:
-    root, port = flown_card(field), free_udp_port()
+    root, port, mirror = flown_card(field), free_udp_port(), free_udp_port()
     flown = Flown(field, root, f"udpout:{HOST}:{port}")
-    dead = [forwarded(free_udp_port()), f"forward=tcp:{HOST}:{free_udp_port()}", forwarded(port)]
-    with ended(flown):
+    dead = [forwarded(free_udp_port()), f"forward=tcp:{HOST}:{free_udp_port()}", forwarded(mirror)]
+    with ended(flown), Mirror(mirror, port) as loop:
         mount = field.mount(f"udpin:{HOST}:{port}", *dead, "dir_timeout=0")
         mount.allowed_log = (r"says that it is 1/1, too",)
         harms_nothing(field, mount, root)
+        wait_until("frames came back", lambda: loop.sent > 100)
+        for words in (("hub", f"udpin:{HOST}:{port}"), ("status", mount.path)):
+            assert "or a router sends frames back: ignored at" in mavftpfs(*words)[0]
 
 
 def test_two_stations_with_one_id_both_work(field: Field) -> None:
@@ -408,6 +439,7 @@ def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
         other.bind((HOST, taken))
         for option, code, said in (
             (f"forward={flown.source}", 1, "is SOURCE itself"),
+            (f"forward=udpout:{HOST}:{flown.source.rpartition(':')[2]}", 1, "is SOURCE itself"),
             (f"forward=udpin:{HOST}:{taken}", 2, "is in use by another program"),
             ("forward=serial:///dev/nowhere:57600", 2, "there is no /dev/nowhere"),
             ("forward=nonsense", 1, "forward=nonsense"),

@@ -90,7 +90,7 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
         nursery.cancel_scope.cancel()
     assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
         "10.0.0.2:14550 says that it is 1/1, too: ignored as long as the vehicle is heard where it was; "
-        "if these are two vehicles, give each a system id of its own"
+        "if these are two vehicles, and not frames that a router sends back, give each a system id of its own"
     ]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +11,13 @@ import pytest
 
 from mavftpfs.cli.verbs import parse_date
 from mavftpfs.client import download, fetch, proof
+from mavftpfs.client.connect import process_name
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
 from mavftpfs.client.proof import Verify
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.peers import describe_peer
-from mavftpfs.link.rendezvous import same_link
+from mavftpfs.link.rendezvous import leads_back, same_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import UsageError
 
@@ -138,6 +141,43 @@ def test_dates() -> None:
 )
 def test_the_same_link(one: str, other: str, same: bool) -> None:
     assert same_link(parse_source(one), parse_source(other)) is same
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "source", "back"),
+    [
+        ("udpout:127.0.0.1:14550", "udpin:0.0.0.0:14550", True),
+        ("udpout:localhost:14550", "udpin:127.0.0.1:14550", True),
+        ("udpout:[::1]:14550", "udpin:[::]:14550", True),
+        ("udpout:127.0.0.1:14551", "udpin:0.0.0.0:14550", False),
+        ("udpout:203.0.113.9:14550", "udpin:0.0.0.0:14550", False),
+        ("udpout:127.0.0.2:14550", "udpin:127.0.0.1:14550", False),
+        ("udpout:station.invalid:14550", "udpin:0.0.0.0:14550", False),
+        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", True),
+        ("tcp:127.0.0.1:5760", "tcpin:0.0.0.0:5760", True),
+        ("tcp:127.0.0.1:5760", "udpin:0.0.0.0:5760", False),
+        ("/dev/null", "/dev/null", True),
+    ],
+)
+def test_an_endpoint_that_leads_back(endpoint: str, source: str, back: bool) -> None:
+    assert leads_back(parse_source(endpoint), parse_source(source)) is back
+
+
+@pytest.mark.parametrize(
+    ("argv", "name"),
+    [
+        (["/usr/bin/mavftpfs", "udpin:0.0.0.0:14550", "drone", "-o", "ro"], "udpin:0.0.0.0:14550 drone"),
+        (["/lib/mavftpfs/__main__.py", "ls", "-l", "drone"], "ls drone"),
+        (["/home/me/survey.py", "--token", "secret"], "survey.py"),
+        (["/home/me/survey/__main__.py"], "survey"),
+        (["-c"], "python"),
+        ([""], "python"),
+        ([], "python"),
+    ],
+)
+def test_what_a_hub_calls_a_program(monkeypatch: pytest.MonkeyPatch, argv: list[str], name: str) -> None:
+    monkeypatch.setattr(sys, "argv", argv)
+    assert process_name() == f"{name} (process {os.getpid()})"
 
 
 @pytest.mark.parametrize(
