@@ -134,6 +134,7 @@ class Inode:
     """One number the kernel may use.
 
     path: None once the name was removed. told_size: the size in bytes that the kernel last heard, if any.
+    believed_until: when the kernel asks for its attributes again (trio's clock).
     """
 
     ino: int
@@ -141,6 +142,11 @@ class Inode:
     path: bytes | None
     lookups: int = 0
     told_size: int | None = None
+    believed_until: float = 0.0
+
+
+MAX_ABSENT = 10_000
+"""Absent names that the kernel may believe at once."""
 
 
 class InodeTable:
@@ -151,6 +157,7 @@ class InodeTable:
         root = Inode(ROOT_INO, 0, ROOT)
         self._by_ino: dict[int, Inode] = {ROOT_INO: root}
         self._by_path: dict[bytes, Inode] = {ROOT: root}
+        self._absent: dict[tuple[int, bytes], float] = {}
         self.excess_forgets = 0
         """Forgets beyond the count: a bug here or in the kernel, never a crash."""
 
@@ -203,6 +210,21 @@ class InodeTable:
         inode.lookups = max(0, inode.lookups - lookups)
         if inode.lookups == 0:
             self._free(inode)
+
+    def note_absent(self, parent: int, name: bytes, until: float, now: float) -> bool:
+        """Note until when the kernel believes that a name is absent; False if there are too many to note."""
+        if len(self._absent) >= MAX_ABSENT:
+            self._absent = {known: at for known, at in self._absent.items() if at > now}
+        if len(self._absent) >= MAX_ABSENT:
+            return False
+        self._absent[parent, name] = until
+        return True
+
+    def believed(self, now: float) -> tuple[list[int], list[tuple[int, bytes]]]:
+        """Return what the kernel answers by itself now: inodes with attributes, and absent names with their
+        directory's inode."""
+        inodes = [ino for ino, inode in self._by_ino.items() if inode.believed_until > now]
+        return inodes, [known for known, until in self._absent.items() if until > now]
 
     def unlink(self, path: bytes) -> None:
         """The name is gone; the kernel may still hold the inode (an open file)."""

@@ -16,7 +16,7 @@ import select
 import signal
 import stat
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +38,7 @@ from mavftpfs.mount.handles import InodeTable, Presentation
 from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import MountOptions, fuse_words
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, exit_code_for
+from mavftpfs.shared.model import split
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -47,6 +48,9 @@ MAX_TASKS = 2000
 
 GRACE = 2.0
 """Seconds that requests in the works get to finish after a signal."""
+
+FORGETTING_TIME = 2.0
+"""Seconds for the kernel to forget what it cached, for a command that waits for that."""
 
 LAST_REPLIES = 3.0
 """Seconds to hand waiting control clients their reply at the end."""
@@ -107,15 +111,22 @@ async def serve_mount(request: MountRequest, attach: Attach, report: Report) -> 
 
 
 class Invalidator:
-    """Tells the kernel that what it cached of files is old; `notify(ino, attr_only)` is its call.
+    """Tells the kernel that what it cached is old, by its calls `notify(ino, attr_only)` and
+    `notify_name(parent ino, name)`.
 
-    That call runs in a worker thread: the kernel waits in it for pages that are being read, and those reads
-    are answered by the event loop.
+    These run in a worker thread: the kernel waits in them for pages that are being read and for names that
+    are looked up, and the event loop answers those.
     """
 
-    def __init__(self, inodes: InodeTable, notify: Callable[[int, bool], None]) -> None:
+    def __init__(
+        self,
+        inodes: InodeTable,
+        notify: Callable[[int, bool], None],
+        notify_name: Callable[[int, bytes], None] = lambda parent, name: None,
+    ) -> None:
         self._inodes = inodes
         self._notify = notify
+        self._notify_name = notify_name
         self._pending: set[int] = set()
         self._wake = trio.Event()
         self._calls: set[object] = set()
@@ -147,21 +158,39 @@ class Invalidator:
         """Have the kernel ask for attributes again; back when it has forgotten them."""
         await self._tell(ino, attr_only=True)
 
+    async def forget_name(self, path: bytes) -> None:
+        """Have the kernel look a name up again; back when it has forgotten it."""
+        directory, name = split(path)
+        parent = self._inodes.known(directory)
+        if parent is not None:
+            await self._in_thread([partial(self._notify_name, parent, name)])
+
+    async def forget_beliefs(self) -> None:
+        """Have the kernel ask again for all that it would answer by itself; back when it has forgotten it."""
+        inodes, absent = self._inodes.believed(trio.current_time())
+        calls = [partial(self._notify, ino, True) for ino in inodes]
+        await self._in_thread(calls + [partial(self._notify_name, *name) for name in absent])
+
     async def _tell(self, ino: int, *, attr_only: bool) -> None:
+        await self._in_thread([partial(self._notify, ino, attr_only)])
+
+    async def _in_thread(self, calls: Sequence[Callable[[], None]]) -> None:
         await trio.lowlevel.checkpoint_if_cancelled()
-        call = object()
-        self._calls.add(call)
-        action = partial(self._in_thread, call, ino, attr_only)
+        running = object()
+        self._calls.add(running)
+        action = partial(self._call, running, calls)
         await trio.to_thread.run_sync(action, abandon_on_cancel=True, limiter=self._limiter)
 
-    def _in_thread(self, call: object, ino: int, attr_only: bool) -> None:
+    def _call(self, running: object, calls: Sequence[Callable[[], None]]) -> None:
         try:
-            self._notify(ino, attr_only)
-        except OSError as exc:
-            if exc.errno != errno.ENOENT:  # the kernel forgot it by itself
-                log.warning("the kernel refused to drop its cache of inode %d: %s", ino, exc)
+            for call in calls:
+                try:
+                    call()
+                except OSError as exc:
+                    if exc.errno != errno.ENOENT:  # the kernel forgot it by itself
+                        log.warning("the kernel refused to drop what it cached: %s", exc)
         finally:
-            self._calls.discard(call)
+            self._calls.discard(running)
 
 
 class _Life:
@@ -195,7 +224,7 @@ class _Life:
         A second signal ends the delivery, not the keeping.
         """
         inodes = InodeTable()
-        invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
+        invalidator = Invalidator(inodes, pyfuse3.invalidate_inode, pyfuse3.invalidate_entry)
         async with attach(invalidator.on_changed) as vehicle:
             nursery.start_soon(vehicle.watcher.run)
             operations = Operations(
@@ -209,7 +238,7 @@ class _Life:
             try:
                 with kernel_mount(operations, self.request, invalidator):
                     self.mounted = True
-                    await self._start_control(vehicle, operations, nursery)
+                    await self._start_control(vehicle, operations, invalidator, nursery)
                     await self._serve(invalidator, vehicle.notice)
             finally:
                 await say_goodbye(vehicle.tree, self.request.source, self._on_undelivered)
@@ -235,7 +264,9 @@ class _Life:
 
     # -- control ----------------------------------------------------------------------------------
 
-    async def _start_control(self, vehicle: Attached, operations: Operations, nursery: trio.Nursery) -> None:
+    async def _start_control(
+        self, vehicle: Attached, operations: Operations, invalidator: Invalidator, nursery: trio.Nursery
+    ) -> None:
         if self.request.control is None:
             return
 
@@ -244,10 +275,19 @@ class _Life:
 
         async def forget(_: Reply) -> Reply:
             vehicle.tree.forget_caches()
+            # The kernel waits for lookups that are under way, and these wait for the vehicle.
+            with trio.move_on_after(FORGETTING_TIME):
+                await invalidator.forget_beliefs()
             return {}
 
         async def withdraw(request: Reply) -> Reply:
-            return {"there": await vehicle.tree.withdraw(os.fsencode(request["path"]))}
+            path = os.fsencode(request["path"])
+            there = await vehicle.tree.withdraw(path)
+            if there is False:
+                operations.inodes.unlink(path)  # a reader keeps what was withdrawn, by a number of its own
+            with trio.move_on_after(FORGETTING_TIME):
+                await invalidator.forget_name(path)
+            return {"there": there}
 
         commands = {"status": status, "umount": self._umount, "forget": forget, "withdraw": withdraw}
         server = ControlServer(self.request.control, commands)

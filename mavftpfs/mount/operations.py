@@ -177,7 +177,7 @@ class Operations(pyfuse3.Operations):
         try:
             found = await self._tree.stat(path)
         except NotFound:
-            return self._negative(path)
+            return self._negative(parent_inode, name, path)
         # The parent may have got another path meanwhile.
         return self._attributes(self.inodes.lookup(self._child(parent_inode, name)), found)
 
@@ -541,15 +541,18 @@ class Operations(pyfuse3.Operations):
             return parent
         return split(parent)[0] if name == b".." else join(parent, name)
 
-    def _negative(self, path: bytes) -> EntryAttributes:
+    def _negative(self, parent: int, name: bytes, path: bytes) -> EntryAttributes:
         entry = EntryAttributes()
         entry.st_ino = 0
-        entry.entry_timeout = self._tree.negative_valid_for(path)
+        now, valid_for = trio.current_time(), self._tree.negative_valid_for(path)
+        noted = self.inodes.note_absent(parent, name, now + valid_for, now)
+        entry.entry_timeout = valid_for if noted else 0.0
         return entry
 
     def _attributes(self, inode: Inode, found: Stat) -> EntryAttributes:
         look = self._look
         inode.told_size = found.size
+        inode.believed_until = trio.current_time() + found.valid_for
         entry = EntryAttributes()
         entry.st_ino = inode.ino
         entry.generation = inode.generation
