@@ -224,7 +224,7 @@ class Drone:
         self._loop.call(self._drone.write_bytes, path, data)
 
     def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
-        """Return a file's content as text."""
+        """Return a file's content as text, each end of a line as `\\n`."""
         return self._loop.call(self._drone.read_text, path, encoding)
 
     def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:

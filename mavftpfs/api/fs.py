@@ -255,8 +255,11 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
     def _open(
         self, path: str, mode: str = "rb", block_size: Any = None, autocommit: bool = True, **kwargs: Any
     ) -> Any:
-        if not autocommit:
-            raise NotImplementedError("a file of a vehicle is in its place when it is closed, or not at all")
+        if not autocommit and "r" not in mode:
+            raise NotImplementedError(
+                "a vehicle has no transactions: each file is in its place, whole, when it is closed; "
+                "write without fs.transaction"
+            )
         size = block_size if isinstance(block_size, int) and block_size > 1 else READ_BUFFER
         file = self._opened(path, mode, size)
         if "r" in mode:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import trio
 
-from mavftpfs.api.errors import translated
+from mavftpfs.api.errors import translated, whereabouts
 from mavftpfs.client.files import CLOSING_TIME, WITHDRAWAL_TIME, File, written
 from mavftpfs.shared.errors import MavftpfsError
+
+log = logging.getLogger("mavftpfs.api")
 
 PIECE = 1 << 20
 """Bytes of one read while a file is read to its end."""
@@ -30,7 +33,13 @@ class Opened:
         self._forget = forget
         self._failure: BaseException | None = None
         self._closed = False
+        self._changed = False
         self.there: bool | None = None
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed, and what was to be said of that was."""
+        return self._closed
 
     @property
     def size(self) -> int:
@@ -53,6 +62,7 @@ class Opened:
     async def write(self, offset: int | None, data: bytes) -> int:
         """Take all of `data`, at the end if no offset is given; return the offset behind it."""
         with translated():
+            self._changed = True
             try:
                 offset = self._file.size if offset is None else offset
                 return offset + await self._file.write(offset, data)
@@ -63,6 +73,7 @@ class Opened:
     async def truncate(self, size: int) -> None:
         """Cut or extend it."""
         with translated():
+            self._changed = True
             try:
                 await self._file.truncate(size)
             except BaseException as exc:
@@ -98,11 +109,14 @@ class Opened:
             raise MavftpfsError(f"{self.name}: writing it was interrupted")
 
     async def abandon(self) -> None:
-        """Close it without delivering what was written, which is withdrawn. Twice is harmless; raises nothing
-        of ours."""
+        """Close it without delivering what was written, which is withdrawn, or said where it cannot be. Twice
+        is harmless; raises nothing of ours."""
         if self._closed:
             return
         self._closed = True
         self._forget(self)
+        there: bool | None = None
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
-            await self._file.give_up()
+            there = await self._file.give_up()
+        if self._changed and there is not False:
+            log.error("%s: %s", self.name, whereabouts(None))

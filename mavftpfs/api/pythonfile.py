@@ -187,6 +187,8 @@ class RawFile(_Ending, io.RawIOBase):
         if self.closed or getattr(self, "_pid", None) != os.getpid():
             return
         super().close()
+        if self._opened.closed:
+            return
         lost = ": what was written to it is withdrawn" if self._mode.writes else ""
         self._portal.post(self._opened.abandon)
         if lost:

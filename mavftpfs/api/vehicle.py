@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -28,7 +29,7 @@ from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
 from mavftpfs.client.source import target_of
-from mavftpfs.shared.errors import AlreadyExists, NotADirectory, NotFound, UsageError
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound, UsageError
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
 from mavftpfs.shared.readable import name_text
 
@@ -69,6 +70,11 @@ def remote(path: PathLike) -> bytes:
         LocalProtocolError: it holds `..` or NUL.
     """
     return normalise(b"/" + os.fsencode(path))
+
+
+def names_directory(path: PathLike) -> bool:
+    """Return whether a path ends in a slash."""
+    return os.fsencode(path).endswith(b"/")
 
 
 def entry(path: bytes, stat: Stat) -> Entry:
@@ -112,6 +118,17 @@ class Drone:
         """Whether a file of it is open."""
         return bool(self._opened)
 
+    async def _existing(self, path: PathLike) -> bytes:
+        """Return a path as the client has it, after a look if it ends in a slash: then it is no file's.
+
+        Raises:
+            NotADirectory, NotFound: it ends in a slash.
+        """
+        wanted = remote(path)
+        if names_directory(path) and (await self._files.stat(wanted)).kind is EntryKind.FILE:
+            raise NotADirectory(f"{wanted!r} is not a directory")
+        return wanted
+
     # --- looking
 
     async def stat(self, path: PathLike) -> Entry:
@@ -121,7 +138,7 @@ class Drone:
             FileNotFoundError, NotADirectoryError.
         """
         with translated():
-            wanted = remote(path)
+            wanted = await self._existing(path)
             return entry(wanted, await self._files.stat(wanted))
 
     async def scandir(self, path: PathLike = "/") -> list[Entry]:
@@ -166,14 +183,14 @@ class Drone:
     async def _kind(self, path: PathLike) -> EntryKind | None:
         with translated():
             try:
-                return (await self._files.stat(remote(path))).kind
+                return (await self._files.stat(await self._existing(path))).kind
             except (NotFound, NotADirectory):
                 return None
 
     async def crc32(self, path: PathLike) -> int:
         """Have the vehicle compute a file's CRC32: start value 0, and no final xor."""
         with translated():
-            return await self._files.crc32(remote(path))
+            return await self._files.crc32(await self._existing(path))
 
     async def status(self) -> dict[str, Any]:
         """Return what `mavftpfs status --json` tells of vehicle, link and transfers."""
@@ -230,24 +247,33 @@ class Drone:
             FileNotFoundError, IsADirectoryError.
         """
         with translated():
-            wanted = [remote(path)]
-            names.refuse_root(wanted)
-            await names.remove_paths(self._session, wanted, recursive=recursive)
+            wanted = await self._existing(path)
+            names.refuse_root([wanted])
+            if recursive:
+                await names.remove_paths(self._session, [wanted], recursive=True)
+            else:
+                await self._files.unlink(wanted)
 
     async def rename(self, old: PathLike, new: PathLike) -> None:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
         with translated():
-            await names.move(self._files, remote(old), remote(new))
+            source, target = await self._existing(old), remote(new)
+            if names_directory(new) and (await self._files.stat(source)).kind is EntryKind.FILE:
+                raise NotADirectory(f"{source!r} is not a directory")
+            await names.move(self._files, source, target)
 
     async def copy(self, old: PathLike, new: PathLike) -> None:
         """Copy a file, by way of this computer."""
         with translated():
-            await names.copy(self._files, remote(old), remote(new))
+            source = await self._existing(old)
+            if names_directory(new):
+                raise IsADirectory(f"{remote(new)!r} is a directory")
+            await names.copy(self._files, source, remote(new))
 
     async def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it by zeros."""
         with translated():
-            await self._files.truncate(remote(path), size)
+            await self._files.truncate(await self._existing(path), size)
 
     # --- whole files
 
@@ -272,8 +298,8 @@ class Drone:
             await opened.close()
 
     async def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
-        """Return a file's content as text."""
-        return (await self.read_bytes(path)).decode(encoding)
+        """Return a file's content as text, each end of a line as `\\n`."""
+        return io.TextIOWrapper(io.BytesIO(await self.read_bytes(path)), encoding).read()
 
     async def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:
         """Make a file or replace its content by a text."""
@@ -298,7 +324,7 @@ class Drone:
         """
 
         async def work(downloads: download.Downloads) -> None:
-            await downloads.get([remote(path)], Path(local), into=False, recursive=recursive)
+            await downloads.get([await self._existing(path)], Path(local), into=False, recursive=recursive)
 
         outcome = await self._download(verify, work)
         return [fetched.wanted.local for fetched in outcome.fetched]
@@ -357,7 +383,8 @@ class Drone:
             found = upload.collect(Path(local), recursive=recursive)
             batches = [(Path(local), found)]
             tell = lambda where, size, how: told.append(os.fsdecode(where))  # noqa: E731
-            await upload.put_paths(self._session, batches, remote(path), Progress(), tell)
+            into = names_directory(path)
+            await upload.put_paths(self._session, batches, remote(path), Progress(), tell, into=into)
         return told
 
     # --- opening
@@ -387,6 +414,10 @@ class Drone:
         """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""
         with translated():
             wanted, files = remote(path), self._files
+            if mode[0] == "r":
+                await self._existing(path)
+            elif names_directory(path):
+                raise IsADirectory(f"{wanted!r} is a directory")
             match mode[0]:
                 case "r":
                     file = await files.open(wanted, write="+" in mode)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -30,7 +30,7 @@ from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import NotFound
-from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
+from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
 from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
@@ -140,13 +140,19 @@ async def written(
     Raises:
         NotDelivered: it is not delivered; its cause says why, and `there` what is on the card instead.
     """
+    whole = False
     try:
         yield
+        whole = True
         await file.fsync()
     except BaseException as exc:
         there: bool | None = None
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             there = await file.give_up()
+        if there and not whole:
+            there = (
+                None  # through a mount, a fork in mid-write closed a copy of the descriptor: a part is there
+            )
         tell(there)
         if isinstance(exc, errors.MavftpfsError):
             raise errors.NotDelivered(str(exc), there=there) from exc
@@ -350,6 +356,20 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
 }
 
 
+_SENTENCES = {
+    errors.NotFound: "does not exist",
+    errors.NotADirectory: "is not a directory",
+    errors.IsADirectory: "is a directory",
+    errors.AlreadyExists: "exists",
+    errors.DirectoryNotEmpty: "is not empty",
+}
+"""What the caches say of the same."""
+_ABOUT_TARGET = (
+    *(errors.NotADirectory, errors.IsADirectory, errors.AlreadyExists, errors.DirectoryNotEmpty),
+)
+"""What rename(2) refuses because of the new name."""
+
+
 _HINTS = {
     errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
     errors.NotDeliveredYet: " (the vehicle is armed, or has not got all of it yet)",
@@ -359,8 +379,23 @@ _HINTS = {
 def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
     number = error.errno or errno.EIO
     kind = _BY_ERRNO.get(number)
+    if kind in _SENTENCES:
+        return kind(_sentence(kind, path))
     text = f"{name_text(path)}: {os.strerror(number)}"
     return errors.OtherRefusal(text, number) if kind is None else kind(text + _HINTS.get(kind, ""))
+
+
+def _sentence(kind: type[errors.MavftpfsError], path: bytes) -> str:
+    return f"{path!r} {_SENTENCES[kind]}"
+
+
+@contextmanager
+def _about_parent(path: bytes) -> Iterator[None]:
+    """Where the body makes a path, what is missing is its directory."""
+    try:
+        yield
+    except NotFound as exc:
+        raise NotFound(_sentence(NotFound, split(path)[0])) from exc
 
 
 async def _call(path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
@@ -457,7 +492,8 @@ class MountedFiles:
 
     async def create(self, path: bytes, *, exclusive: bool) -> MountedFile:
         """As os.open with O_CREAT."""
-        return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
+        with _about_parent(path):
+            return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
 
     async def _open(self, path: bytes, flags: int) -> MountedFile:
         def opened(place: bytes) -> tuple[int, int]:
@@ -487,7 +523,8 @@ class MountedFiles:
 
     async def mkdir(self, path: bytes) -> None:
         """As os.mkdir."""
-        await _call(path, os.mkdir, self._place(path))
+        with _about_parent(path):
+            await _call(path, os.mkdir, self._place(path))
 
     async def rmdir(self, path: bytes) -> None:
         """As os.rmdir."""
@@ -499,7 +536,10 @@ class MountedFiles:
 
     async def rename(self, old: bytes, new: bytes) -> None:
         """As os.rename."""
-        await _call(old, os.rename, self._place(old), self._place(new))
+        try:
+            await _call(old, os.rename, self._place(old), self._place(new))
+        except _ABOUT_TARGET as exc:
+            raise type(exc)(_sentence(type(exc), new)) from exc
 
     def forget_caches(self) -> None:
         """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""

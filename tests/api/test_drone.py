@@ -33,26 +33,23 @@ class Local:
     def mkdir(self, path: str, *, parents: bool = False, exist_ok: bool = False) -> None:
         Path(path).mkdir(parents=parents, exist_ok=exist_ok)
 
-    def exists(self, path: str) -> bool:
-        return Path(path).exists()
-
-    def is_dir(self, path: str) -> bool:
-        return Path(path).is_dir()
-
-    def is_file(self, path: str) -> bool:
-        return Path(path).is_file()
+    exists, is_dir, is_file = map(staticmethod, (os.path.exists, os.path.isdir, os.path.isfile))
 
     def read_text(self, path: str) -> str:
-        return Path(path).read_text()
+        with open(path) as file:
+            return file.read()
 
     def write_text(self, path: str, text: str) -> None:
-        Path(path).write_text(text)
+        with open(path, "w") as file:
+            file.write(text)
 
     def read_bytes(self, path: str) -> bytes:
-        return Path(path).read_bytes()
+        with open(path, "rb") as file:
+            return file.read()
 
     def write_bytes(self, path: str, data: bytes) -> None:
-        Path(path).write_bytes(data)
+        with open(path, "wb") as file:
+            file.write(data)
 
 
 CALLS: dict[str, Call] = {
@@ -91,6 +88,25 @@ CALLS: dict[str, Call] = {
     "read a directory": lambda on, d: on.read_bytes(d + "/e"),
     "write a directory": lambda on, d: on.write_bytes(d + "/e", b""),
     "write below nothing": lambda on, d: on.write_bytes(d + "/nothing/n", b""),
+    "exists, with a slash": lambda on, d: [on.exists(d + name) for name in ("/a/", "/e/", "/nothing/")],
+    "a file, with a slash": lambda on, d: (on.is_file(d + "/a/"), on.is_dir(d + "/a/")),
+    "stat a file, with a slash": lambda on, d: on.stat(d + "/a/"),
+    "stat nothing, with a slash": lambda on, d: on.stat(d + "/nothing/"),
+    "remove a file, with a slash": lambda on, d: on.remove(d + "/a/"),
+    "remove a directory, with a slash": lambda on, d: on.remove(d + "/e/"),
+    "rename a file, with a slash": lambda on, d: on.rename(d + "/a/", d + "/n"),
+    "rename a file to a slash": lambda on, d: on.rename(d + "/a", d + "/n/"),
+    "rename a directory to a slash": lambda on, d: on.rename(d + "/e/", d + "/n/"),
+    "truncate a file, with a slash": lambda on, d: on.truncate(d + "/a/", 1),
+    "read a file, with a slash": lambda on, d: on.read_bytes(d + "/a/"),
+    "read a directory, with a slash": lambda on, d: on.read_bytes(d + "/e/"),
+    "read nothing, with a slash": lambda on, d: on.read_bytes(d + "/nothing/"),
+    "write a file, with a slash": lambda on, d: on.write_bytes(d + "/a/", DATA),
+    "write nothing, with a slash": lambda on, d: on.write_bytes(d + "/n/", DATA),
+    "mkdir, with a slash": lambda on, d: on.mkdir(d + "/n/"),
+    "rmdir, with a slash": lambda on, d: on.rmdir(d + "/e/"),
+    "ends of lines": lambda on, d: (on.write_bytes(d + "/n", b"1\r\n2\r3\n"), on.read_text(d + "/n")),
+    "text of one kind": lambda on, d: on.write_text(d + "/n", "1\r\n2\n"),
 }
 
 
@@ -172,6 +188,12 @@ def test_get_and_put(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None
         shared.get(f"{card.name}/nothing", tmp_path / "z")
     with pytest.raises(ValueError, match="is not there"):
         shared.put(tmp_path / "nothing", card.name)
+    with pytest.raises(FileNotFoundError, match="no such directory"):
+        shared.put(tmp_path / "x", f"{card.name}/nothing/")
+    with pytest.raises(NotADirectoryError):
+        shared.get(f"{card.name}/d/e/f/", tmp_path / "z")
+    with pytest.raises(IsADirectoryError):
+        shared.copy(f"{card.name}/d/e/f", f"{card.name}/nothing/")
 
 
 def test_sync(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:
@@ -335,6 +357,49 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
     with mavftpfs.connect(vehicle.source, use_mount=False) as drone:
         assert drone.mountpoint is None
         assert drone.read_bytes("/f") == DATA
+
+
+NAMED = [
+    *("list a file", "list nothing", "stat nothing", "mkdir there", "mkdir below nothing", "rmdir full"),
+    *("rmdir a file", "remove a directory", "remove nothing", "rename nothing", "rename over a directory"),
+    *("truncate nothing", "read a directory", "write a directory", "write below nothing"),
+]
+
+
+@pytest.mark.mount
+def test_an_error_is_said_in_the_same_words_over_a_mount(field: Field) -> None:
+    card = field.local("card")
+    (card / "d/e").mkdir(parents=True)
+    for name in ("a", "b"):
+        (card / "d" / name).touch()
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source)
+    for name in NAMED:
+        said = []
+        for use_mount in (False, True):
+            with mavftpfs.connect(vehicle.source, use_mount=use_mount) as drone:
+                assert (drone.mountpoint == str(mount.path)) == use_mount
+                with pytest.raises(OSError, match="/") as caught:
+                    CALLS[name](drone, "/d")
+                said.append((type(caught.value), str(caught.value)))
+        assert said[0] == said[1], name
+
+
+@pytest.mark.mount
+def test_refresh_reaches_the_kernel_of_a_mount(field: Field) -> None:
+    card = field.local("card")
+    (card / "f").write_bytes(DATA)
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, "negative_timeout=600", "attr_timeout=600", "dir_timeout=600")
+    with mavftpfs.connect(str(mount.path)) as drone:
+        assert drone.stat("/f").size == len(DATA)
+        assert not drone.exists("/others")
+        (card / "others").touch()
+        (card / "f").write_bytes(b"short")
+        assert not drone.exists("/others")
+        drone.refresh()
+        assert drone.exists("/others")
+        assert drone.stat("/f").size == 5
 
 
 @pytest.mark.mount

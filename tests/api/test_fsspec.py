@@ -155,6 +155,15 @@ def test_calls_of_its_own(fs: DroneFileSystem) -> None:
     assert pickle.loads(pickle.dumps(fs)).isfile("/d/f")
 
 
+@pytest.mark.parametrize("mode", ["w", "wb"])
+def test_a_transaction_is_an_error_and_reading_in_one_is_none(fs: DroneFileSystem, mode: str) -> None:
+    with fs.transaction, fs.open("/d/f", "rb") as file:
+        assert file.read() == DATA
+    with fs.transaction, pytest.raises(NotImplementedError, match="no transactions"):
+        fs.open("/d/late", mode)
+    assert not fs.exists("/d/late")
+
+
 def test_a_directory_that_cannot_be_listed_is_not_an_empty_one(
     fs: DroneFileSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
