@@ -8,7 +8,8 @@ from collections.abc import Callable
 import trio
 
 from mavftpfs.api.errors import translated, whereabouts
-from mavftpfs.client.files import CLOSING_TIME, WITHDRAWAL_TIME, File, written
+from mavftpfs.client.files import File, written
+from mavftpfs.client.mounted import CLOSING_TIME, WITHDRAWAL_TIME
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.api")

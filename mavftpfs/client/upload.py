@@ -17,7 +17,8 @@ from typing import Any, BinaryIO
 import trio
 
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.client.files import READ_SIZE, WITHDRAWAL_TIME, File, Session, is_directory, written
+from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, written
+from mavftpfs.client.mounted import WITHDRAWAL_TIME
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import BY_CRC32, BY_SIZE

@@ -211,14 +211,15 @@ class InodeTable:
         if inode.lookups == 0:
             self._free(inode)
 
-    def note_absent(self, parent: int, name: bytes, until: float, now: float) -> bool:
-        """Note until when the kernel believes that a name is absent; False if there are too many to note."""
+    def absent(self, parent: int, name: bytes, valid_for: float, now: float) -> float:
+        """Note that a name is absent, and return for how long the kernel may believe it: not at all if there
+        are too many to note."""
         if len(self._absent) >= MAX_ABSENT:
-            self._absent = {known: at for known, at in self._absent.items() if at > now}
+            self._absent = {known: until for known, until in self._absent.items() if until > now}
         if len(self._absent) >= MAX_ABSENT:
-            return False
-        self._absent[parent, name] = until
-        return True
+            return 0.0
+        self._absent[parent, name] = now + valid_for
+        return valid_for
 
     def believed(self, now: float) -> tuple[list[int], list[tuple[int, bytes]]]:
         """Return what the kernel answers by itself now: inodes with attributes, and absent names with their

@@ -543,16 +543,13 @@ class Operations(pyfuse3.Operations):
 
     def _negative(self, parent: int, name: bytes, path: bytes) -> EntryAttributes:
         entry = EntryAttributes()
-        entry.st_ino = 0
-        now, valid_for = trio.current_time(), self._tree.negative_valid_for(path)
-        noted = self.inodes.note_absent(parent, name, now + valid_for, now)
-        entry.entry_timeout = valid_for if noted else 0.0
+        entry.st_ino, now = 0, trio.current_time()
+        entry.entry_timeout = self.inodes.absent(parent, name, self._tree.negative_valid_for(path), now)
         return entry
 
     def _attributes(self, inode: Inode, found: Stat) -> EntryAttributes:
         look = self._look
-        inode.told_size = found.size
-        inode.believed_until = trio.current_time() + found.valid_for
+        inode.told_size, inode.believed_until = found.size, trio.current_time() + found.valid_for
         entry = EntryAttributes()
         entry.st_ino = inode.ino
         entry.generation = inode.generation

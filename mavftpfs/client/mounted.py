@@ -1,0 +1,252 @@
+"""The files of a mount that is up, by the kernel's calls. Layer: client.
+
+Each call goes through the kernel in a thread: it may have to wait for the mount's vehicle.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import trio
+
+from mavftpfs.cache.attributes import Stat
+from mavftpfs.client import control
+from mavftpfs.client.mountpoint import XATTR_CRC32
+from mavftpfs.shared import errors
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import NotFound
+from mavftpfs.shared.model import ROOT, EntryKind, normalise, split
+from mavftpfs.shared.readable import name_text
+
+WITHDRAWAL_TIME = 45.0
+"""Seconds to take back what was written: a request or two that nobody answers."""
+
+CLOSING_TIME = 5.0
+"""Seconds to close what nothing more is to be delivered of."""
+
+STATUS_PATIENCE = 3.0
+"""Seconds for a mount to say what it is of; one that does not is not used."""
+
+ResultT = TypeVar("ResultT")
+
+_BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
+    errno_for(kind("")): kind
+    for kind in (
+        *(errors.NotFound, errors.NotADirectory, errors.IsADirectory, errors.AlreadyExists),
+        *(errors.DirectoryNotEmpty, errors.InvalidMove, errors.CrossDevice, errors.ReadOnly, errors.FileBusy),
+        *(errors.NotSupported, errors.FileTooLarge, errors.NoSpace, errors.FileChanged),
+        *(errors.PathTooLong, errors.RequestTimeout),
+    )
+} | {
+    errno.ENOTCONN: errors.LinkClosed,  # the mount's process is gone
+    errno.ECONNABORTED: errors.LinkClosed,
+    errno.ENODEV: errors.LinkClosed,
+    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum says it, also while armed
+}
+
+
+_SENTENCES = {
+    errors.NotFound: "does not exist",
+    errors.NotADirectory: "is not a directory",
+    errors.IsADirectory: "is a directory",
+    errors.AlreadyExists: "exists",
+    errors.DirectoryNotEmpty: "is not empty",
+}
+"""What the caches say of the same."""
+_ABOUT_TARGET = (
+    *(errors.NotADirectory, errors.IsADirectory, errors.AlreadyExists, errors.DirectoryNotEmpty),
+)
+"""What rename(2) refuses because of the new name."""
+
+
+_HINTS = {
+    errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
+    errors.NotDeliveredYet: " (the vehicle is armed, or has not got all of it yet)",
+}
+
+
+def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
+    number = error.errno or errno.EIO
+    kind = _BY_ERRNO.get(number)
+    if kind in _SENTENCES:
+        return kind(_sentence(kind, path))
+    text = f"{name_text(path)}: {os.strerror(number)}"
+    return errors.OtherRefusal(text, number) if kind is None else kind(text + _HINTS.get(kind, ""))
+
+
+def _sentence(kind: type[errors.MavftpfsError], path: bytes) -> str:
+    return f"{path!r} {_SENTENCES[kind]}"
+
+
+@contextmanager
+def _about_parent(path: bytes) -> Iterator[None]:
+    """Where the body makes a path, what is missing is its directory."""
+    try:
+        yield
+    except NotFound as exc:
+        raise NotFound(_sentence(NotFound, split(path)[0])) from exc
+
+
+async def _call(path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
+    """Have the kernel do something about a path, in a thread."""
+    try:
+        return await trio.to_thread.run_sync(function, *args, abandon_on_cancel=True)
+    except OSError as exc:
+        raise _translated(exc, path) from exc
+
+
+@dataclass(slots=True)
+class MountedFile:
+    """An open file of a mount; see File. withdraw: asks the mount to, and blocks; None if it cannot."""
+
+    path: bytes
+    fd: int
+    size: int
+    withdraw: Callable[[], bool | None]
+    writable: bool
+
+    async def read(self, offset: int, size: int) -> bytes:
+        """As os.pread."""
+        return await _call(self.path, os.pread, self.fd, size, offset)
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """As os.pwrite."""
+        count = await _call(self.path, os.pwrite, self.fd, data, offset)
+        self.size = max(self.size, offset + count)
+        return count
+
+    async def fsync(self) -> None:
+        """As os.fsync."""
+        await _call(self.path, os.fsync, self.fd)
+
+    async def truncate(self, size: int) -> None:
+        """As os.ftruncate."""
+        await _call(self.path, os.ftruncate, self.fd, size)
+
+    async def release(self) -> None:
+        """As os.close, which goes on in its thread if it takes long."""
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
+                await _call(self.path, os.close, fd)
+
+    async def give_up(self) -> bool | None:
+        """Have the mount take back what it has not delivered, before closing it would have it try again."""
+        there: bool | None = None
+        try:
+            if self.writable:
+                there = await trio.to_thread.run_sync(self.withdraw, abandon_on_cancel=True)
+        finally:
+            with suppress(errors.MavftpfsError):
+                await self.release()
+        return there
+
+
+class MountedFiles:
+    """Implements Files by the kernel's calls."""
+
+    def __init__(self, mountpoint: str, mounted: bytes, root: bytes) -> None:
+        """`mounted`: what of the vehicle is on the mountpoint; `root`: what of it is our `/`."""
+        self._mountpoint = os.fsencode(mountpoint)
+        self._mounted = mounted.rstrip(b"/")
+        self._root = root.rstrip(b"/")
+
+    def _place(self, path: bytes) -> bytes:
+        remote = normalise(self._root + b"/" + path)
+        if remote != (self._mounted or ROOT) and not remote.startswith(self._mounted + b"/"):
+            raise errors.NotFound(
+                f"{name_text(remote)} lies outside of {name_text(self._mounted)}, which is mounted on "
+                f"{os.fsdecode(self._mountpoint)}"
+            )
+        return self._mountpoint + remote[len(self._mounted) :].rstrip(b"/")
+
+    async def stat(self, path: bytes) -> Stat:
+        """As os.stat."""
+        return _stat_of(await _call(path, os.stat, self._place(path)))
+
+    async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
+        """As os.scandir."""
+
+        def scan(place: bytes) -> list[tuple[bytes, Stat]]:
+            with os.scandir(place) as entries:
+                return [(entry.name, _stat_of(entry.stat())) for entry in entries]
+
+        return await _call(path, scan, self._place(path))
+
+    async def open(
+        self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
+    ) -> MountedFile:
+        """As os.open."""
+        return await self._open(path, os.O_RDWR * write | os.O_TRUNC * truncate | os.O_APPEND * append)
+
+    async def create(self, path: bytes, *, exclusive: bool) -> MountedFile:
+        """As os.open with O_CREAT."""
+        with _about_parent(path):
+            return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
+
+    async def _open(self, path: bytes, flags: int) -> MountedFile:
+        def opened(place: bytes) -> tuple[int, int]:
+            fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
+            # Else the kernel asks for 128 KiB at once, 22 s on a radio. The mount reads ahead itself.
+            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
+            return fd, os.fstat(fd).st_size
+
+        place = self._place(path)
+        fd, size = await _call(path, opened, place)
+        return MountedFile(path, fd, size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
+
+    def _withdraw(self, place: bytes) -> bool | None:
+        request = {"command": "withdraw", "path": os.fsdecode(place[len(self._mountpoint) :])}
+        with suppress(errors.MavftpfsError):
+            there = self._ask(request, timeout=WITHDRAWAL_TIME)["there"]
+            return None if there is None else bool(there)
+        return None
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """As os.truncate."""
+        await _call(path, os.truncate, self._place(path), size)
+
+    async def crc32(self, path: bytes) -> int:
+        """Ask the vehicle."""
+        return int(await _call(path, os.getxattr, self._place(path), XATTR_CRC32), 16)
+
+    async def mkdir(self, path: bytes) -> None:
+        """As os.mkdir."""
+        with _about_parent(path):
+            await _call(path, os.mkdir, self._place(path))
+
+    async def rmdir(self, path: bytes) -> None:
+        """As os.rmdir."""
+        await _call(path, os.rmdir, self._place(path))
+
+    async def unlink(self, path: bytes) -> None:
+        """As os.unlink."""
+        await _call(path, os.unlink, self._place(path))
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """As os.rename."""
+        try:
+            await _call(old, os.rename, self._place(old), self._place(new))
+        except _ABOUT_TARGET as exc:
+            raise type(exc)(_sentence(type(exc), new)) from exc
+
+    def forget_caches(self) -> None:
+        """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
+        with suppress(errors.MavftpfsError):
+            self._ask({"command": "forget"}, timeout=STATUS_PATIENCE)
+
+    def _ask(self, request: control.Reply, *, timeout: float) -> control.Reply:
+        socket = control.find_socket(os.fsdecode(self._mountpoint), control.own_directories())
+        return control.ask(socket, request, timeout=timeout)
+
+
+def _stat_of(found: os.stat_result) -> Stat:
+    kind = EntryKind.DIRECTORY if stat.S_ISDIR(found.st_mode) else EntryKind.FILE
+    return Stat(kind, found.st_size, found.st_mtime_ns, 0.0)
