@@ -9,7 +9,6 @@ import pytest
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP
 from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
@@ -103,21 +102,6 @@ def test_a_seq_that_is_still_out_is_left_out() -> None:
     assert not first.done
 
 
-@pytest.mark.holds("fault replay", "rule 14.3")
-@pytest.mark.parametrize(
-    ("packets", "jump"), [(40, BURST_JUMP), (5_000, 10_004), (25_000, 50_004), (200_000, FURTHEST_JUMP)]
-)
-def test_the_counter_jumps_at_a_burst(packets: int, jump: int) -> None:
-    """Beyond twice what the burst may send, because the rest of an abandoned one still comes."""
-    engine = make(10)
-    reading(engine, 239 * packets, BurstTransfer)
-    (burst,) = sent(engine, 0.0)
-    assert (burst.seq, burst.opcode) == (10, Opcode.BURST_READ_FILE)
-    engine.start(mkdir(), 0.0)
-    assert sent(engine, 0.0)[0].seq == 11 + jump
-    assert jump >= min(2 * packets, FURTHEST_JUMP)
-
-
 @pytest.mark.holds("rule 14.3")
 def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
     """A server that sends the whole file, whatever is asked meanwhile (MAVSDK before 2022)."""
@@ -206,19 +190,6 @@ def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often(opcode:
     engine.receive(ack(request), 0.2)
     assert op.done
     assert op.retransmitted
-
-
-@pytest.mark.holds("fault duplicate")
-def test_the_first_reply_counts_its_duplicates_do_not() -> None:
-    engine = make()
-    op, request = asked(engine)
-    engine.receive(ack(request), 0.1)
-    engine.receive(nak(request, 8), 0.2)
-    assert op.done
-    assert op.error is None
-    assert engine.stats.unknown == 1
-    assert engine.take_finished() == [op]
-    assert engine.take_finished() == []
 
 
 # --- sessions of session-agnostic requests
@@ -480,26 +451,3 @@ def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
 
 
 # --- pauses of the server
-
-
-@pytest.mark.parametrize(("others", "patient"), [(8, True), (2, False)])
-def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does(
-    others: int, patient: bool
-) -> None:
-    """What waits in its buffer would be executed twice."""
-    engine = make(limit=1 + others)
-    reading(engine)
-    first = sent(engine, 0.0)
-    for request in first:
-        engine.receive(chunk(request, bytes(SIZE)), 0.05)
-    engine.flow.window = 1 + others
-    engine.flow.pause = 0.3
-    waiting = sent(engine, 0.05)
-    assert len(waiting) == 1 + others
-    engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
-    engine.flow.pause = 0.3
-    sent(engine, 0.1)
-    engine.on_deadline(0.35)
-    assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
-    engine.on_deadline(0.45)
-    assert engine._ledger.again or sent(engine, 0.45)

@@ -6,12 +6,10 @@ import pytest
 
 from mavftpfs.client.flights import (
     GROWN,
-    LOST,
     MOST_GROWN,
     MOST_RETRY,
     PATIENCE,
     QUIET,
-    REFUSED,
     RETRY,
     STILL_THERE,
     Fetch,
@@ -65,27 +63,6 @@ def story() -> Story:
     return made
 
 
-def test_a_log_that_is_quiet_is_fetched_and_then_nothing_is_asked(story: Story) -> None:
-    story.looks(A, B)
-    assert story.wait_for() == QUIET
-    story.looks(A, B)
-    for log in (A, B):
-        assert story.does() == Fetch(1, log)
-        story.policy.fetched(1, log)
-    assert story.wait_for() > 3000.0
-
-
-def test_nothing_is_asked_of_an_armed_vehicle(story: Story) -> None:
-    story.looks(A)
-    story.passes(QUIET)
-    story.looks(A)
-    assert story.hears(armed=True) == "armed"
-    assert not story.policy.may_transfer(1, story.now)
-    assert story.wait_for() > 3000.0
-    assert story.hears(armed=False) == "disarmed"
-    assert story.does() == Look(1)
-
-
 def test_a_log_that_grows_is_waited_for_and_then_fetched_as_it_is(story: Story) -> None:
     size, began = 100, story.now
     while isinstance(step := story.does(), Look | Wait):
@@ -124,31 +101,6 @@ def test_a_log_that_grew_while_it_was_fetched_soon_after_the_flight_is_not_worth
     story.looks(B)
 
 
-def test_a_refusal_to_arm_pauses_what_is_ready(story: Story) -> None:
-    story.looks(A)
-    story.passes(QUIET)
-    story.looks(A)
-    story.policy.refused(1, story.now)
-    assert not story.policy.may_transfer(1, story.now)
-    assert story.wait_for() == REFUSED
-    story.looks(A)
-    assert story.does() == Fetch(1, A)
-
-
-def test_a_lost_vehicle_is_looked_at_when_it_is_back(story: Story) -> None:
-    story.looks(A)
-    story.armed.clear()
-    story.passes(LOST)
-    assert list(story.policy.newly_lost(story.now)) == []
-    story.passes(1)
-    assert list(story.policy.newly_lost(story.now)) == [1]
-    assert list(story.policy.newly_lost(story.now)) == []
-    assert not story.policy.may_transfer(1, story.now)
-    assert isinstance(story.does(), Wait)
-    assert story.hears() == "back"
-    assert story.does() == Look(1)
-
-
 def test_what_fails_is_tried_again_later_and_later_and_does_not_hinder_others(story: Story) -> None:
     story.passes(PATIENCE)
     story.looks(A, B)
@@ -177,12 +129,6 @@ def test_the_vehicle_that_is_served_goes_on_first(story: Story) -> None:
     assert story.does() == Fetch(1, A)
     story.hears(1, armed=True)
     assert story.policy.may_transfer(2, story.now)
-
-
-def test_while_the_local_disk_is_in_trouble_nobody_is_asked(story: Story) -> None:
-    story.policy.local_trouble(story.now)
-    assert story.wait_for() == RETRY
-    assert story.does() == Look(1)
 
 
 def test_a_restart_counts_as_the_end_of_a_flight_but_not_in_flight(story: Story) -> None:

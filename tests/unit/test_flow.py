@@ -1,4 +1,8 @@
-"""The in-flight window: what it does on paths whose every round trip is known."""
+"""The in-flight window: what it does on paths whose every round trip is known.
+
+What it brings over whole links, with servers that pause or queue little: tests/sim/test_shares.py and
+test_latency.py.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from itertools import pairwise
 
 import pytest
 
-from mavftpfs.protocol.flow import KNOWN, MOST_SERIAL, QUEUE, Flow
+from mavftpfs.protocol.flow import MOST_SERIAL, Flow
 
 
 class Path:
@@ -19,17 +23,14 @@ class Path:
         self.base = base
         self.now = start
         self.order = 0
-        self.waiting = 0
-        """Requests that the window does not count."""
 
     def round(self, *, lost: int = 0) -> None:
         window = self.flow.window
-        rtt = max(self.base, (window + self.waiting) / self.rate)
-        took = rtt * window / (window + self.waiting)
+        rtt = max(self.base, window / self.rate)
         first = self.order
         self.order += window
         for index in range(window):
-            self.now += took / window
+            self.now += rtt / window
             if index < lost:
                 self.flow.on_loss(first + index)
             else:
@@ -81,18 +82,6 @@ def test_a_queue_ends_the_start() -> None:
     assert 20 <= flow.window <= 40
 
 
-def test_a_start_that_overflows_a_buffer_ends() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1e6, base=0.1)
-    while flow.window < 100:
-        path.round()
-    wide = flow.window
-    path.rounds(2, lost=90)
-    assert flow.window < wide
-    path.rounds(4)
-    assert flow.window <= wide
-
-
 def test_a_starved_round_proves_nothing() -> None:
     flow = Flow()
     path = Path(flow, rate=1000.0, base=0.1)
@@ -131,17 +120,6 @@ def test_a_longer_way_is_noticed() -> None:
     assert flow.window >= 200
 
 
-def test_a_short_queue_of_ones_own_takes_one_more() -> None:
-    flow = Flow()
-    flow.alone = True
-    assert flow.room(0, 0.0, paced=False) == 8
-    flow.set_queue_limit(4)
-    assert flow.room(4, 0.0, paced=False) == 1
-    assert flow.room(5, 0.0, paced=False) == 0
-    flow.alone = False
-    assert flow.room(4, 0.0, paced=False) == 0
-
-
 # --- a serial port
 
 
@@ -171,60 +149,6 @@ def test_it_stays_near_what_the_receive_buffer_holds(loss: float) -> None:
     assert 5 <= sum(windows[20:]) / len(windows[20:]) <= 9.5
 
 
-# --- a card that pauses
-
-
-def paused(*, serial: bool = False, base: float = 0.1) -> tuple[Flow, Path]:
-    """Return a flow that has just seen a server pause for 0.2 s."""
-    flow = Flow(serial=serial)
-    path = Path(flow, rate=400.0, base=base)
-    path.rounds(40)
-    path.now += 0.2
-    flow.on_replies(path.now, path.base + 0.2, 1, path.order, path.order)
-    return flow, path
-
-
-def beyond(flow: Flow, now: float, *, paced: bool = True) -> int:
-    """Return how many requests may go out although the window is full."""
-    flow.begin()
-    return flow.room(flow.window, now, paced=paced)
-
-
-def test_after_a_pause_answers_are_kept_in_reserve_for_reads() -> None:
-    flow, path = paused()
-    path.rounds(10)
-    assert beyond(flow, path.now, paced=False) <= 0 < beyond(flow, path.now) <= QUEUE * 420
-    assert beyond(flow, path.now + KNOWN) <= 0
-
-
-def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
-    flow, path = paused()
-    path.rounds(30)
-    usual = flow._reserve()
-    path.rounds(5, lost=10)
-    assert flow._reserve() < 0.5 * usual
-
-
-def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
-    flow = Flow()
-    path = Path(flow, rate=400.0, base=0.1)
-    path.rounds(40)
-    flow.on_starved()
-    path.now += 0.3
-    path.rounds(3)
-    assert beyond(flow, path.now) <= 0
-    assert flow.starved or flow.pause == 0.0
-
-
-def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
-    flow, path = paused()
-    path.rounds(10)
-    assert beyond(flow, path.now + 0.01, paced=False) <= 0
-    assert beyond(flow, path.now + 0.1, paced=False) > 0
-    assert flow.next_room_at() < path.now + 0.2
-    assert flow.room(flow.window + 200, path.now + 15.0, paced=False) <= 0
-
-
 # --- a fast path
 
 
@@ -252,26 +176,6 @@ def test_on_a_fast_path_the_window_is_no_wider_than_keeps_the_server_busy(best: 
             rates.append(path.rate)
     assert max(windows) <= 160
     assert sum(rates) / len(rates) >= 0.5 * computer.rate(best)
-
-
-def test_an_answer_that_is_waited_for_queues_behind_less() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(20)
-    flow.begin()
-    flow.room(0, 100.0, paced=True, urgent=True)
-    full = flow.window
-    assert flow.room(full - 1, 100.0, paced=True) <= 0
-    assert flow.room(full - 1, 100.0, paced=True, urgent=True) == 1
-    flow.begin()
-    assert flow.room(full - 1, 100.0, paced=True) == 1
-
-
-@pytest.mark.parametrize("window", [1, 2, 4])
-def test_bulk_goes_on_beside_it_even_in_a_small_window(window: int) -> None:
-    flow = Flow(limit=window)
-    flow.room(0, 100.0, paced=True, urgent=True)
-    assert flow.room(0, 100.0, paced=True) >= 1
 
 
 @pytest.mark.parametrize("seed", range(5))

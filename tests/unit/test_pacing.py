@@ -7,7 +7,6 @@ from math import inf
 
 import pytest
 
-from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.pacing import Pacer
 
 pytestmark = pytest.mark.holds("fault overflow")
@@ -72,72 +71,11 @@ class Server:
             self.pacer.on_replies(self.now, rtt, 1, order, self.order)
 
 
-@pytest.mark.parametrize(("base", "loss"), [(0.1, 0.2), (0.3, 0.0), (1.0, 0.1)])
-def test_a_long_way_is_filled(base: float, loss: float) -> None:
-    server = Server(base=base, loss=loss)
-    server.run(30.0)
-    assert server.run(60.0) > 0.45 * (5 / 0.010) * (1 - loss)
-
-
 @pytest.mark.holds("fault overflow")
 def test_room_is_left_in_the_queue_for_others() -> None:
     server = Server(base=0.3)
     server.run(30.0)
     assert server.run(10.0) < 0.9 * 5 / 0.010
-
-
-def test_requests_go_out_one_by_one() -> None:
-    pacer = Pacer(QUEUE, 2048)
-    pacer.rate, pacer.window = 100.0, 50
-    sent = []
-    now = 0.0
-    while now < 1.0:
-        room = pacer.room(QUEUE, now)
-        assert room <= 2
-        for _ in range(room):
-            pacer.on_sent(1, now)
-            sent.append(now)
-        now = max(now + 1e-9, pacer.next_at())
-    assert 98 <= len(sent) <= 103
-    assert pacer.room(QUEUE, now + 5.0) == 2, "what was not used is not made up for at once"
-
-
-def test_who_is_waited_for_does_not_come_to_a_full_queue() -> None:
-    pacer = Pacer(QUEUE, 2048)
-    assert pacer.room_for_urgent(QUEUE, 0.0) == 0, "no rate is known"
-    for order in range(200):
-        pacer.on_sent(1, order * 0.01)
-        pacer.on_replies(order * 0.01, 0.3, 1, order, order + QUEUE)
-    pacer.on_sent(QUEUE + 1, 3.0)
-    assert pacer.room_for_urgent(QUEUE, 3.001) == 0
-    due = pacer.next_at()
-    assert 3.0 + 0.9 * QUEUE * 0.01 < due < 3.0 + 1.5 * QUEUE * 0.01, "the time the server takes for a queue"
-    assert pacer.room_for_urgent(QUEUE, due) == 1
-    assert pacer.room_for_urgent(10_000, due) == 0
-    pacer.begin()
-    assert pacer.next_at() == inf
-
-
-def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -> None:
-    flow = Flow()
-    assert flow.room(10, 0.0, paced=True) < 0
-    flow.set_queue_limit(QUEUE)
-    for order in range(200):
-        now = order * 0.01
-        flow.on_sent(1, now)
-        flow.on_replies(now, 0.3, 1, order, order + QUEUE)
-    assert flow.room(QUEUE, 3.0, paced=True) == 0, "beside other clients the queue is all there is"
-    flow.alone = True
-    shared = QUEUE + 1  # the place that is kept for others
-    assert flow.room(shared, 3.0, paced=True) > 0
-    assert flow.next_room_at() < inf
-    assert flow.room(shared, 3.0, paced=False) == 0
-    assert flow.next_room_at() == inf
-    assert flow.room(shared - 1, 3.0, paced=True) == 1
-    flow.set_queue_limit(QUEUE)
-    assert flow.room(shared, 3.0, paced=True) > 0
-    flow.on_silence()
-    assert flow.room(shared, 3.0, paced=True) <= 0
 
 
 QUEUED = 5 / 0.010

@@ -1,4 +1,7 @@
-"""Parameters as values, packed files and lines of text; what a saved text asks for (docs/servers.md 17)."""
+"""Parameters as values, packed files and lines of text (docs/servers.md 17).
+
+What a saved text asks for: tests/sim/test_parameters.py.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,7 @@ import pytest
 
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, pack_upload, unpack
-from mavftpfs.parameters.saving import Values, judge, make_plan, pick_base
-from mavftpfs.parameters.text import Line, parse, render_all, render_changed, render_qgc
+from mavftpfs.parameters.text import parse, render_all, render_changed, render_qgc
 from mavftpfs.parameters.values import (
     BadValue,
     Kind,
@@ -25,17 +27,6 @@ from mavftpfs.parameters.values import (
 from mavftpfs.protocol.writing import Pieces
 from mavftpfs.shared.errors import RemoteProtocolError
 from tests.support.recordings import data_of, load_recording
-
-
-def values(*parameters: Parameter) -> Values:
-    return {one.name: one for one in parameters}
-
-
-def lines_of(text: str) -> list[Line]:
-    lines, problems = parse(text)
-    assert problems == []
-    return lines
-
 
 # --- values
 
@@ -203,7 +194,9 @@ def test_the_three_spellings() -> None:
 
 def test_each_line_says_which_spelling_it_has() -> None:
     text = "# x\r\n\r\nA,1\r\n  B   2.5 # default 3\nC\t-3\nD , 4\n2\t1\tE\t5\t9\nF,6"
-    found = [(line.name, line.value, line.number, line.system) for line in lines_of(text)]
+    lines, problems = parse(text)
+    found = [(line.name, line.value, line.number, line.system) for line in lines]
+    assert problems == []
     assert found == [
         *(("A", 1, 3, None), ("B", 2.5, 4, None), ("C", -3, 5, None)),
         *(("D", 4, 6, None), ("E", 5, 7, 2), ("F", 6, 8, None)),
@@ -235,55 +228,7 @@ def test_a_name_twice_with_one_value_is_one_line() -> None:
     assert parse("A,nan\nA,nan\n")[1] == []
 
 
-# --- what a save asks for
-
-COUNTER = Parameter("COUNTER", Kind.INT32, 5)
-GAIN = Parameter("GAIN", Kind.FLOAT, 1.5)
-BOOTS = Parameter("STAT_BOOTCNT", Kind.INT16, 7)
-NOW = values(COUNTER, GAIN, BOOTS)
-
-
-def moved(parameter: Parameter, value: Number) -> Parameter:
-    return Parameter(parameter.name, parameter.kind, value)
-
-
-def test_lines_as_in_the_base_ask_for_nothing_however_the_vehicle_moved() -> None:
-    base = values(COUNTER, GAIN)
-    now = values(moved(COUNTER, 9), GAIN)
-    plan = make_plan(lines_of("COUNTER,5\nGAIN,2.50\n"), base, now, meant=False)
-    assert plan.wanted == [moved(GAIN, 2.5)]
-    assert (plan.problems, plan.conflicts, plan.notes) == ([], [], [])
-
-
-def test_without_a_base_what_holds_is_not_sent() -> None:
-    plan = make_plan(lines_of("COUNTER,6\nGAIN,1.5\n"), None, NOW, meant=False)
-    assert plan.wanted == [moved(COUNTER, 6)]
-
-
-def test_changed_here_and_there_is_a_conflict_that_names_both() -> None:
-    plan = make_plan(lines_of("GAIN,3\n"), values(moved(GAIN, 1)), NOW, meant=False)
-    assert plan.wanted == []
-    assert plan.conflicts == ["GAIN: it was 1 and has become 1.5 on the vehicle meanwhile; wanted 3"]
-    agreed = make_plan(lines_of("GAIN,1.5\n"), values(moved(GAIN, 1)), NOW, meant=False)
-    assert (agreed.wanted, agreed.conflicts) == ([], [])
-
-
-def test_unknown_names_and_values_that_do_not_fit_are_problems() -> None:
-    plan = make_plan(lines_of("NONE,1\nCOUNTER,2.5\nGAIN,2\n"), None, NOW, meant=False)
-    assert [(problem.number, problem.reason) for problem in plan.problems] == [
-        (1, "the vehicle has no parameter NONE"),
-        (2, "COUNTER: 2.5 is not a whole number, and this is a 32-bit integer"),
-    ]
-
-
-def test_the_vehicle_s_own_are_set_only_where_somebody_meant_them() -> None:
-    lines = lines_of("STAT_BOOTCNT,0\n")
-    restored = make_plan(lines, None, NOW, meant=False)
-    assert restored.wanted == []
-    assert "STAT_BOOTCNT" in restored.notes[0]
-    assert make_plan(lines, None, NOW, meant=True).wanted == [moved(BOOTS, 0)]
-    edited = make_plan(lines, values(moved(BOOTS, 6)), NOW, meant=False)
-    assert (edited.wanted, edited.conflicts) == ([moved(BOOTS, 0)], [])
+# --- which ones the vehicle sets by itself
 
 
 @pytest.mark.parametrize(
@@ -296,33 +241,6 @@ def test_the_vehicle_s_own(name: str) -> None:
 @pytest.mark.parametrize("name", ["RTL_ALT", "BARO_ALT_OFFSET", "COMPASS_DEC", "MIS_TAKEOFF_ALT", "X_TOTAL"])
 def test_not_the_vehicle_s_own(name: str) -> None:
     assert not is_own(name)
-
-
-FIRST = values(COUNTER, GAIN)
-LATER = values(moved(COUNTER, 6), moved(GAIN, 2))
-
-
-def test_the_base_is_what_the_text_was_made_from() -> None:
-    """vim reads the file again before it saves what it read first."""
-    edited = lines_of("COUNTER,5\nGAIN,9\n")
-    assert pick_base(edited, [FIRST, LATER], rereads=False) is FIRST
-    assert pick_base(lines_of("COUNTER,6\nGAIN,9\n"), [FIRST, LATER], rereads=True) is LATER
-    assert pick_base(lines_of("GAIN,9\n"), [FIRST, LATER], rereads=True) is LATER
-    assert pick_base(edited, [], rereads=False) is None
-
-
-def test_an_older_text_as_a_whole_is_meant_unless_an_editor_read_again() -> None:
-    older = lines_of("COUNTER,5\nGAIN,1.5\n")
-    assert pick_base(older, [FIRST, LATER], rereads=False) is LATER
-    assert pick_base(older, [FIRST, LATER], rereads=True) is FIRST
-
-
-def test_a_verdict_names_what_was_wanted_and_what_is_there() -> None:
-    wanted = [moved(COUNTER, 6), moved(GAIN, 2), Parameter("GONE", Kind.INT8, 1), moved(BOOTS, 0)]
-    verdict = judge(wanted, values(moved(COUNTER, 6), GAIN, BOOTS))
-    assert verdict.taken == ["COUNTER"]
-    assert verdict.missed == ["GAIN: wanted 2, got 1.5", "GONE: wanted 1, and it is not there any more"]
-    assert verdict.notes == ["STAT_BOOTCNT is the vehicle's own: wanted 0, it is 7"]
 
 
 # --- how an upload is cut

@@ -10,7 +10,6 @@ import trio
 
 from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
-from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
 from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.tree import Stat, Tree
@@ -25,7 +24,6 @@ from mavftpfs.shared.errors import (
     PathTooLong,
     ReadOnly,
     RequestTimeout,
-    UsageError,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
@@ -342,21 +340,6 @@ async def test_checksums_are_refused(here: Rig, tree: Tree) -> None:
 
 
 # --- options and sharing
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"dir_timeout": -1},
-        {"cache_size": MIN_CACHE_SIZE - 1},
-        {"root": b"/a/"},
-        {"root": b"a"},
-        {"attr_timeout": float("nan")},
-    ],
-)
-def test_wrong_options(wrong: dict[str, float]) -> None:
-    with pytest.raises(UsageError):
-        CacheOptions(**wrong)  # type: ignore[arg-type]
 
 
 async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays() -> None:
