@@ -149,6 +149,42 @@ def test_it_stays_near_what_the_receive_buffer_holds(loss: float) -> None:
     assert 5 <= sum(windows[20:]) / len(windows[20:]) <= 9.5
 
 
+# --- a card that pauses
+
+
+def paused(*, serial: bool = False, base: float = 0.1) -> tuple[Flow, Path]:
+    """Return a flow that has just seen a server pause for 0.2 s."""
+    flow = Flow(serial=serial)
+    path = Path(flow, rate=400.0, base=base)
+    path.rounds(40)
+    path.now += 0.2
+    flow.on_replies(path.now, path.base + 0.2, 1, path.order, path.order)
+    return flow, path
+
+
+def beyond(flow: Flow, now: float, *, paced: bool = True) -> int:
+    """Return how many requests may go out although the window is full."""
+    flow.begin()
+    return flow.room(flow.window, now, paced=paced)
+
+
+def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
+    flow, path = paused()
+    path.rounds(30)
+    usual = flow._reserve()
+    path.rounds(5, lost=10)
+    assert flow._reserve() < 0.5 * usual
+
+
+def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
+    flow, path = paused()
+    path.rounds(10)
+    assert beyond(flow, path.now + 0.01, paced=False) <= 0
+    assert beyond(flow, path.now + 0.1, paced=False) > 0
+    assert flow.next_room_at() < path.now + 0.2
+    assert flow.room(flow.window + 200, path.now + 15.0, paced=False) <= 0
+
+
 # --- a fast path
 
 
