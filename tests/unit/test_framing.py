@@ -21,7 +21,7 @@ from mavftpfs.link.messages import (
     StorageInformation,
     SystemTime,
 )
-from mavftpfs.shared.errors import LocalProtocolError, UsageError
+from mavftpfs.shared.errors import UsageError
 from tests.support.frames import feed
 
 pytestmark = pytest.mark.holds("promise 10")
@@ -136,12 +136,6 @@ def test_source_may_change() -> None:
     assert tuple(framer.encode_heartbeat(18)[5:7]) == (254, 192)
 
 
-@pytest.mark.parametrize("size", [0, 250, 252])
-def test_refuses_a_payload_of_the_wrong_size(size: int) -> None:
-    with pytest.raises(LocalProtocolError):
-        Framer(US, stream=True).encode_ftp(DRONE, bytes(size))
-
-
 @pytest.mark.parametrize("size", [0, 31, 33])
 def test_refuses_a_key_of_the_wrong_size(size: int) -> None:
     with pytest.raises(UsageError, match="32 bytes"):
@@ -229,16 +223,6 @@ def test_reset_forgets_half_a_frame() -> None:
     framer.reset()
     assert feed(framer, ftp()) == [FTP]
     assert framer.stats.garbage_bytes == 60
-
-
-def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    framer = Framer(US, stream=True)
-
-    def refuse(*_: object) -> None:
-        raise dialect.MAVError("no")
-
-    monkeypatch.setattr(framer._decoder, "decode", refuse)
-    assert feed(framer, heartbeat() + ftp()) == [FTP]
 
 
 # ---------------------------------------------------------------------- a length that is far too large
