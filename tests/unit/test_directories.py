@@ -18,10 +18,6 @@ def file(name: bytes, size: int = 1, mtime: int | None = None) -> DirEntry:
     return DirEntry(name, EntryKind.FILE, size, mtime)
 
 
-def folder(name: bytes) -> DirEntry:
-    return DirEntry(name, EntryKind.DIRECTORY)
-
-
 class Clock:
     """Time that passes when a test says so."""
 
@@ -51,11 +47,6 @@ def put(directories: Directories, path: bytes, *entries: DirEntry, took: float =
 def is_fresh(directories: Directories, path: bytes) -> bool:
     directory = directories.known(path)
     return directory is not None and directories.clock() < directory.fresh_until
-
-
-def names(directories: Directories, path: bytes) -> set[bytes]:
-    directory = directories.known(path)
-    return set(directory.entries) if directory else {b"(unknown)"}
 
 
 @pytest.mark.parametrize(("dir_timeout", "took", "life"), [(20, 9, 20), (None, 0.1, 20), (None, 2, 100)])
@@ -126,15 +117,6 @@ def test_least_recently_used_listings_go_first() -> None:
 # --- expiring and forgetting
 
 
-def test_an_expired_listing_is_kept_but_proves_nothing() -> None:
-    directories = make()
-    put(directories, b"/", file(b"a"))
-    directories.expire(b"/")
-    directories.expire(b"/unknown")
-    assert not is_fresh(directories, b"/")
-    assert names(directories, b"/") == {b"a"}
-
-
 def test_forget_takes_all_below_and_nothing_beside() -> None:
     directories = make()
     for path in (b"/a", b"/a/b", b"/ab", b"/"):
@@ -156,25 +138,6 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
 # --- our own changes
 
 
-def test_what_we_changed_shows_at_once() -> None:
-    directories = make()
-    put(directories, b"/", file(b"a", 1, 50))
-    put(directories, b"/b", file(b"x"))
-    directories.learn_size(b"/a", 2)
-    directories.put(b"/a", file(b"a", 9))
-    directories.put(b"/b", folder(b"another name"))
-    directory = directories.known(b"/")
-    assert directory is not None
-    assert directory.entries == {b"a": file(b"a", 9), b"b": folder(b"b")}
-    assert directory.size_of(b"a") == 9
-    assert directories.known(b"/b") is None
-    assert directories.entry(b"/b") == folder(b"b")
-    directories.put(b"/a", None)
-    directories.put(b"/never", None)
-    assert names(directories, b"/") == {b"b"}
-    assert directories.entry(b"/a") is None
-
-
 def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: Clock) -> None:
     directories = make(clock)
     directory = put(directories, b"/")
@@ -185,17 +148,6 @@ def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: Clock)
     assert directory.proven == {b"a": 3}
     directories.expire(b"/")
     assert directory.proven == {}
-
-
-@pytest.mark.holds("fault odd listing")
-def test_a_change_during_a_listing_beats_what_it_saw_and_lets_it_expire() -> None:
-    directories = make()
-    sweep = directories.begin(b"/")
-    directories.put(b"/a", file(b"a", 9))
-    directories.put(b"/b", None)
-    directory = directories.remember(sweep, Listing((file(b"a", 1, 5), file(b"b"), file(b"c")), 0))
-    assert directory.entries == {b"a": file(b"a", 9), b"c": file(b"c")}
-    assert (directory.complete, directory.fresh_until) == (True, 0)
 
 
 # --- mtimes

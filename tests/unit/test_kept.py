@@ -108,17 +108,6 @@ async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts) -> None:
     assert mounts.asked() == (0, 0)
 
 
-async def test_a_damaged_block_is_read_again(mounts: Mounts) -> None:
-    await mounts.read_and_settle()
-    for number, path in enumerate(p for p in mounts.path.rglob("*") if p.is_file()):
-        data = bytearray(path.read_bytes())
-        data[-number * 7 - 1] ^= 0x40
-        path.write_bytes(data if number % 2 else data[:-1])
-    tree = mounts.mount()
-    assert await read_file(tree, LOG) == DATA
-    assert mounts.asked() == (1, 0)
-
-
 @pytest.mark.parametrize("change", ["size", "mtime", "vehicle", "unknown vehicle", "growing", "young"])
 async def test_anything_else_is_read_again(mounts: Mounts, change: str) -> None:
     await mounts.read_and_settle()
@@ -208,17 +197,6 @@ async def test_what_was_read_whole_just_before_the_unmount_costs_a_checksum(
     here.here.put(LOG, new, MTIME)
     assert await read_file(here.mount(), LOG) == new
     assert here.asked() == (1, 1)
-
-
-async def test_what_was_kept_by_its_time_is_not_kept_again_by_its_checksum(mounts: Mounts) -> None:
-    tree = mounts.mount()
-    assert await read_file(tree, LOG) == DATA
-    await trio.sleep(ENOUGH)
-    written = mounts.caches[0].written
-    await tree.keep_whole_files()
-    assert mounts.caches[0].written == written
-    assert await read_file(mounts.mount(), LOG) == DATA
-    assert mounts.asked() == (0, 0)
 
 
 LEFT_OUT = ["armed or large", "in part", "growing", "rebooted", "in doubt"]

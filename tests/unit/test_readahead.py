@@ -76,14 +76,6 @@ def test_a_small_file_is_wanted_whole_at_the_first_read_from_its_start() -> None
     assert read(small, 4 * KIB, 4 * KIB) == NOTHING
 
 
-def test_a_slow_link_gets_a_small_window() -> None:
-    ahead = Readahead(BIG)
-    read(ahead, 0, 16 * KIB, limit=9000)
-    assert read(ahead, 16 * KIB, 16 * KIB, limit=9000) == Plan(32 * KIB, 32 * KIB + 9000)
-    assert read(ahead, 32 * KIB, 16 * KIB, limit=0) == NOTHING
-    assert read(ahead, 48 * KIB, 16 * KIB, limit=-1) == NOTHING
-
-
 @pytest.mark.parametrize(
     ("streams", "rate", "limit", "small"),
     [

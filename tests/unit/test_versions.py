@@ -119,17 +119,6 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> Non
 # --- waiting
 
 
-async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
-    reading = await start_read(nursery, blocks, 0, 1000)
-    deliver(blocks, 0, content(1000), batch=False)
-    await trio.testing.wait_all_tasks_blocked()
-    assert reading.results == []
-    blocks.on_batch(1000)
-    await trio.testing.wait_all_tasks_blocked()
-    assert reading.results == [content(1000)]
-
-
 @pytest.mark.holds("promise 4")
 async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -> None:
     blocks = Version(make_cache(), b"/f", 1000)
@@ -187,28 +176,6 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
 
 
 # --- doubtful bytes
-
-
-async def test_all_bytes_are_dropped_in_doubt_and_none_taken_before_a_new_reader_is_there() -> None:
-    cache = make_cache()
-    told: list[Version] = []
-    blocks = Version(cache, b"/f", 3 * BLOCK_SIZE, on_dropped=told.append)
-    deliver(blocks, 0, content(2 * BLOCK_SIZE))
-    old = blocks.get(0, 20)
-    assert old is not None
-    before = bytes(old)
-    for _ in range(2):
-        blocks.on_suspect("test")
-    assert (blocks.drops, told) == (1, [blocks])
-    assert blocks.missing(0, 3 * BLOCK_SIZE) == [(0, 3 * BLOCK_SIZE)]
-    assert cache.bytes_cached == 0
-    deliver(blocks, 10, b"\xff" * 20)  # from the reader that is in doubt
-    assert blocks.get(10, 30) is None
-    blocks.ignores_data = False
-    deliver(blocks, 10, b"\xff" * 20)
-    assert bytes(old) == before
-    assert bytes(blocks.get(10, 30) or b"") == b"\xff" * 20
-    cache.check_invariants()
 
 
 async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
