@@ -1,9 +1,8 @@
-"""Who wants the session and who goes first, as tables; and what a reader wants of a file."""
+"""Who wants the session, who goes first, and when a turn ends."""
 
 from __future__ import annotations
 
 import random
-from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -11,9 +10,7 @@ import pytest
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import (
     LONG_WAIT,
     MAX_TURN,
@@ -24,8 +21,6 @@ from mavftpfs.session.scheduler import (
     SessionUser,
 )
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.extents import ExtentSet
-from tests.support.worlds import MemorySink
 
 
 class NoLink:
@@ -93,43 +88,3 @@ def test_when_a_turn_ends(
     slice_: float, use: float, rival: float, rtt: float | None, gives_way: bool
 ) -> None:
     assert heavy(use).gives_way(rival, 100.0, 100.0 + slice_, rtt) is gives_way
-
-
-# --- a reader
-
-
-def make(size: int = 1000) -> tuple[FileStream, MemorySink]:
-    sink = MemorySink(size)
-    return FileStream(b"/f", sink, size, scheduler()), sink
-
-
-def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> None:
-    stream, sink = make()
-    stream.want(0, 600, demand=True)
-    stream.want(600, 900, demand=False)
-    for offset, size in ((0, 600), (600, 300)):
-        assert not stream.idle
-        sink.on_data(offset, bytes(size))
-        transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
-        stream._transfer = cast(ReadTransfer, transfer)
-        stream._on_batch(0.0)
-        sink.have = ExtentSet()  # evicted
-        assert stream._demand.empty
-    assert stream.idle
-
-
-def test_only_what_the_cache_lacks_is_wanted() -> None:
-    stream, sink = make()
-    sink.on_data(100, bytes(100))
-    stream.want(100, 200, demand=True)
-    assert stream._demand.empty
-    stream.want(0, 300, demand=True)
-    assert list(stream._demand) == [(0, 100), (200, 300)]
-
-
-def test_a_closed_stream_wants_nothing() -> None:
-    stream, _ = make()
-    stream.want(0, 100, demand=True)
-    stream.close()
-    stream.want(0, 100, demand=True)
-    assert stream._demand.empty
