@@ -7,20 +7,10 @@ import random
 import pytest
 
 from mavftpfs.protocol.chunking import LONE_LOSSES, LONE_SECONDS, SHORT, SHORT_SECONDS, ChunkSize
-from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload
-from mavftpfs.protocol.reading import ReadTransfer
-from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.shared.errors import LocalProtocolError
-from tests.support.replies import ack, chunk, sent
-from tests.support.sources import MemorySource
-from tests.support.virtual import MemorySink
 
 pytestmark = pytest.mark.holds("fault long frames")
-
-CONTENT = random.Random(8).randbytes(MAX_DATA * 40)
-WINDOW = 4
 
 
 def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0, step: float = 0.05) -> set[int]:
@@ -97,55 +87,3 @@ def test_the_size_that_a_user_asked_for_stays() -> None:
 def test_a_size_out_of_range_is_a_bug(size: int) -> None:
     with pytest.raises(LocalProtocolError):
         ChunkSize(size)
-
-
-class Transfers:
-    """A transfer over a link on which no frame with more than `passing` bytes of data comes through."""
-
-    def __init__(self, *, writes: bool, passing: int) -> None:
-        self.engine = Engine(random.Random(1), Flow(limit=WINDOW))
-        self.sink, self.source = MemorySink(len(CONTENT)), MemorySource(CONTENT)
-        self.chunks, self.passing, self.now = ChunkSize(), passing, 0.0
-        self.file = bytearray(len(CONTENT))
-        self.late: list[Payload] = []
-        if writes:
-            self.engine.start(WriteTransfer(0, self.source, self.chunks), 0.0)
-        else:
-            transfer = ReadTransfer(0, len(CONTENT), self.sink, self.chunks)
-            transfer.want(0, len(CONTENT), True)
-            self.engine.start(transfer, 0.0)
-
-    def answer(self, request: Payload) -> None:
-        self.now += 0.01
-        if request.opcode == Opcode.READ_FILE:
-            self.engine.receive(chunk(request, CONTENT), self.now)
-        else:
-            self.file[request.offset : request.offset + request.size] = request.data
-            self.engine.receive(ack(request, request.size.to_bytes(4, "little")), self.now)
-
-    def finish(self) -> None:
-        while (out := sent(self.engine, self.now)) or self.engine.next_deadline() is not None:
-            assert self.engine.in_flight <= WINDOW
-            for request in out:
-                if request.size <= self.passing:
-                    self.answer(request)
-                else:
-                    self.late.append(request)
-            if not out:
-                self.now = max(self.now, self.engine.next_deadline() or 0.0)
-                self.engine.on_deadline(self.now)
-
-
-@pytest.mark.parametrize("writes", [False, True], ids=["read", "write"])
-def test_a_file_is_moved_by_short_chunks_and_late_answers_to_long_ones_change_nothing(writes: bool) -> None:
-    transfers = Transfers(writes=writes, passing=100)
-    transfers.finish()
-    assert (transfers.file if writes else transfers.sink.data) == CONTENT
-    assert transfers.source.acked.covers(0, len(CONTENT)) is writes
-    assert transfers.source.in_flight.empty
-    assert transfers.chunks.size == SHORT
-    assert transfers.engine.in_flight == 0
-    unknown = transfers.engine.stats.unknown
-    for request in transfers.late:
-        transfers.answer(request)
-    assert transfers.engine.stats.unknown == unknown + len(transfers.late)

@@ -95,9 +95,6 @@ def test_a_base_that_others_replaced() -> None:
     assert cut.state is State.DIRTY
 
 
-# --- content
-
-
 # --- sending
 
 
