@@ -6,15 +6,9 @@ from math import inf
 
 import pytest
 
-from mavftpfs.protocol.budget import FRAME_OVERHEAD, Budget
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.budget import Budget
 
 COST = 266
-
-
-def wire(opcode: int, *, size: int = 0, req_opcode: int = 0, data: bytes = b"") -> bytes:
-    """Return 251 bytes."""
-    return bytes((1, 0, 0, opcode, size, req_opcode, 0, 0, 0, 0, 0, 0)) + data.ljust(239, b"\0")
 
 
 def spend_all(budget: Budget, start: float, stop: float, *, urgent: bool = False) -> list[float]:
@@ -46,20 +40,6 @@ def test_nothing_is_saved_up() -> None:
     assert len(spend_all(budget, 100.0, 100.5)) <= 0.5 * 10_000 / COST + 2
 
 
-def test_small_answers_go_ahead_and_bulk_pays() -> None:
-    budget = Budget(5760.0)
-    spend_all(budget, 0.0, 1.0)
-    budget.begin()
-    assert budget.room(1.0, urgent=False) == 0
-    assert budget.exhausted
-    assert budget.room(1.0, urgent=True) >= 1
-    ahead = spend_all(budget, 1.0, 1.001, urgent=True)
-    assert 1 <= len(ahead) <= 4
-    budget.begin()
-    assert budget.room(1.05, urgent=False) == 0
-    assert budget.next_room_at() > 1.05 + 0.05
-
-
 def test_who_has_nothing_to_send_is_not_woken() -> None:
     budget = Budget(1e6)
     budget.begin()
@@ -67,23 +47,3 @@ def test_who_has_nothing_to_send_is_not_woken() -> None:
     assert budget.room(5.0, urgent=False) >= 1
     assert budget.next_room_at() == inf
     assert not budget.exhausted
-
-
-def test_a_read_pays_for_its_reply_when_it_goes_out() -> None:
-    budget = Budget(1000.0)
-    budget.room(0.0, urgent=False)
-    budget.on_request(wire(Opcode.READ_FILE, size=239), 0.0)
-    budget.on_reply(wire(Opcode.ACK, size=239, req_opcode=Opcode.READ_FILE, data=bytes([7]) * 239), 0.0)
-    budget.room(0.0, urgent=False)
-    request = FRAME_OVERHEAD + 5  # what follows the size is zeros, which MAVLink 2 cuts
-    reply = FRAME_OVERHEAD + 12 + 239
-    assert budget.next_room_at() == pytest.approx((request + reply) / 1000.0, abs=1e-3)
-
-
-def test_other_replies_are_paid_for_when_they_come() -> None:
-    budget = Budget(1000.0)
-    budget.room(0.0, urgent=False)
-    budget.on_reply(wire(Opcode.ACK, size=4, req_opcode=Opcode.WRITE_FILE, data=b"\xef"), 0.0)
-    budget.on_reply(wire(Opcode.NAK, size=1, req_opcode=Opcode.READ_FILE, data=b"\x06"), 0.0)
-    budget.room(0.0, urgent=False)
-    assert budget.next_room_at() == pytest.approx(2 * (FRAME_OVERHEAD + 13) / 1000.0, abs=1e-3)

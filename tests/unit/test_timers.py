@@ -109,12 +109,6 @@ def learned(*, rtt: float = 0.012, seen: tuple[float, float] | None = None) -> T
     return timers
 
 
-def test_a_small_file_s_checksum_is_asked_for_again_soon() -> None:
-    timers = learned()
-    assert timers.wait(work(0.06)) == pytest.approx(0.36, abs=0.01)
-    assert sum(timers.wait(work(0.06, sends=sends)) for sends in (1, 2, 3)) < 1.5
-
-
 @pytest.mark.holds("rule 14.38")
 def test_a_server_at_work_gets_the_slowest_one_s_time() -> None:
     timers = learned()
@@ -129,18 +123,6 @@ def test_but_a_checksum_that_most_would_have_is_asked_for_three_times_before() -
     assert [timers.wait(work(6.0, sends=sends)) for sends in (1, 2, 3)] == pytest.approx([0.9, 0.9, 1.8])
     assert timers.wait(work(0.5)) == pytest.approx(0.4)
     assert timers.wait(work(0.0)) == pytest.approx(0.3)
-
-
-def test_long_work_does_not_make_small_files_wait() -> None:
-    timers = learned(seen=(100.0, 60.0))
-    assert timers.wait(work(0.06)) < 0.5
-
-
-def test_what_is_done_at_once_is_repeated_several_times_before_waits_double() -> None:
-    timers = learned()
-    waits = [timers.wait(path(sends)) for sends in range(1, 8)]
-    assert waits[:4] == [waits[0]] * 4
-    assert waits[4:] == [pytest.approx(waits[0] * factor) for factor in (2, 4, 8)]
 
 
 def test_without_a_round_trip_known_waits_double_at_once() -> None:
