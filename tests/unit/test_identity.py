@@ -52,18 +52,6 @@ def test_what_tells_two_boards_apart(known: AutopilotVersion, told: AutopilotVer
     assert is_another(known, told) is another
 
 
-@pytest.mark.parametrize("first", [None, version()])
-def test_a_vehicle_that_never_told_is_never_doubted(first: AutopilotVersion | None) -> None:
-    identity = Watched()
-    if first is not None:
-        assert identity.told(first)
-    identity.heard(0.0)
-    identity.heard(1000.0)
-    identity.doubt()
-    assert standing(identity) is Standing.TRUSTED
-    assert identity.settled == []
-
-
 def test_it_may_have_restarted_while_it_was_away() -> None:
     identity = Watched()
     identity.heard(10.0)
@@ -140,16 +128,6 @@ def mute() -> Watched:
     for _ in range(PATIENCE):
         identity.unanswered()
     return identity
-
-
-def test_who_never_told_again_is_asked_but_not_kept_waiting_until_it_tells() -> None:
-    identity = mute()
-    identity.doubt()
-    assert standing(identity) is Standing.TRUSTED
-    assert identity.doubts == 2
-    assert identity.told(version(1))
-    identity.doubt()
-    assert standing(identity) is not Standing.TRUSTED
 
 
 def test_another_id_is_a_strangers_however_silent_it_falls_and_is_asked_for_again() -> None:

@@ -208,12 +208,3 @@ def test_facts_are_taken_from_the_target_alone() -> None:
     vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
     assert vehicle.storage is not None
     assert vehicle.storage.total_capacity == 16.0
-
-
-def test_our_own_address_heard_from_somebody_else_is_told() -> None:
-    doubles: list[int] = []
-    vehicle = listener()
-    vehicle.on_double = lambda: doubles.append(1)
-    vehicle.on_message(heartbeat(OWN, autopilot=MAV_AUTOPILOT_INVALID), 0.0)
-    assert doubles == [1]
-    assert vehicle.address is None
