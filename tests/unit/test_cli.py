@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -13,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import trio
 
 from mavftpfs import __main__
 from mavftpfs.cli import commands
 from mavftpfs.cli import main as cli
-from mavftpfs.cli.verbs import until_interrupted
 from mavftpfs.client import connect as compose
 from mavftpfs.client import control, status
 from mavftpfs.mount.options import MountOptions
@@ -189,21 +185,6 @@ def test_commands_that_mount_nothing_need_no_libfuse() -> None:
 
 
 # -- one-shot runs --------------------------------------------------------------------------------
-
-
-def test_an_interrupted_command_cleans_up() -> None:
-    steps: list[str] = []
-
-    async def work() -> None:
-        try:
-            os.kill(os.getpid(), signal.SIGINT)
-            await trio.sleep(60)
-        finally:
-            steps.append("cleaned")
-
-    with pytest.raises(KeyboardInterrupt):
-        trio.run(until_interrupted, work)
-    assert steps == ["cleaned"]
 
 
 # -- status and umount ----------------------------------------------------------------------------

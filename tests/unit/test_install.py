@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cli import completion, install
+from mavftpfs.cli import install
 from mavftpfs.cli import main as cli
 from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode
@@ -24,28 +24,11 @@ def pieces(tmp_path: Path) -> dict[str, install.Piece]:
     return {piece.path.relative_to(tmp_path).as_posix(): piece for piece in found}
 
 
-def run_install(*words: str) -> int:
-    """Run the command."""
-    return cli.main(["install", *words])
-
-
 def checked(*command: str | Path) -> str:
     """Run a checker and return what it says; it must be content."""
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 0, result.stderr
     return result.stdout + result.stderr
-
-
-def test_what_is_written_is_removed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_install("--root", str(tmp_path)) == 0
-    written = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if not path.is_dir()}
-    said = capsys.readouterr().out
-    assert len(written) >= 8
-    assert all(str(tmp_path / path) in said for path in written)
-    assert run_install("--root", str(tmp_path)) == 0, "twice is fine"
-    assert run_install("--root", str(tmp_path), "--remove") == 0
-    assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
-    assert run_install("--root", str(tmp_path), "--remove") == 0, "nothing is there any more"
 
 
 def test_a_user_needs_no_root(tmp_path: Path) -> None:
@@ -78,15 +61,6 @@ def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece],
         said = checked("man", "--warnings", "--encoding=UTF-8", "--local-file", page)
         assert "warning" not in said
         assert "drone" in said
-
-
-@pytest.mark.parametrize("shell", completion.SHELLS)
-def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Path) -> None:
-    text = completion.completion(cli.whole_parser(), shell)
-    assert all(name in text for name in COMMANDS)
-    path = tmp_path / "mavftpfs"
-    path.write_text(text)
-    assert checked(shell, "-n", path) == ""
 
 
 def test_the_unit_calls_this_program(pieces: dict[str, install.Piece]) -> None:
