@@ -11,10 +11,7 @@ import pytest
 from mavftpfs.sim.parameters import (
     FLOAT,
     HEADER,
-    INT8,
-    INT16,
     INT32,
-    MAGIC,
     LenientUpload,
     Parameter,
     Selection,
@@ -134,70 +131,9 @@ def test_uploads_are_acked_and_refused_as_recorded(name: str) -> None:
             assert without_live(table.visible(0)) == without_live(unpacked(data_of(after))), upload_name
 
 
-def table_of_two() -> Table:
-    return Table([parameter("A_FLOAT", FLOAT, 1.5, 0.0), parameter("A_INT", INT32, 3, 3)])
-
-
-def packed(*entries: tuple[bytes, int, bytes], magic: int = MAGIC) -> bytes:
-    body = b"".join(bytes([kind, (len(name) - 1) << 4]) + name + value for name, kind, value in entries)
-    return HEADER.pack(magic, len(entries), len(body) + HEADER.size) + body
-
-
-def send(upload: Upload, data: bytes) -> None:
-    upload.write(0, data, 0)
-    upload.close(0)
-
-
-def test_a_float_is_cut_or_rounded_for_an_integer() -> None:
-    data = packed((b"A_INT", FLOAT, struct.pack("<f", 2.9)))
-    table = table_of_two()
-    send(StrictUpload(table), data)
-    assert table.number("A_INT", 0) == 2
-    table = table_of_two()
-    send(LenientUpload(table, says_so=True), packed((b"A_INT", FLOAT, struct.pack("<f", 5.995))))
-    assert table.number("A_INT", 0) == 6
-
-
-def test_what_came_before_the_mistake_is_set_by_px4_alone() -> None:
-    good = packed((b"A_FLOAT", FLOAT, struct.pack("<f", 7)))
-    wrong_length = HEADER.pack(MAGIC, 1, 9) + good[HEADER.size :]
-    strict, lenient = table_of_two(), table_of_two()
-    with pytest.raises(OSError, match="Invalid"):
-        send(StrictUpload(strict), wrong_length)
-    send(LenientUpload(lenient, says_so=False), wrong_length)
-    with pytest.raises(OSError, match="Invalid"):
-        send(LenientUpload(lenient, says_so=True), wrong_length)
-    assert (strict.number("A_FLOAT", 0), lenient.number("A_FLOAT", 0)) == (7, 1.5)
-
-
-def test_values_drift_by_whole_seconds_and_a_download_follows() -> None:
-    table = Table([parameter("STAT_RUNTIME", INT32, 10, drift=2), parameter("X", INT8, 1)])
-    before = table.download(Selection(), 239, 100.0)
-    assert table.download(Selection(), 239, 100.9) == before
-    assert table.number("STAT_RUNTIME", 103.5) == 16
-    assert table.download(Selection(), 239, 103.5) != before
-    table.set(b"STAT_RUNTIME", 0, 103.6)
-    assert table.number("STAT_RUNTIME", 104.1) == 2
-
-
-def test_limits_read_only_and_parameters_that_need_another() -> None:
-    table = Table(
-        [
-            parameter("LIMITED", FLOAT, 1, limits=(0, 5)),
-            parameter("FIXED", INT16, 3, read_only=True),
-            parameter("GRIP_ENABLE", INT8, 0),
-            parameter("GRIP_GRAB", INT16, 9, needs="GRIP_ENABLE"),
-        ]
-    )
-    for name in (b"LIMITED", b"FIXED", b"GRIP_GRAB"):
-        table.set(name, 100, 0)
-    assert [one.number for one in table.visible(0)] == [5, 3, 0]
-    table.set(b"GRIP_ENABLE", 1, 0)
-    assert table.number("GRIP_GRAB", 0) == 9
-
-
 def test_a_table_may_tell_every_default() -> None:
-    some = table_of_two().download(Selection(defaults=True), 239, 0)
+    two = Table([parameter("A_FLOAT", FLOAT, 1.5, 0.0), parameter("A_INT", INT32, 3, 3)])
+    some = two.download(Selection(defaults=True), 239, 0)
     every = Table(unpacked(some), every_default=True).download(Selection(defaults=True), 239, 0)
     assert len(every) == len(some) + 4
     assert [one.default for one in unpacked(every)] == [bytes(4), struct.pack("<i", 3)]

@@ -1,4 +1,4 @@
-"""What holds for every simulated server: above all that it never raises. And the textbook one."""
+"""What holds for every simulated server: above all that it never raises."""
 
 from __future__ import annotations
 
@@ -184,6 +184,3 @@ def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tm
         expected = new + old[100:500] + new + new + old[700:1000] + new + old[1100:]
         kept = storage.open(A).read(0, 4096)
         assert kept == (expected if closed else expected[:1024] + old[1024:])
-
-
-# -- the textbook server -------------------------------------------------------------------------
