@@ -150,6 +150,17 @@ def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: Clock)
     assert directory.proven == {}
 
 
+@pytest.mark.holds("fault odd listing")
+def test_a_change_during_a_listing_beats_what_it_saw_and_lets_it_expire() -> None:
+    directories = make()
+    sweep = directories.begin(b"/")
+    directories.put(b"/a", file(b"a", 9))
+    directories.put(b"/b", None)
+    directory = directories.remember(sweep, Listing((file(b"a", 1, 5), file(b"b"), file(b"c")), 0))
+    assert directory.entries == {b"a": file(b"a", 9), b"c": file(b"c")}
+    assert (directory.complete, directory.fresh_until) == (True, 0)
+
+
 # --- mtimes
 
 
