@@ -211,8 +211,10 @@ async def attached(
     """
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
-    async with opened(spec, options) as link, connected(link, settings, trace=sinks.payload) as connection:
-        connection.driver.framer.on_frame = sinks.frame
+    async with (
+        opened(spec, options) as link,
+        connected(link, settings, trace=sinks.payload, on_frame=sinks.frame) as connection,
+    ):
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
         async with with_tree(
             connection, spec, options, invalidate=invalidate, writing=writing, rescue_for=rescue_for

@@ -159,10 +159,10 @@ class Framer:
         signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
             or the vehicle refuses us.
+        on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
 
     Attributes:
         waiting: a stream ended in what may be the beginning of a frame.
-        on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
 
     Raises:
         UsageError: the key has another length.
@@ -175,9 +175,10 @@ class Framer:
         stream: bool,
         signing_key: bytes | None = None,
         signing_clock: Callable[[], int] | None = None,
+        on_frame: Callable[[bytes], None] | None = None,
     ) -> None:
         self.stats = FramerStats()
-        self.on_frame: Callable[[bytes], None] | None = None
+        self.on_frame = on_frame
         self.stream = stream
         self.waiting = False
         self._tail = b""

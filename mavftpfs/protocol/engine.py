@@ -61,12 +61,12 @@ class Engine:
         rng: for the first seq and the session id to ask for.
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
+        on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
+            explains, and with the seconds since its request went out (0 where that is not known).
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
-        on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
-            explains, and with the seconds since its request went out (0 where that is not known).
     """
 
     def __init__(
@@ -75,13 +75,14 @@ class Engine:
         flow: Flow,
         *,
         op_deadline: float = OP_DEADLINE,
+        on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)
         self.session = self.home_session
         self.flow = flow
         self.traits = Traits()
         self.stats = EngineStats()
-        self.on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None
+        self._on_unexplained = on_unexplained
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
@@ -219,7 +220,7 @@ class Engine:
         duplicates = self._ledger.duplicates
         if not duplicates.explains(reply.seq) and reply.req_opcode != _BURST:
             self.stats.unexplained += 1
-            self.on_unexplained(reply, duplicates.late_by(reply.seq, now))
+            self._on_unexplained(reply, duplicates.late_by(reply.seq, now))
 
     def _on_replay(self, request: Request) -> None:
         """The server replays an earlier reply under this seq, so it will never answer this one (servers.md

@@ -7,7 +7,7 @@ import random
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from math import inf
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from mavftpfs.link.peers import describe_peer
 from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.payload import Payload
 from mavftpfs.session.driver import Driver, PayloadTrace
 from mavftpfs.session.scheduler import ReadMode, Scheduler
 from mavftpfs.session.store import Store
@@ -86,22 +87,62 @@ class ConnectOptions:
     bwlimit: int | None = None
 
 
-@dataclass(slots=True)
 class Connection:
-    """One vehicle, reachable. Made by `connected`."""
+    """One vehicle, reachable. Made by `connected`, which runs its tasks.
 
-    store: Store
-    vehicle: Vehicle
-    scheduler: Scheduler
-    engine: Engine
-    driver: Driver
-    link: Link
-    options: ConnectOptions
-    clock: Callable[[], float]
-    was_lost: bool = False
-    news: list[Callable[[str], None]] = field(default_factory=list)
-    _first_heartbeat: trio.Event = field(default_factory=trio.Event)
-    _doubted: trio.Event = field(default_factory=trio.Event)
+    Attributes:
+        was_lost: it was lost, and not heard since. news: see `subscribe`.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        options: ConnectOptions,
+        *,
+        rng: random.Random,
+        clock: Callable[[], float],
+        trace: PayloadTrace | None = None,
+        on_frame: Callable[[bytes], None] | None = None,
+    ) -> None:
+        self.link, self.options, self.clock = link, options, clock
+        self.was_lost = False
+        self.news: list[Callable[[str], None]] = []
+        self._first_heartbeat, self._doubted = trio.Event(), trio.Event()
+        own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
+        framer = Framer(
+            own,
+            stream=link.is_stream,
+            signing_key=options.signing_key,
+            signing_clock=signing_now,
+            on_frame=on_frame,
+        )
+        framer.link_id = 0 if link.seat is None else link.seat.number
+        self.vehicle = Vehicle(
+            options.target_system,
+            options.target_component,
+            own,
+            write_armed=options.when_armed == "ok",
+            on_reboot=self._on_reboot,
+            on_foreign=self._on_foreign,
+            on_heartbeat=self._on_heartbeat,
+            on_armed=self._on_armed,
+            on_refusal=partial(self._tell, "arming refused"),
+            on_double=self._move_away,
+            on_doubt=self._on_doubt,
+        )
+        signature = 0 if options.signing_key is None else SIGNATURE
+        budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
+        flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
+        self.engine = Engine(rng, flow, op_deadline=options.op_deadline, on_unexplained=self._on_unexplained)
+        self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, trace=trace)
+        self.scheduler = Scheduler(
+            self.driver,
+            clock=clock,
+            op_deadline=options.op_deadline,
+            read_mode=options.read_mode if budget is None else "window",
+            chunk=options.chunk,
+        )
+        self.store = Store(self.scheduler)
 
     async def ready(self, timeout: float, on_wait: Callable[[], None] = lambda: None) -> None:
         """Wait for the vehicle's first heartbeat; on_wait: called when it does not come at once.
@@ -205,12 +246,11 @@ class Connection:
         self.engine.flow.alone = False
         self.scheduler.on_foreign(payload, newcomer=newcomer)
 
+    def _on_unexplained(self, reply: Payload, late: float) -> None:
+        self.scheduler.on_unexplained(reply, late)
+
     def _on_armed(self, armed: bool) -> None:
-        # Uploads are terminated and held while it is armed, and go on afterwards (promise 9).
-        for user in list(self.scheduler.users):
-            if isinstance(user, Upload):
-                user.on_armed_changed()
-        self.scheduler.server.wake()
+        self.scheduler.on_armed_changed()
         self._tell("armed" if armed else "disarmed")
 
     def _move_away(self) -> None:
@@ -310,9 +350,14 @@ async def connected(
     rng: random.Random | None = None,
     clock: Callable[[], float] = trio.current_time,
     trace: PayloadTrace | None = None,
+    on_frame: Callable[[bytes], None] | None = None,
 ) -> AsyncIterator[Connection]:
-    """Run a connection over an open link for the length of the body; the session is terminated at its end."""
-    connection = _build(link, options, rng or random.SystemRandom(), clock, trace)
+    """Run a connection over an open link for the length of the body; the session is terminated at its end.
+
+    trace, on_frame: told of each FTP payload, and of each whole frame, received or sent.
+    """
+    rng = rng or random.SystemRandom()
+    connection = Connection(link, options, rng=rng, clock=clock, trace=trace, on_frame=on_frame)
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:
         serving = _Task(nursery, connection.scheduler.serve)
@@ -355,42 +400,6 @@ class _Task:
             nursery.cancel_scope.cancel()
         finally:
             self.ended.set()
-
-
-def _build(
-    link: Link,
-    options: ConnectOptions,
-    rng: random.Random,
-    clock: Callable[[], float],
-    trace: PayloadTrace | None,
-) -> Connection:
-    own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
-    framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key, signing_clock=signing_now)
-    framer.link_id = 0 if link.seat is None else link.seat.number
-    write_armed = options.when_armed == "ok"
-    vehicle = Vehicle(options.target_system, options.target_component, own, write_armed)
-    signature = 0 if options.signing_key is None else SIGNATURE
-    budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
-    flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
-    engine = Engine(rng, flow, op_deadline=options.op_deadline)
-    driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
-    scheduler = Scheduler(
-        driver,
-        clock=clock,
-        op_deadline=options.op_deadline,
-        read_mode=options.read_mode if budget is None else "window",
-        chunk=options.chunk,
-    )
-    connection = Connection(Store(scheduler), vehicle, scheduler, engine, driver, link, options, clock)
-
-    vehicle.on_reboot = connection._on_reboot
-    vehicle.on_foreign = connection._on_foreign
-    vehicle.on_heartbeat = connection._on_heartbeat
-    vehicle.on_armed = connection._on_armed
-    vehicle.on_refusal = partial(connection._tell, "arming refused")
-    vehicle.on_double = connection._move_away
-    vehicle.identity.on_doubt = connection._on_doubt
-    return connection
 
 
 def signing_now() -> int:

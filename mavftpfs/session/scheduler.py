@@ -128,6 +128,9 @@ class SessionUser:
     def on_suspect(self, reason: str) -> None:
         """What was read lately may be another file's."""
 
+    def on_armed_changed(self) -> None:
+        """The vehicle was armed or disarmed."""
+
     def on_turn(self, began: float, now: float) -> None:
         """It had the session until now."""
         self._used = self.used(began) + now - began
@@ -234,7 +237,6 @@ class Scheduler:
         self._nursery: trio.Nursery | None = None
         self._used_at = clock()
         self._touched_at = -inf
-        driver.engine.on_unexplained = self._on_unexplained
 
     # --- turns
 
@@ -413,7 +415,7 @@ class Scheduler:
             self.server.abandon()  # what we read or write would be its file
         self.server.wake()
 
-    def _on_unexplained(self, reply: Payload, late: float) -> None:
+    def on_unexplained(self, reply: Payload, late: float) -> None:
         """An answer came that no request of ours explains. An older open that was carried out once more may
         have put its file in the place of ours (MAVSDK); all else is no other file's."""
         session = self.server.session
@@ -428,6 +430,12 @@ class Scheduler:
         """What was read lately is provisional, also of files closed since."""
         for user in [*self.users, *(user for _, user in self.gone)]:
             user.on_suspect(reason)
+
+    def on_armed_changed(self) -> None:
+        """Uploads end while it is armed, and go on afterwards (promise 9)."""
+        for user in self.users:
+            user.on_armed_changed()
+        self.server.wake()
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""

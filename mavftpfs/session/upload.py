@@ -153,7 +153,7 @@ class Upload(SessionUser):
         return not all(finisher.done for finisher in self._finishers)
 
     def on_armed_changed(self) -> None:
-        """What waits for an upload is told at once; a running one ends itself. On disarming it goes on."""
+        """What waits for it is told at once, and it ends its turn by itself. On disarming it goes on."""
         if self._vehicle.may_write:
             self._retry_at = 0.0
         else:

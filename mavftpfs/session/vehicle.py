@@ -78,14 +78,13 @@ class Identity:
         standing: of who answers now; only a trusted one is asked for files.
         left_at: when it was heard last before it was away, the last time.
         heard_at: when it was heard last.
-        on_doubt: it may have restarted, or be another one: it is to be asked.
-        on_settled: called with whether it was a stranger meanwhile: it is trusted again.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, on_doubt: Callable[[], None], on_settled: Callable[[bool], None]) -> None:
+        """on_doubt: it may have restarted, or be another one: it is to be asked. on_settled: called with
+        whether it was a stranger meanwhile: it is trusted again."""
         self.standing = Standing.TRUSTED
-        self.on_doubt: Callable[[], None] = lambda: None
-        self.on_settled: Callable[[bool], None] = lambda was_stranger: None
+        self._on_doubt, self._on_settled = on_doubt, on_settled
         self._known: AutopilotVersion | None = None
         self._strange = False
         self._mute = False
@@ -134,7 +133,7 @@ class Identity:
             self._strange |= self.standing is Standing.STRANGER
             self.standing = Standing.DOUBTED
             self._unanswered = 0
-        self.on_doubt()
+        self._on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
         """It told who it is; return whether it is the same as ever."""
@@ -161,14 +160,14 @@ class Identity:
     def _is_stranger(self) -> None:
         was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
         if was_trusted:  # nobody asks, and ours may come back without a silence
-            self.on_doubt()
+            self._on_doubt()
 
     def _settle(self) -> None:
         if self.standing is Standing.TRUSTED:
             return
         strange = self._strange or self.standing is Standing.STRANGER
         self.standing, self._strange, self._moved = Standing.TRUSTED, False, False
-        self.on_settled(strange)
+        self._on_settled(strange)
 
 
 def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
@@ -189,6 +188,7 @@ class Vehicle:
     write_armed: write in flight, too.
     own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
     another client's, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
+    on_double: somebody else uses our address. on_doubt: see Identity.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
@@ -205,6 +205,7 @@ class Vehicle:
     on_armed: Callable[[bool], None] = lambda armed: None
     on_refusal: Callable[[], None] = lambda: None
     on_double: Callable[[], None] = lambda: None
+    on_doubt: Callable[[], None] = lambda: None
     address: Address | None = None
     heartbeat: Heartbeat | None = None
     heartbeat_at: float | None = None
@@ -213,7 +214,7 @@ class Vehicle:
     foreign_at: float | None = None
     reboots: int = 0
     refusals: int = 0
-    identity: Identity = field(default_factory=Identity)
+    identity: Identity = field(init=False)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     armed: bool = True
     may_write: bool = False
@@ -225,7 +226,7 @@ class Vehicle:
     _timed_out: bool = False
 
     def __post_init__(self) -> None:
-        self.identity.on_settled = self._on_settled
+        self.identity = Identity(self.on_doubt, self._on_settled)
         self.may_write = self.write_armed
 
     @property

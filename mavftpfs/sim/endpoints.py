@@ -45,8 +45,7 @@ class Endpoint:
         self.model = model
         self.cut = False
         self._arrived: list[bytes] = []
-        self._splitter = Framer(vehicle.address, stream=link.is_stream)
-        self._splitter.on_frame = self._arrived.append
+        self._splitter = Framer(vehicle.address, stream=link.is_stream, on_frame=self._arrived.append)
         self._scope: trio.CancelScope | None = None
         self._set_room()
 

@@ -89,9 +89,12 @@ def test_two_answers_to_two_requests() -> None:
 
 
 def test_how_late_a_copy_was_is_told() -> None:
-    engine = make()
     heard: list[tuple[int, float]] = []
-    engine.on_unexplained = lambda reply, late: heard.append((reply.req_opcode, late))
+
+    def hear(reply: Payload, late: float) -> None:
+        heard.append((reply.req_opcode, late))
+
+    engine = Engine(random.Random(1), Flow(limit=8), on_unexplained=hear)
     request = ask(engine, Opcode.CREATE_DIRECTORY, 1.0)
     engine.receive(ack(request), 1.1)
     engine.receive(ack(request), 4.0)

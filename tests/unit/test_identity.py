@@ -25,11 +25,9 @@ class Watched(Identity):
     """An identity that counts what it tells. doubts: questions wanted; settled: what on_settled was told."""
 
     def __init__(self) -> None:
-        super().__init__()
         self.doubts = 0
         self.settled: list[bool] = []
-        self.on_doubt = self._count
-        self.on_settled = self.settled.append
+        super().__init__(self._count, self.settled.append)
 
     def _count(self) -> None:
         self.doubts += 1
