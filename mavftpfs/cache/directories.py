@@ -129,7 +129,6 @@ class Directories:
     ones are dropped when they have more than `max_entries` names.
 
     Attributes:
-        on_listed: called with each new listing. on_swept: awaited before a new listing is returned.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
 
@@ -140,16 +139,20 @@ class Directories:
         *,
         clock: Callable[[], float],
         nursery: trio.Nursery | None = None,
+        on_listed: Callable[[bytes, Directory], None] = lambda path, directory: None,
+        on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None,
     ) -> None:
-        """`clock`: seconds, monotonic. With a nursery a listing outlives its caller."""
+        """`clock`: seconds, monotonic. With a nursery a listing outlives its caller.
+
+        `on_listed` is called with each new listing, and `on_swept` is awaited before one is returned.
+        """
         self._store = store
         self._options = options
         self.clock = clock
         self._known: OrderedDict[bytes, Directory] = OrderedDict()
         self._sweeps: dict[bytes, Sweep] = {}
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
-        self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
-        self.on_listed: list[Callable[[bytes, Directory], None]] = []
+        self._on_listed, self._on_swept = on_listed, on_swept
         self.sweeps = 0
         self.rebooted()
 
@@ -377,8 +380,8 @@ class Directories:
                 break
             self.require_heard()
             waited_for = True
-        if self.on_swept is not None:
-            await self.on_swept(path, directory)
+        if self._on_swept is not None:
+            await self._on_swept(path, directory)
         return directory
 
     async def _walk_to_root(self) -> None:
@@ -418,8 +421,7 @@ class Directories:
                 del self._sweeps[path]
             directory = self.remember(sweep, listing)
             if not sweep.void:
-                for hear in self.on_listed:
-                    hear(path, directory)
+                self._on_listed(path, directory)
             if not sweep.changes or tries == SWEEP_TRIES:
                 return directory
 

@@ -71,7 +71,6 @@ class Files:
     """All regular files that are open or cached. Paths are the vehicle's.
 
     Attributes:
-        is_changing: see Context.is_changing.
         kept: the cache on the local disk, if there is one. open_versions: those with open handles.
         reopening: the versions that are given a reader now, see `open_reader`.
     """
@@ -84,11 +83,15 @@ class Files:
         proof_time: float,
         directories: Directories,
         invalidate: Callable[[bytes], None],
+        is_changing: Callable[[bytes], bool],
         kept: KeptCache | None = None,
     ) -> None:
-        """`proof_time`: seconds for which a proof that a version is the vehicle's file holds."""
+        """`is_changing`: see Context.is_changing.
+
+        `proof_time`: seconds for which a proof that a version is the vehicle's file holds.
+        """
         self.kept = kept
-        self.is_changing: Callable[[bytes], bool] = lambda path: False
+        self._is_changing = is_changing
         self._store = store
         self.cache = cache
         self._clock = cache.clock
@@ -101,7 +104,6 @@ class Files:
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self.reopening: SingleFlight[Version, None] = SingleFlight()
-        directories.on_listed.append(self._on_listed)
 
     # --- opening
 
@@ -166,7 +168,7 @@ class Files:
         version = self._version(path)
         reader = await self._store.open_reader(path, version)
         try:
-            if reader.size < entry.size and not self.is_changing(path):
+            if reader.size < entry.size and not self._is_changing(path):
                 entry = await self._require_listed(path, reader.size)
         except BaseException:
             reader.close()
@@ -253,7 +255,7 @@ class Files:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
         soon = not now and self._clock() < version.compare_after
-        if not (soon or self._is_sure(version) or self.is_changing(version.path)):
+        if not (soon or self._is_sure(version) or self._is_changing(version.path)):
             await self._compare(version)
         version.require_not_replaced()
 
@@ -273,7 +275,7 @@ class Files:
             self.kill(version)
             return
         async with self.paths.steady(version) as present:
-            if present != path or self.is_changing(path):
+            if present != path or self._is_changing(path):
                 return  # it is compared under its new name, by the next read
         took = directory.ended_at - directory.listed_at
         version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
@@ -295,17 +297,17 @@ class Files:
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
 
-    def _on_listed(self, path: bytes, directory: Directory) -> None:
+    def on_listed(self, path: bytes, directory: Directory) -> None:
         """Compare the open versions of a directory with any new listing of it."""
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and not version.replaced
-            if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
+            if known and directory.listed_at > version.proven_at and not self._is_changing(version.path):
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
         """Make a version REPLACED, and with the newest one of a path all older ones."""
-        by_others = not self.is_changing(version.path)
+        by_others = not self._is_changing(version.path)
         newest = self._current.get(version.path) is version
         older = [v for v in self.open_versions if newest and v.path == version.path]
         for one in dict.fromkeys((version, *older)):

@@ -1,4 +1,4 @@
-"""The remote tree as the FUSE layer sees it. Layer: cache.
+"""The vehicle's files, as mounts, commands and programs see them. Layer: cache.
 
 `Tree` decides which part answers: remembered listings (`directories`), blocks of regular files (`files`),
 what is written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
@@ -17,7 +17,7 @@ from typing import Any
 import trio
 
 from mavftpfs.cache.attributes import SECOND, Stat, shown_mtime
-from mavftpfs.cache.directories import Directories, Found
+from mavftpfs.cache.directories import Directories, Directory, Found
 from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import CLOCK_SET, KeptCache
@@ -71,7 +71,8 @@ class Tree:
         rng: Random | None = None,
         keep: Callable[[Directories, BlockCache], KeptCache] | None = None,
     ) -> None:
-        """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
+        """`invalidate(path)`: copies that the caller (a mount's kernel) keeps of a path's bytes and
+        attributes are wrong; must not block.
 
         With a nursery, listings and snapshots under way survive the cancellation of their callers, and
         written bytes go to the vehicle while the program still writes.
@@ -80,9 +81,11 @@ class Tree:
         """
         self._options = options
         self._clock = clock
-        self._tell_kernel = invalidate
+        self._forget_copies = invalidate
         self._store = store
-        self._directories = Directories(store, options, clock=clock, nursery=nursery)
+        self._directories = Directories(
+            store, options, clock=clock, nursery=nursery, on_listed=self._on_listed, on_swept=self._on_swept
+        )
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self._kept: KeptCache | None = None
         if keep is not None and nursery is not None:
@@ -94,6 +97,7 @@ class Tree:
             proof_time=options.proof_time,
             directories=self._directories,
             invalidate=self._invalidate,
+            is_changing=self._is_changing,
             kept=self._kept,
         )
         self._virtual = VirtualTrees(
@@ -142,7 +146,7 @@ class Tree:
         return self._listed_stat(remote, await self._directories.find(remote))
 
     def negative_valid_for(self, path: bytes) -> float:
-        """Return for how many seconds the kernel may remember that stat(path) raised NotFound.
+        """Return for how many seconds a caller may remember that stat(path) raised NotFound.
 
         0 where the absence is not proven: the listing was incomplete or is not fresh any more.
         """
@@ -485,7 +489,20 @@ class Tree:
             raise NotFound(f"{remote!r} is a name of our own")
 
     def _invalidate(self, remote: bytes) -> None:
-        self._tell_kernel(self._below(remote))
+        self._forget_copies(self._below(remote))
+
+    def _on_listed(self, remote: bytes, directory: Directory) -> None:
+        """A directory was listed: what is open of it is compared."""
+        self._files.on_listed(remote, directory)
+        self._context.on_listed(remote, directory)
+
+    async def _on_swept(self, remote: bytes, directory: Directory) -> None:
+        """A listing is to be given out: leftovers in it are mended first."""
+        if not self._options.read_only:
+            await self._writing.cleaner.on_swept(remote, directory)
+
+    def _is_changing(self, remote: bytes) -> bool:
+        return self._context.is_changing(remote)
 
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):

@@ -53,7 +53,7 @@ class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
     Attributes:
-        context: what its parts share. namespace: mkdir, rmdir, unlink and rename.
+        context: what its parts share. namespace: mkdir, rmdir, unlink and rename. cleaner: looks at listings.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Writeback:
         nursery: trio.Nursery | None,
         spool_directory: SpoolDirectory | None,
     ) -> None:
-        """Build on the parts for reading. From now on leftovers in listings are repaired.
+        """Build on the parts for reading.
 
         Without a spool directory, bytes beyond the memory's limit go to one that does not outlive the
         process.
@@ -94,16 +94,12 @@ class Writeback:
         )
         self._throttle = throttle = Throttle(context, limit)
         self._names = names = Names(context)
-        self._cleaner = cleaner = Cleaner(context, names, dead)
+        self.cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
         self._nursery = nursery
         self._retrying = False
         self.namespace = Namespace(context, names, deliverer)
         self._parts = Parts(context, deliverer, throttle, self.namespace)
-        if not options.read_only:
-            directories.on_swept = cleaner.on_swept
-        files.is_changing = context.is_changing
-        directories.on_listed.append(context.on_listed)
 
     # --- opening
 
@@ -239,7 +235,7 @@ class Writeback:
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
         if self._context.unfinished and self._context.store.why_lost() is None:
-            await self._cleaner.finish(at_once=True)
+            await self.cleaner.finish(at_once=True)
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
@@ -298,7 +294,7 @@ class Writeback:
 
     async def _try_all(self) -> None:
         """Finish and deliver everything that failed or was refused: it may work now."""
-        await self._cleaner.finish()
+        await self.cleaner.finish()
         for node in self._context.nodes:
             node.start_after = float("-inf")
         await self._deliver_each(self._is_left_to_us)
@@ -329,7 +325,7 @@ class Writeback:
             while unfinished or any(n.undelivered and may_pass(n) for n in nodes):
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
-                await self._cleaner.finish()
+                await self.cleaner.finish()
                 await self._deliver_each(lambda node: may_pass(node) and self._is_left_to_us(node))
         finally:
             self._retrying = False
