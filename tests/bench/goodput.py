@@ -29,8 +29,8 @@ from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench import record
 from tests.bench.cases import Case, Direction, Result
-from tests.support.mounting import writable_tree
-from tests.support.worlds import ROOTS, MemorySink, World
+from tests.support.rigs import Rig
+from tests.support.transfers import MemorySink
 
 PATIENCE = 20
 """How many times the ideal duration a run may take."""
@@ -39,6 +39,7 @@ PIECE = 128 * 1024
 """Bytes that a program writes at once."""
 
 TABLE_WIDTH = 100
+FILE = b"/d/log.bin"
 
 
 def measure(
@@ -62,17 +63,17 @@ def measure(
     settings = LinkSettings(
         rate=case.rate, delay=case.rtt / 2, jitter=jitter, reorder=reorder, loss=case.loss, queue=room
     )
-    world = World(case.profile, settings, seed=seed, telemetry=telemetry)
+    here = Rig(case.profile, link=settings, seed=seed, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
     transfer = _read if case.direction == "read" else _write
 
     async def run() -> Result:
-        async with world.connection() as connection:
+        async with here.connected() as connection:
             with trio.fail_after(seconds * PATIENCE):
-                took = await transfer(world, connection, data)
+                took = await transfer(here, connection, data)
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
-        server = world.vehicle.server
-        dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
+        server = here.vehicle.server
+        dropped = sum(here.model.counters(direction).dropped for direction in LinkDirection)
         dropped += server.firmware.dropped_replies
         limit = replace(case, rate=case.rate - telemetry).limit_beside(server.firmware.pauses)
         return Result(case, limit, len(data) / took / limit, requests, dropped)
@@ -80,39 +81,31 @@ def measure(
     return trio.run(run, clock=MockClock(autojump_threshold=0))
 
 
-async def _read(world: World, connection: Connection, data: bytes) -> float:
+async def _read(here: Rig, connection: Connection, data: bytes) -> float:
     """Return how many seconds it took to read the file."""
-    path = _directory(world) + b"/log.bin"
-    world.tree.add(path, data)
+    here.put(FILE, data)
     began = trio.current_time()
     sink = MemorySink(len(data))
-    reader = await connection.store.open_reader(path, sink)
+    reader = await connection.store.open_reader(here.root + FILE, sink)
     reader.want(0, len(data), demand=True)
     assert await sink.wait_for(0, len(data)) == data
     return trio.current_time() - began
 
 
-async def _write(world: World, connection: Connection, data: bytes) -> float:
+async def _write(here: Rig, connection: Connection, data: bytes) -> float:
     """Return how many seconds it took from the open of a new file to the return of its close."""
-    world.tree.add_directory(_directory(world))
-    path = _directory(world) + b"/log.bin"
-    async with trio.open_nursery() as nursery:
-        tree = writable_tree(connection, nursery, verify="size")
-        assert path not in dict(await tree.list(_directory(world)))  # as a lookup does before the open
-        began = trio.current_time()
-        file = await tree.create(path, exclusive=False)
-        for at in range(0, len(data), PIECE):
-            await file.write(at, data[at : at + PIECE])
-        await file.flush()
-        took = trio.current_time() - began
-        assert world.tree.data(path) == data
-        await file.release()
-        nursery.cancel_scope.cancel()
+    here.put_directory(b"/d")
+    tree = here.mount(verify="size")
+    assert FILE not in dict(await tree.list(b"/d"))  # as a lookup does before the open
+    began = trio.current_time()
+    file = await tree.create(FILE, exclusive=False)
+    for at in range(0, len(data), PIECE):
+        await file.write(at, data[at : at + PIECE])
+    await file.flush()
+    took = trio.current_time() - began
+    assert here.data(FILE) == data
+    await file.release()
     return took
-
-
-def _directory(world: World) -> bytes:
-    return ROOTS.get(world.profile, b"") + b"/d"
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:

@@ -106,7 +106,7 @@ class Programs:
     def __init__(self, here: Rig, rng: random.Random) -> None:
         self.here = here
         self.rng = rng
-        self.with_times = here.world.profile == "mavsdk"
+        self.with_times = here.profile == "mavsdk"
         self.mtime = 1_700_000_000
         self.had: dict[bytes, list[bytes]] = {path: [] for path in self.PATHS}
         here.put_directory(b"/d")
@@ -177,7 +177,7 @@ class Programs:
         if trouble == "doubt":
             self.here.connection.scheduler.doubt.raise_it("somebody else")
         elif trouble == "cut":
-            self.here.world.link.cut()
+            self.here.link.cut()
             await trio.sleep(self.rng.choice([1.0, 8.0]))
             await self.here.find()
         elif trouble == "reboot":

@@ -7,7 +7,6 @@ is found out on the way; where it does, others wait, and are told in time.
 from __future__ import annotations
 
 import random
-from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 
 import pytest
@@ -21,12 +20,18 @@ from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import Armed, FtpNak, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.faults import Faults
-from tests.support.mounting import mounted
-from tests.support.sources import MemorySource
+from tests.support.rigs import Rig
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import know, start, under_way
-from tests.support.worlds import ROOTS, MemorySink, World, content, path, read_file, world
+from tests.support.transfers import (
+    MemorySink,
+    MemorySource,
+    content,
+    know,
+    path,
+    read_file,
+    start,
+    under_way,
+)
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -50,14 +55,12 @@ class Place:
     """
 
     def __init__(self, profile: str, link: LinkSettings) -> None:
-        self.world = World(profile, link)
-        self.root = ROOTS.get(profile, b"") + b"/d"
-        self.world.tree.add(self.root + b"/other", b"q" * 3000)
-        self.world.tree.add(self.root + b"/brief", b"q" * 100)
+        self.rig = Rig(profile, {b"/d/other": b"q" * 3000, b"/d/brief": b"q" * 100}, link)
+        self.root = self.rig.root + b"/d"
         self.came: list[tuple[int, float]] = []
         self.lose: list[int] = []
-        self._handle = self.world.vehicle.server.handle
-        self.world.vehicle.server.handle = self._on_request  # type: ignore[method-assign]
+        self._handle = self.rig.server.handle
+        self.rig.server.handle = self._on_request  # type: ignore[method-assign]
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         if wire[OPCODE] in self.lose:
@@ -80,12 +83,9 @@ class Place:
         assert source.all_proven
         assert self.data(name) == data
 
-    def mounted(self) -> AbstractAsyncContextManager[tuple[Connection, Tree]]:
-        return mounted(self.world, self.root)
-
     async def copy(self, tree: Tree, name: bytes, data: bytes) -> float:
         """Do what cp does; return how long closing took."""
-        file = await tree.create(self.root + b"/" + name, exclusive=True)
+        file = await tree.create(b"/d/" + name, exclusive=True)
         for at in range(0, len(data), 50_000):
             await file.write(at, data[at : at + 50_000])
         began = trio.current_time()
@@ -96,7 +96,7 @@ class Place:
         return trio.current_time() - began
 
     def data(self, name: bytes) -> bytes:
-        return bytes(self.world.tree.data(self.root + b"/" + name))
+        return self.rig.data(b"/d/" + name)
 
 
 async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
@@ -114,14 +114,14 @@ async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autojump: MockClock) -> None:
     place = Place(profile, QUICK)
-    async with place.mounted() as (_, tree), trio.open_nursery() as nursery:
-        nursery.start_soon(trickle, tree, place.root + b"/log")
+    async with place.rig.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+        nursery.start_soon(trickle, tree, b"/d/log")
         await trio.sleep(10)
         for number in range(4):
             with trio.fail_after(15):
                 await place.copy(tree, b"b%d" % number, b"b" * 1000)
             assert place.data(b"b%d" % number) == b"b" * 1000
-            file = await tree.open(place.root + b"/other")
+            file = await tree.open(b"/d/other")
             with trio.fail_after(15):
                 assert await file.read(number * 300, 300) == b"q" * 300
             file.close()
@@ -133,16 +133,16 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
     place = Place(profile, SLOW)
-    data = random.Random(4).randbytes(600_000)
-    async with place.mounted() as (connection, tree):
+    data = random.Random(4).randbytes(300_000)
+    async with place.rig.mounted(b"/d") as tree:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(place.copy, tree, b"big", data)
             await trio.sleep(10)
             with trio.fail_after(5):
-                assert await read_file(connection, place.root + b"/other") == b"q" * 3000
+                assert await read_file(place.rig.connection, place.root + b"/other") == b"q" * 3000
             with trio.fail_after(10):
                 await place.copy(tree, b"small", b"b" * 1000)
-        assert connection.store.traits.wo_truncates is False, "learnt on the way"
+        assert place.rig.connection.store.traits.wo_truncates is False, "learnt on the way"
     assert place.data(b"big") == data
     assert place.data(b"small") == b"b" * 1000
 
@@ -154,23 +154,24 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str,
     place = Place(profile, SLOW)
     data = random.Random(4).randbytes(600_000)
     waited: list[float] = []
-    async with place.mounted() as (connection, tree):
-        faults = Faults(place.world)
+    async with place.rig.mounted(b"/d") as tree:
+        faults = place.rig.faults
+        faults.requests.clear()
         async with trio.open_nursery() as nursery:
             nursery.start_soon(place.copy, tree, b"big", data)
             await trio.sleep(10)
-            assert await read_file(connection, place.root + b"/other") == b"q" * 3000  # the trial
+            assert await read_file(place.rig.connection, place.root + b"/other") == b"q" * 3000  # the trial
             await trio.sleep(2)
             began = trio.current_time()
             with pytest.raises(RequestTimeout):
                 await place.copy(tree, b"small", b"b" * 1000)
             waited.append(trio.current_time() - began)
             began = trio.current_time()
-            await connection.store.list_directory(place.root)
+            await place.rig.connection.store.list_directory(place.root)
             waited.append(trio.current_time() - began)
         assert waited[0] <= 2 * OP_DEADLINE + 3, "for close, and for the release behind it"
         assert waited[1] < 3
-        assert connection.store.traits.wo_truncates is True
+        assert place.rig.connection.store.traits.wo_truncates is True
         await trio.sleep(60)
         assert place.data(b"small") == b"b" * 1000, "brought later"
         # big twice, small, and an empty file that shows whether the card can rename
@@ -183,12 +184,13 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str,
 async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: MockClock) -> None:
     """The whole file again for each line is more than a link carries."""
     place = Place(profile, QUICK)
-    async with place.mounted() as (_, tree), trio.open_nursery() as nursery:
-        faults = Faults(place.world)
-        nursery.start_soon(trickle, tree, place.root + b"/log", 3.0)
-        await trio.sleep(600)
+    async with place.rig.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+        faults = place.rig.faults
+        faults.requests.clear()
+        nursery.start_soon(trickle, tree, b"/d/log", 3.0)
+        await trio.sleep(300)
         nursery.cancel_scope.cancel()
-    needed = (70_000 + 200 * 500) // 239
+    needed = (70_000 + 100 * 500) // 239
     assert faults.requests.count(Opcode.CREATE_FILE) <= 16
     assert faults.requests.count(Opcode.WRITE_FILE) <= (10 if profile in TRUNCATING else 2) * needed
 
@@ -199,11 +201,12 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, auto
     """A program without a buffer of its own writes faster than answers come, and slower than the link."""
     place = Place(profile, LinkSettings(rate=100_000.0, delay=0.02))
     data = random.Random(5).randbytes(70_000 + 700 * step)
-    async with place.mounted() as (_, tree):
-        file = await tree.create(place.root + b"/log", exclusive=True)
+    async with place.rig.mounted(b"/d") as tree:
+        file = await tree.create(b"/d/log", exclusive=True)
         await file.write(0, data[:70_000])
         await trio.sleep(10)  # it is on its way, and all there is was sent
-        faults = Faults(place.world)
+        faults = place.rig.faults
+        faults.requests.clear()
         for at in range(70_000, len(data), step):
             await file.write(at, data[at : at + step])
             await trio.sleep(0.004)
@@ -218,8 +221,9 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, auto
 async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(profile: str, autojump: MockClock) -> None:
     """More comes for a file that was closed for lack of bytes: it is reopened, and that is looked at."""
     place = Place(profile, QUICK)
-    async with place.world.connection() as connection:
-        faults = Faults(place.world)
+    async with place.rig.connected() as connection:
+        faults = place.rig.faults
+        faults.requests.clear()
         source = MemorySource(b"a" * 3000)
         upload = await connection.store.open_upload(place.root + b"/new", source)
         await upload.finish()
@@ -231,7 +235,7 @@ async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(profile: str, 
         assert source.rollbacks == ([True] if profile in TRUNCATING else [])
         assert faults.requests.count(Opcode.CREATE_FILE) == 1 + (profile in TRUNCATING)
     assert place.data(b"new") == b"a" * 3000 + b"b" * 100
-    assert place.world.vehicle.server.open_sessions == 0
+    assert place.rig.server.open_sessions == 0
 
 
 # --- the Terminate goes out right behind the last requests
@@ -256,8 +260,8 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
 ) -> None:
     """What was refused behind the Terminate was sent again, and refused again, for ever."""
     place = Place(profile, LINK)
-    place.world.tree.capacity = place.world.tree.used + 20_400
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+    place.rig.card.capacity = place.rig.card.used + 20_400
+    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
         nursery.start_soon(_read_always, place, connection)
         with trio.fail_after(200), pytest.raises(FtpNak):
             await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
@@ -274,7 +278,7 @@ async def _read_always(place: Place, connection: Connection) -> None:
 async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClock) -> None:
     """Who waits for an upload was told nothing before the vehicle was disarmed (promise 9)."""
     place = Place(profile, LINK)
-    vehicle, handle = place.world.vehicle, place.world.vehicle.server.handle
+    vehicle, handle = place.rig.vehicle, place.rig.server.handle
 
     def on_request(wire: bytes, source: Address, now: float) -> None:
         closing = wire[OPCODE] == Opcode.TERMINATE_SESSION and place.came[-1][0] == Opcode.WRITE_FILE
@@ -284,7 +288,7 @@ async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClo
             handle(wire, source, now)
 
     vehicle.server.handle = on_request  # type: ignore[method-assign]
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
         nursery.start_soon(_read_always, place, connection)
         with trio.fail_after(60), pytest.raises(Armed):
             await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
@@ -297,7 +301,7 @@ async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClo
 async def test_two_uploads_and_a_reader_over_bad_links(profile: str, link: str, autojump: MockClock) -> None:
     place = Place(profile, BAD[link])
     rng = random.Random(1)
-    async with place.world.connection(seed=1) as connection, trio.open_nursery() as nursery:
+    async with place.rig.connected(seed=1) as connection, trio.open_nursery() as nursery:
 
         async def read_now_and_then() -> None:
             while True:
@@ -319,7 +323,7 @@ async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
     place = Place("ardupilot", BAD["mixing"])
     rng = random.Random(1)
     sources = [MemorySource(rng.randbytes(SIZE)) for _ in range(2)]
-    async with place.world.connection(seed=1) as connection, trio.open_nursery() as nursery:
+    async with place.rig.connected(seed=1) as connection, trio.open_nursery() as nursery:
         connection.store.traits.wo_truncates = False
         for number, source in enumerate(sources):
             upload = await connection.store.open_upload(place.root + b"/%d" % number, source)
@@ -354,7 +358,7 @@ async def test_uploads_that_alternate_fill_a_short_queue(
 ) -> None:
     place = Place("ardupilot", link)
     began = trio.current_time()
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
         for number in range(count):
             data = random.Random(number).randbytes(60_000)
             nursery.start_soon(place.upload, connection, b"%d" % number, data)
@@ -368,8 +372,8 @@ PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: MockClock) -> None:
     """Not told at once that it waited too long: that was the time before."""
-    here = world("mavsdk", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    here = Rig("mavsdk", {b"/d/old": b"hello"}, LinkSettings(rate=5_000.0, delay=0.05))
+    async with here.connected() as connection, trio.open_nursery() as nursery:
         know(connection, "mavsdk")
         upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
         nursery.start_soon(upload.finish)
@@ -390,10 +394,10 @@ async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: 
 async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
     """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
     data = content(60_000)
-    here = world("px4-nuttx", PLAIN)
-    here.tree.add(b"/etc/init.d/rcS", b"#")
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("px4-nuttx", {b"/d": None}, PLAIN)
+    here.card.add(b"/etc/init.d/rcS", b"#")
+    faults = here.faults
+    async with here.connected() as connection:
         async with under_way(connection, "px4-nuttx", data, seconds=0.5) as source:
             for _ in range(8):
                 await connection.store.list_directory(b"/etc/init.d")
@@ -402,28 +406,28 @@ async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) ->
         assert source.rollbacks == []
         refused = faults.refused.count(Opcode.WRITE_FILE)
         assert 1 <= refused < 30  # the first window only: after that, each knows its turn
-    assert here.tree.data(path("px4-nuttx", "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
-    here = world("px4-nuttx")
-    here.tree.add_directory(b"/etc")
-    async with here.connection() as connection:
+    here = Rig("px4-nuttx", {b"/d": None})
+    here.card.add_directory(b"/etc")
+    async with here.connected() as connection:
         upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
         assert connection.engine.stats.by_opcode[Opcode.LIST_DIRECTORY] == 1, "the buffer was set right once"
         await upload.end()
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autojump: MockClock) -> None:
     data = content(200_000)
-    here = world("px4-nuttx", LinkSettings(rate=20_000.0, delay=0.3))
-    here.tree.add(b"/etc/rc", b"#")
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.3))
+    here.card.add(b"/etc/rc", b"#")
+    faults = here.faults
+    async with here.connected() as connection:
         async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
             await connection.store.list_directory(b"/etc")
             await trio.sleep(5)
@@ -435,17 +439,17 @@ async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autoju
             assert faults.requests.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
         assert source.all_proven
         assert source.rollbacks == []
-    assert here.tree.data(path("px4-nuttx", "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
     """Whatever slips in between arming and writing, the upload is not refused for it."""
     data = content(40_000)
-    here = World("px4-nuttx", LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))
-    here.tree.add_directory(path("px4-nuttx", "")[:-1])
-    here.tree.add(b"/etc/init.d/rcS", b"#")
+    here = Rig("px4-nuttx", link=LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))
+    here.put_directory(b"/d")
+    here.card.add(b"/etc/init.d/rcS", b"#")
     listed = 0
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         source = MemorySource(data)
         upload = await start(connection, "px4-nuttx", source)
         async with trio.open_nursery() as nursery:
@@ -463,4 +467,4 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(autojump: MockClock
         assert source.all_proven
         assert source.rollbacks == []
         assert listed > 10
-    assert here.tree.data(path("px4-nuttx", "new")) == data
+    assert here.data(b"/d/new") == data

@@ -13,8 +13,8 @@ from mavftpfs.link.fastframe import FTP_MESSAGE_ID
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.sources import MemorySource
-from tests.support.worlds import ROOTS, World, read_file
+from tests.support.rigs import Rig
+from tests.support.transfers import put, read_file
 
 PROFILES = ["px4", "px4-nuttx", "ardupilot", "mavsdk"]
 LIMIT = 20_000
@@ -52,23 +52,13 @@ class Meter:
         return sum(size for _, size in self.frames) / (self.frames[-1][0] - self.frames[0][0])
 
 
-def world(profile: str, settings: LinkSettings = WIDE) -> World:
-    here = World(profile, settings)
-    here.tree.add(ROOTS.get(profile, b"") + b"/d/f", DATA)
-    return here
+async def read(connection: Connection, here: Rig) -> None:
+    assert await read_file(connection, here.root + b"/d/f") == DATA
 
 
-async def read(connection: Connection, here: World) -> None:
-    assert await read_file(connection, ROOTS.get(here.profile, b"") + b"/d/f") == DATA
-
-
-async def write(connection: Connection, here: World) -> None:
-    path = ROOTS.get(here.profile, b"") + b"/d/g"
-    source = MemorySource(DATA)
-    upload = await connection.store.open_upload(path, source)
-    await upload.finish()
-    await upload.end()
-    assert here.tree.data(path) == DATA
+async def write(connection: Connection, here: Rig) -> None:
+    await put(connection, here.root + b"/d/g", DATA)
+    assert here.data(b"/d/g") == DATA
 
 
 def check(meter: Meter, limit: float = LIMIT, *, late: float = 0.0) -> None:
@@ -83,19 +73,19 @@ def check(meter: Meter, limit: float = LIMIT, *, late: float = 0.0) -> None:
 @pytest.mark.parametrize("transfer", [read, write])
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_bulk_keeps_the_limit_and_uses_it(
-    profile: str, transfer: Callable[[Connection, World], Awaitable[None]], autojump: MockClock
+    profile: str, transfer: Callable[[Connection, Rig], Awaitable[None]], autojump: MockClock
 ) -> None:
-    here = world(profile)
+    here = Rig(profile, {b"/d/f": DATA}, WIDE)
     limit = LIMIT // 2 if profile == "ardupilot" else LIMIT  # its short queue allows no more
-    async with here.connection(ConnectOptions(bwlimit=limit)) as connection:
+    async with here.connected(ConnectOptions(bwlimit=limit)) as connection:
         meter = Meter(connection)
         await transfer(connection, here)
-        check(meter, limit, late=here.vehicle.server.profile.stall_chance and 0.3)
+        check(meter, limit, late=here.server.profile.stall_chance and 0.3)
 
 
 async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
-    here = world("px4")
-    async with here.connection(ConnectOptions(bwlimit=LIMIT)) as connection:
+    here = Rig("px4", {b"/d/f": DATA}, WIDE)
+    async with here.connected(ConnectOptions(bwlimit=LIMIT)) as connection:
         meter = Meter(connection)
         async with trio.open_nursery() as nursery:
             nursery.start_soon(read, connection, here)
@@ -110,9 +100,8 @@ async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
 
 
 async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) -> None:
-    here = World("px4", WIDE)
-    here.tree.add(b"/f", DATA[:5000])
-    async with here.connection(ConnectOptions(bwlimit=100)) as connection:
+    here = Rig("px4", {b"/f": DATA[:5000]}, WIDE)
+    async with here.connected(ConnectOptions(bwlimit=100)) as connection:
         began = trio.current_time()
         assert await read_file(connection, b"/f") == DATA[:5000]
         assert 50.0 < trio.current_time() - began < 100.0  # our heartbeats alone take a fifth of it
@@ -123,8 +112,8 @@ async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) ->
 
 
 async def test_no_bursts_with_a_limit(autojump: MockClock) -> None:
-    here = world("ardupilot")
-    async with here.connection(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
+    here = Rig("ardupilot", {b"/d/f": DATA}, WIDE)
+    async with here.connected(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
         meter = Meter(connection)
         await read(connection, here)
         assert Opcode.BURST_READ_FILE not in connection.engine.stats.by_opcode

@@ -22,29 +22,26 @@ from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind
-from tests.support.faults import Faults
-from tests.support.mounting import mounted
-from tests.support.sources import MemorySource
+from tests.support.rigs import Rig
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import know
-from tests.support.worlds import ROOTS, World, begin_to_read, content, path, read_file, world
+from tests.support.transfers import ROOTS, MemorySource, begin_to_read, content, know, path, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
 
 
-def names(here: World) -> list[bytes]:
-    found = [entry.name for entry in here.tree.entries(path(here.profile, ""))]
+def names(here: Rig) -> list[bytes]:
+    found = [entry.name for entry in here.card.entries(path(here.profile, ""))]
     return sorted(name for name in found if name not in (b".", b".."))
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
-    here = world(profile, file=b"content")
-    here.tree.add(path(profile, "dir/inner"), b"x")
-    here.tree.add_directory(path(profile, "empty"))
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/file": b"content"})
+    here.put(b"/d/dir/inner", b"x")
+    here.put_directory(b"/d/empty")
+    async with here.connected() as connection:
         store = connection.store
         for attempt in (
             lambda: store.remove(path(profile, "missing")),
@@ -59,16 +56,16 @@ async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
             with pytest.raises(FtpNak):
                 await attempt()
         assert names(here) == [b"dir", b"empty", b"file"]
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_an_existing_directory_is_not_taken_for_ours(profile: str, autojump: MockClock) -> None:
     """Its reply lost, mkdir of what was there before must still be refused."""
-    here = world(profile)
-    here.tree.add(path(profile, "dir/inner"), b"x")
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None})
+    here.put(b"/d/dir/inner", b"x")
+    faults = here.faults
+    async with here.connected() as connection:
         faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
         with pytest.raises(FtpNak) as refusal:
             await connection.store.make_directory(path(profile, "dir"))
@@ -77,16 +74,16 @@ async def test_an_existing_directory_is_not_taken_for_ours(profile: str, autojum
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "px4-2026"])
 async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojump: MockClock) -> None:
-    here = world(profile, file=b"content")
-    here.tree.add_directory(path(profile, "dir"))
-    faults = Faults(here)
+    here = Rig(profile, {b"/d/file": b"content"})
+    here.put_directory(b"/d/dir")
+    faults = here.faults
 
     async def spoil(connection: Connection) -> None:
         request = Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir"))
         with pytest.raises(FtpNak):
             await connection.driver.run(request)
 
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         await spoil(connection)
         with pytest.raises(FtpNak) as refusal:
             await connection.store.remove(path(profile, "missing"))
@@ -102,15 +99,15 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
         source.add(b" world")
         upload.wake()
         await upload.finish()
-        assert here.tree.data(path(profile, "new")) == b"hello world"
+        assert here.data(b"/d/new") == b"hello world"
 
 
 @pytest.mark.holds("fault refused retry")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojump: MockClock) -> None:
-    here = world(profile, file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/file": b"content"})
+    faults = here.faults
+    async with here.connected() as connection:
         faults.ignore(Opcode.REMOVE_FILE)
         with pytest.raises(RequestTimeout):
             await connection.store.remove(path(profile, "file"))
@@ -123,12 +120,14 @@ async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojum
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
-    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), file=bytes(60_000), other=b"x")
-    faults = Faults(here)
+    here = Rig(
+        profile, {b"/d/file": bytes(60_000), b"/d/other": b"x"}, LinkSettings(rate=20_000.0, delay=0.02)
+    )
+    faults = here.faults
     open_then: list[list[bytes]] = []
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, path(profile, "file"), 1000)
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
         with pytest.raises(FileChanged):
@@ -142,17 +141,17 @@ async def test_our_own_session_is_closed_before_a_path_changes(profile: str, aut
 @pytest.mark.parametrize("profile", RENAMING)
 async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> None:
     data = content(40_000)
-    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02))
-    here.tree.add(path(profile, "dir/file"), data)
-    faults = Faults(here)
+    here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
+    here.put(b"/d/dir/file", data)
+    faults = here.faults
     open_then: list[list[bytes]] = []
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         _, sink = await begin_to_read(connection, path(profile, "dir/file"), 1000)
-        faults.at(Opcode.RENAME, lambda: open_then.append(here.vehicle.server.open_paths))
+        faults.at(Opcode.RENAME, lambda: open_then.append(here.server.open_paths))
         await connection.store.rename(path(profile, "dir"), path(profile, "moved"))
         assert open_then == [[]]
         assert await sink.wait_for(0, 40_000) == data
-    assert here.tree.stat(path(profile, "moved/file")).kind is Kind.FILE
+    assert here.card.stat(path(profile, "moved/file")).kind is Kind.FILE
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
@@ -160,38 +159,38 @@ async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> Non
 async def test_an_upload_makes_room_for_a_change_of_its_path(
     profile: str, probed: bool, autojump: MockClock
 ) -> None:
-    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02))
-    faults = Faults(here)
+    here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
+    faults = here.faults
     open_then: list[list[bytes]] = []
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         if probed:
             know(connection, profile)
         source = MemorySource(bytes(300_000))
         upload = await connection.store.open_upload(path(profile, "file"), source)
         await trio.sleep(1)
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
         assert not source.todo.empty  # it did not wait for the upload's end
         await upload.end()
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if name != "spec"])
 async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump: MockClock) -> None:
     """A CreateFile whose ACK never came may have opened the file that is then removed."""
-    here = world(profile)
-    faults = Faults(here)
+    here = Rig(profile, {b"/d": None})
+    faults = here.faults
     open_then: list[list[bytes]] = []
-    async with here.connection(ConnectOptions(op_deadline=5.0)) as connection:
+    async with here.connected(ConnectOptions(op_deadline=5.0)) as connection:
         faults.cut_after(1)
         upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"))
         with pytest.raises(RequestTimeout):
             await upload.finish()
         await upload.end()
         faults.cut_after(None)
-        assert here.vehicle.server.open_sessions == 1
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        assert here.server.open_sessions == 1
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
         await connection.store.remove(path(profile, "new"))
         assert open_then == [[]]
 
@@ -204,12 +203,12 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
 ) -> None:
     """A page begins where the one before ended, by number: what moved up meanwhile is on neither."""
     names = [b"name of some length %02d" % number for number in range(60)]
-    here = world(profile, LinkSettings(delay=0.1))
+    here = Rig(profile, {b"/d": None}, LinkSettings(delay=0.1))
     directory = ROOTS.get(profile, b"/") if in_root else path(profile, "")[:-1]
     for name in names:
-        here.tree.add(join(directory, name), b"x")
+        here.card.add(join(directory, name), b"x")
     shown: set[bytes] = set()
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    async with here.connected() as connection, trio.open_nursery() as nursery:
 
         async def sweep() -> None:
             shown.update((await connection.store._names(directory))[0])
@@ -228,15 +227,15 @@ async def test_no_checksum_is_asked_for_in_flight(
     when_armed: Literal["ro", "ok"], autojump: MockClock
 ) -> None:
     """The vehicle reads the whole file for it (promise 9)."""
-    here = world("px4", file=b"content")
-    faults = Faults(here)
+    here = Rig("px4", {b"/d/file": b"content"})
+    faults = here.faults
 
     async def fly(armed: bool) -> None:
         (here.vehicle.arm if armed else here.vehicle.disarm)()
         here.link.kick()
         await trio.sleep(0.5)
 
-    async with here.connection(ConnectOptions(when_armed=when_armed)) as connection:
+    async with here.connected(ConnectOptions(when_armed=when_armed)) as connection:
         await fly(True)
         with pytest.raises(Armed):
             await connection.store.crc32(b"/d/file")
@@ -252,19 +251,19 @@ RADIO = LinkSettings(rate=5760.0, delay=0.05)
 D = b"/d"
 
 
-def made(profile: str, settings: LinkSettings | None = None) -> World:
-    world = World(profile, settings or LinkSettings())
+def made(profile: str, settings: LinkSettings | None = None) -> Rig:
+    here = Rig(profile, link=settings or LinkSettings())
     for name in (b"/a", b"/b"):
-        world.tree.add(D + name, b"x" * 30)
-    world.tree.add_directory(D + b"/empty")
-    return world
+        here.card.add(D + name, b"x" * 30)
+    here.card.add_directory(D + b"/empty")
+    return here
 
 
 @pytest.mark.holds("promise 4")
 async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> None:
-    world = made("mavsdk", RADIO)
-    world.tree.add(D + b"/long", bytes(1_500_000))
-    async with mounted(world, D) as (_, tree):
+    here = made("mavsdk", RADIO)
+    here.card.add(D + b"/long", bytes(900_000))
+    async with here.mounted(D) as tree:
         file = await tree.open(D + b"/long", write=True)
         await file.write(100, b"s" * 1000)
 
@@ -294,44 +293,45 @@ async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> Non
 
 @pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
 async def test_a_new_file_s_close_outlasts_bad_luck(profile: str, autojump_clock: MockClock) -> None:
-    here = World(profile)
-    here.tree.add_directory(b"/d")
-    async with here.connection() as connection:
+    here = Rig(profile)
+    here.card.add_directory(b"/d")
+    async with here.connected() as connection:
         await connection.store.list_directory(b"/d")
-        faults = Faults(here)
+        faults = here.faults
+        faults.requests.clear()
         for _ in range(8):
             faults.lose_reply_to(Opcode.TERMINATE_SESSION)
         await connection.store.create_empty(b"/d/new")
-        assert here.tree.data(b"/d/new") == b""
-    assert here.vehicle.server.open_sessions == 0
+        assert here.card.data(b"/d/new") == b""
+    assert here.server.open_sessions == 0
 
 
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
-    here = world("mavsdk", file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("mavsdk", {b"/d/file": b"content"})
+    faults = here.faults
+    async with here.connected() as connection:
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
 
 
 async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) -> None:
-    world = made("px4", LinkSettings(delay=0.5))
-    async with mounted(world, D) as (_, tree):
+    here = made("px4", LinkSettings(delay=0.5))
+    async with here.mounted(D) as tree:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(tree.rename, D, b"/e")
             await trio.sleep(0.1)
             with pytest.raises(Exception, match="does not exist"):
                 await tree.mkdir(D + b"/new")
         await tree.mkdir(b"/e/new")
-        assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}
+        assert b"new" in {entry.name for entry in here.card.entries(b"/e")}
 
 
 @pytest.mark.parametrize("same", [False, True])
 async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool, autojump: MockClock) -> None:
-    world = made("px4")
-    faults = Faults(world)
-    async with mounted(world, D) as (_, tree):
+    here = made("px4")
+    faults = here.faults
+    async with here.mounted(D) as tree:
         faults.cut_after(0)
 
         async def one(number: int) -> None:

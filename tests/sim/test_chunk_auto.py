@@ -12,8 +12,8 @@ from mavftpfs.protocol.chunking import SHORT, SHORT_SECONDS
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.uploads import put
-from tests.support.worlds import content, path, read_file, world
+from tests.support.rigs import Rig
+from tests.support.transfers import content, path, put, read_file
 
 pytestmark = pytest.mark.holds("fault long frames")
 
@@ -31,8 +31,8 @@ def sizes(connection: Connection) -> tuple[int, int]:
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_a_file_is_read_where_no_full_frame_passes(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
-    here = world(profile, replace(RADIO, mtu=LIMIT), file=data)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/file": data}, replace(RADIO, mtu=LIMIT))
+    async with here.connected() as connection:
         assert await read_file(connection, path(profile, "file")) == data
         assert sizes(connection) == (SHORT, MAX_DATA)
 
@@ -40,20 +40,20 @@ async def test_a_file_is_read_where_no_full_frame_passes(profile: str, autojump:
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_a_file_is_written_where_no_full_frame_passes(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
-    here = world(profile, RADIO)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, RADIO)
+    async with here.connected() as connection:
         here.model.settings = replace(RADIO, mtu=LIMIT)
         await put(connection, path(profile, "new"), data)
-        assert here.tree.data(path(profile, "new")) == data
+        assert here.data(b"/d/new") == data
         assert sizes(connection)[1] == SHORT
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
 async def test_a_link_that_recovers_gets_full_chunks_back(profile: str, autojump: MockClock) -> None:
     data = content(20_000)
-    here = world(profile, replace(RADIO, mtu=LIMIT), file=data)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/file": data}, replace(RADIO, mtu=LIMIT))
+    async with here.connected() as connection:
         assert await read_file(connection, path(profile, "file")) == data
         assert sizes(connection)[0] == SHORT
         here.model.settings = RADIO

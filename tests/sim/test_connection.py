@@ -33,10 +33,9 @@ from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
-from tests.support.faults import Faults
 from tests.support.memory import MemoryLink
-from tests.support.uploads import put
-from tests.support.worlds import World, content, path, read_file, world
+from tests.support.rigs import Rig
+from tests.support.transfers import content, path, put, read_file
 
 KEY = bytes(range(32))
 
@@ -99,10 +98,10 @@ class Diary(dict[Address, Heartbeat]):
 async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump: MockClock) -> None:
     """A radio that cannot do both at a time, with a short queue: what we send must not starve them."""
     radio = LinkSettings(rate=5760.0, duplex=Duplex.HALF, queue=4096, delay=0.05)
-    here = world(profile, radio, f=DATA * 2)
+    here = Rig(profile, {b"/d/f": DATA * 2}, radio)
     here.vehicle.heard = diary = Diary()
     options = ConnectOptions(read_mode="burst" if what == "burst" else "window")
-    async with here.connection(options) as connection:
+    async with here.connected(options) as connection:
         began = trio.current_time()
         if what == "write":
             await put(connection, path(profile, "new"), DATA * 2)
@@ -137,9 +136,8 @@ async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojum
 )
 async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, autojump: MockClock) -> None:
     """A ground station's heartbeat would feed the autopilot's failsafe, and trigger it later (promise 6)."""
-    here = World("px4")
-    here.tree.add(b"/f", DATA)
-    async with here.connection(options) as connection:
+    here = Rig("px4", {b"/f": DATA})
+    async with here.connected(options) as connection:
         await trio.sleep(3)
         heard = {} if said is None else {US: Heartbeat(US, said, MAV_AUTOPILOT_INVALID, False)}
         assert here.vehicle.heard == heard
@@ -148,9 +146,8 @@ async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, aut
 
 @pytest.mark.holds("promise 6")
 async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:
-    here = World("ardupilot", LinkSettings(delay=0.01))
-    here.tree.add(b"/f", DATA)
-    async with here.connection() as connection:
+    here = Rig("ardupilot", {b"/f": DATA}, LinkSettings(delay=0.01))
+    async with here.connected() as connection:
         own = connection.vehicle.own
         neighbour = Framer(own, stream=False).encode_heartbeat(18, MAV_AUTOPILOT_INVALID)
         for message in connection.driver.framer.feed(neighbour):
@@ -163,7 +160,7 @@ async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -
 # --- leaving
 
 
-def join(monkeypatch: pytest.MonkeyPatch, here: World, folder: Path) -> None:
+def join(monkeypatch: pytest.MonkeyPatch, here: Rig, folder: Path) -> None:
     """Have whoever opens a link, or a spool, get these."""
 
     @asynccontextmanager
@@ -177,9 +174,9 @@ def join(monkeypatch: pytest.MonkeyPatch, here: World, folder: Path) -> None:
 async def test_a_restart_while_leaving_has_nothing_delivered(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    here = world("ardupilot", f=content(100))
+    here = Rig("ardupilot", {b"/d/f": content(100)})
     join(monkeypatch, here, tmp_path)
-    faults = Faults(here)
+    faults = here.faults
     async with compose.attached(parse_source("udpin:127.0.0.1:1"), Options(), writing=True) as up:
         await trio.sleep(60.0)
         file = await up.tree.open(b"/d/f", write=True)
@@ -195,7 +192,7 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
         faults.at(Opcode.TERMINATE_SESSION, restart)
     assert up.connection.vehicle.reboots == 1
     assert up.tree.undelivered() == [b"/d/f"]
-    assert here.tree.data(b"/d/f") == content(100)
+    assert here.card.data(b"/d/f") == content(100)
 
 
 async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
@@ -213,7 +210,7 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
 @pytest.mark.parametrize("target", [0, 1])
 async def test_another_vehicle_that_is_heard_is_said(target: int, autojump: MockClock) -> None:
     options = Options(target_system=target)
-    async with world("px4").connection() as connection:
+    async with Rig("px4", {b"/d": None}).connected() as connection:
         assert compose.others_heard(connection, options) == ""
         other, station = Address(2, 1), Address(255, 190)
         heard = connection.vehicle.heard

@@ -34,7 +34,7 @@ from mavftpfs.shared.errors import (
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.replies import ack
 from tests.support.rigs import KINDS, Rig, card, list_all, read_file, rig, write_file
-from tests.support.worlds import content
+from tests.support.transfers import content
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
@@ -95,7 +95,7 @@ def never_rename(here: Rig, *, loses: bool) -> None:
             return None
         if loses:
             with suppress(OSError):
-                here.world.tree.remove(request.data.split(b"\0")[0])
+                here.card.remove(request.data.split(b"\0")[0])
         return [ack(request)]
 
     here.server.answer = answer
@@ -203,7 +203,7 @@ async def test_overwriting_in_place_needs_no_room_for_both_files(stale: bool) ->
     """Whether the card can rename is found out on an empty file then. ArduPilot's refusal may tell what an
     earlier request failed of."""
     async with rig("littlefs", {FILE: OLD}) as here:
-        here.world.tree.capacity = len(NEW)
+        here.card.capacity = len(NEW)
         if stale:
             here.faults.refuse(Opcode.RENAME, NakCode.FILE_EXISTS, times=9)
         await write_file(here.mount(inplace=True), FILE, NEW)
@@ -241,7 +241,7 @@ async def test_a_temporary_that_vanished_is_not_taken_for_success(
     here.put(FILE, NEW[::-1])  # of the same size
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
-    here.faults.at(Opcode.RENAME, here.world.link.cut, drop=True)
+    here.faults.at(Opcode.RENAME, here.link.cut, drop=True)
     with pytest.raises(RequestTimeout):
         await file.fsync()
     for path in here.litter():
@@ -372,8 +372,8 @@ async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> 
     tree = here.mount(verify="crc")
 
     def arm() -> None:
-        here.world.vehicle.arm()
-        here.world.link.kick()
+        here.vehicle.arm()
+        here.link.kick()
 
     here.faults.at(Opcode.TERMINATE_SESSION, arm, nth=2)  # the first is of what tries the card
     with pytest.raises(Armed):
@@ -452,7 +452,7 @@ async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(here: R
 
 
 async def test_a_full_card_leaves_the_old_file(here: Rig) -> None:
-    here.world.tree.capacity = here.world.tree.used + 500
+    here.card.capacity = here.card.used + 500
     tree = here.mount()
     with pytest.raises(FtpNak) as caught:
         await write_file(tree, FILE, NEW)
@@ -577,13 +577,13 @@ async def test_writers_wait_for_a_slow_link() -> None:
         file = await tree.create(b"/new", exclusive=True)
         for at in range(0, 200_000, 50_000):
             await file.write(at, bytes(50_000))
-            assert 50_000 + at - here.world.tree.used <= 160_000
+            assert 50_000 + at - here.card.used <= 160_000
         await file.release()
         assert tree.status()["bytes_held"] == 0
 
 
 async def test_a_writer_is_told_why_nothing_moves(here: Rig) -> None:
-    here.world.tree.capacity = here.world.tree.used + 2000
+    here.card.capacity = here.card.used + 2000
     file = await here.mount(dirty_max=65536).create(FRESH, exclusive=True)
 
     async def write() -> None:

@@ -7,14 +7,12 @@ not what the card has, because an older copy came late, another client was there
 from __future__ import annotations
 
 import random
-import struct
 from collections.abc import Callable
 
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
@@ -24,13 +22,10 @@ from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support import rigs
-from tests.support.faults import Faults, power_goes_at_close
 from tests.support.latecomers import Latecomer
-from tests.support.mounting import mounted, writable_tree
-from tests.support.rigs import KINDS, RENAMING, rig, write_file
+from tests.support.rigs import KINDS, RENAMING, Rig, rig, write_file
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import put
-from tests.support.worlds import ROOTS, MemorySink, World, begin_to_read, content, path, read_file, world
+from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
 
 pytestmark = pytest.mark.holds("fault duplicate")
 
@@ -91,8 +86,8 @@ def test_few_names_are_remembered() -> None:
 async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(
     profile: str, loss: float, autojump: MockClock
 ) -> None:
-    here = world(profile, LinkSettings(delay=0.02, loss=loss), f=content(20_000))
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": content(20_000)}, LinkSettings(delay=0.02, loss=loss))
+    async with here.connected() as connection:
         await read_file(connection, path(profile, "f"))
         await put(connection, path(profile, "new"), content(20_000))
         await connection.store.remove(path(profile, "new"))
@@ -102,8 +97,8 @@ async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(
 
 
 async def test_an_answer_that_comes_twice_raises_it(autojump: MockClock) -> None:
-    here = world("px4", CLEAN)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, CLEAN)
+    async with here.connected() as connection:
         began = trio.current_time()
         Latecomer(here, Opcode.CREATE_DIRECTORY, after=Opcode.REMOVE_DIRECTORY)
         await connection.store.make_directory(b"/d/one")
@@ -121,8 +116,8 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autoj
     """The first that is heard of him, what may use our session, and for a while after that everything: a
     request that took the session may have been missed."""
     data = content(200_000)
-    here = world("px4", LinkSettings(rate=5_000.0, delay=0.02), f=data)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/f": data}, LinkSettings(rate=5_000.0, delay=0.02))
+    async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, b"/d/f", 5_000)
 
         async def doubts(opcode: Opcode, pause: float = 0.0) -> bool:
@@ -145,8 +140,8 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autoj
 
 async def test_a_session_that_vanished_raises_it(autojump: MockClock) -> None:
     data = content(200_000)
-    here = world("px4", LinkSettings(rate=50_000.0, delay=0.02), f=data)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/f": data}, LinkSettings(rate=50_000.0, delay=0.02))
+    async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, b"/d/f", 10_000)
         here.vehicle.foreign_request(
             request(777, Opcode.RESET_SESSIONS).encode(), Address(255, 190), trio.current_time()
@@ -158,8 +153,8 @@ async def test_a_session_that_vanished_raises_it(autojump: MockClock) -> None:
 
 
 async def test_a_restart_raises_it(autojump: MockClock) -> None:
-    here = world("px4", CLEAN)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, CLEAN)
+    async with here.connected() as connection:
         await trio.sleep(5)
         here.vehicle.reboot(trio.current_time())
         await trio.sleep(5)
@@ -174,9 +169,9 @@ async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(
     """The same RENAME, carried out once more, would take the next file of the name."""
     if profile == "littlefs":
         return
-    here = world(profile, CLEAN, old=content(500, 1))
+    here = Rig(profile, {b"/d/old": content(500, 1)}, CLEAN)
     old, new = path(profile, "old"), path(profile, "new")
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         connection.scheduler.doubt.raise_it("as if a copy had been late")
         connection.scheduler.doubt.late.saw(1.0, trio.current_time())
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.CREATE_FILE)
@@ -191,9 +186,9 @@ async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str, autojump
     """A late copy finds nothing under the old name. rsync renames each new file so: a second each."""
     if profile == "littlefs":
         return
-    here = world(profile, CLEAN, old=content(500, 1))
+    here = Rig(profile, {b"/d/old": content(500, 1)}, CLEAN)
     old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         connection.scheduler.doubt.raise_it("as if a copy had been late")
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
         began = trio.current_time()
@@ -201,7 +196,7 @@ async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str, autojump
         await connection.store.rename(new, final)
         assert trio.current_time() - began < LEAST_REST
         assert copy.late is not None
-        assert here.tree.data(final) == content(500, 1)
+        assert here.card.data(final) == content(500, 1)
 
 
 async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) -> None:
@@ -222,8 +217,8 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
 ) -> None:
     """MAVSDK closes what is open and opens that one, under the same id; files of one size hide it."""
     one, two = content(1500, 1), content(1500, 2)
-    here = world(profile, CLEAN, one=one, two=two)
-    async with here.connection(ConnectOptions(window=1)) as connection:
+    here = Rig(profile, {b"/d/one": one, b"/d/two": two}, CLEAN)
+    async with here.connected(ConnectOptions(window=1)) as connection:
         copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.READ_FILE, nth=nth, first=True)
         assert await read_file(connection, path(profile, "one")) == one
         await read_or_doubt(connection, path(profile, "two"), two)
@@ -235,8 +230,8 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
 @pytest.mark.holds("fault leaving")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, autojump: MockClock) -> None:
-    here = world(profile, CLEAN, one=content(1500, 1), two=content(1500, 2))
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/one": content(1500, 1), b"/d/two": content(1500, 2)}, CLEAN)
+    async with here.connected() as connection:
         copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.TERMINATE_SESSION)
         await read_file(connection, path(profile, "one"))
         await trio.sleep(3)
@@ -248,24 +243,18 @@ async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, aut
 
 async def test_who_waits_for_a_turn_is_not_timed_out(autojump: MockClock) -> None:
     """200 programs read at once over a round trip of 100 ms: the last one waits longer than a read may."""
-    here = World("px4", LinkSettings(delay=0.05))
-    for number in range(200):
-        here.tree.add(b"/f%d" % number, content(2000, number))
+    files = {b"/f%d" % number: content(2000, number) for number in range(200)}
     ended: list[float] = []
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        tree = writable_tree(connection, nursery)
-        await tree.list(b"/")
+    async with Rig("px4", files, LinkSettings(delay=0.05)).mounted(b"/") as tree:
+        opened = {path: await tree.open(path) for path in files}
 
-        files = [await tree.open(b"/f%d" % number) for number in range(200)]
-
-        async def read(number: int) -> None:
-            assert await files[number].read(0, 2000) == content(2000, number)
+        async def read(path: bytes) -> None:
+            assert await opened[path].read(0, 2000) == files[path]
             ended.append(trio.current_time())
 
         async with trio.open_nursery() as readers:
-            for number in range(200):
-                readers.start_soon(read, number)
-        nursery.cancel_scope.cancel()
+            for path in files:
+                readers.start_soon(read, path)
     assert len(ended) == 200
     assert ended[-1] - ended[0] > ConnectOptions().op_deadline
 
@@ -277,93 +266,47 @@ DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
 
 STRANGER = Address(255, 190)
 
+OPCODE = 3
+
 READY = 0.011
 """Seconds before ArduPilot looks at its queue."""
+
+FORGOTTEN = 400
+"""Bytes that a card loses with the power: less than a sector."""
 
 SWIFTEST = 2.5
 """No vehicle restarts twice in so many seconds."""
 
 
-def on_write(world: World, act: Callable[[int, bytes, Address], None]) -> Callable[[bytes], None]:
-    """Have something happen at each WriteFile of ours; return how to hand the server a request of others."""
-    server, count = world.vehicle.server, 0
-    handle = server.handle
+def come_again(here: Rig, late: float, chosen: Callable[[bytes], bool]) -> None:
+    """Have requests come once more so many seconds later, where they are chosen."""
+    handle = here.server.handle
 
-    def watch(wire: bytes, source: Address, now: float) -> None:
-        nonlocal count
-        if wire[3] == Opcode.WRITE_FILE:
-            count += 1
-            act(count, wire, source)
-        handle(wire, source, now)
-
-    server.handle = watch  # type: ignore[method-assign]
-    return lambda wire: handle(wire, STRANGER, trio.current_time())
-
-
-def come_late(world: World, nursery: trio.Nursery, late: float) -> trio.Event:
-    """Have the first WriteFile from now on come once more; the event tells when it came."""
-    came = trio.Event()
-    handle = world.vehicle.server.handle
-
-    async def arrive(wire: bytes, source: Address) -> None:
+    async def again(wire: bytes, source: Address) -> None:
         await trio.sleep(late)
         handle(wire, source, trio.current_time())
+        here.link.kick()
 
-    def act(count: int, wire: bytes, source: Address) -> None:
-        if count == 1:
-            nursery.start_soon(arrive, wire, source)
-            came.set()
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        if chosen(wire):
+            here.nursery.start_soon(again, wire, source)
+        handle(wire, source, now)
 
-    on_write(world, act)
-    return came
-
-
-@pytest.mark.holds("rule 14.12")
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk", "littlefs"])
-async def test_new_files_stay_what_they_are_where_all_requests_come_twice(
-    profile: str, autojump: MockClock
-) -> None:
-    """Over two radios copies of a CreateFile and of the rename put an empty file in the place of one that
-    close had said to be there."""
-    here = world(profile, CLEAN, f=content(300))
-    directory = path(profile, "")[:-1]
-    handle = here.vehicle.server.handle
-    async with mounted(here, directory) as (connection, tree), trio.open_nursery() as nursery:
-
-        async def again(wire: bytes, source: Address) -> None:
-            await trio.sleep(0.5)
-            handle(wire, source, trio.current_time())
-            here.link.kick()
-
-        def twice(wire: bytes, source: Address, now: float) -> None:
-            nursery.start_soon(again, wire, source)
-            handle(wire, source, now)
-
-        here.vehicle.server.handle = twice  # type: ignore[method-assign]
-        await read_file(connection, path(profile, "f"))
-        await trio.sleep(3.0)  # the copies were seen
-        for number in range(8):
-            file = await tree.create(path(profile, f"new{number}"), exclusive=False)
-            await file.write(0, content(300 + number, number))
-            await file.flush()
-            await file.release()
-        await trio.sleep(3.0)
-        for number in range(8):
-            assert bytes(here.tree.data(path(profile, f"new{number}"))) == content(300 + number, number)
+    here.server.handle = on_request  # type: ignore[method-assign]
 
 
 @pytest.mark.holds("rule 14.12")
 async def test_a_create_that_we_repeated_comes_after_the_file_was_compared(autojump: MockClock) -> None:
     """Our own repetition explains its answer, so there is no doubt; its copy empties what was compared."""
-    here = world("px4", CLEAN)
-    async with mounted(here, b"/d") as (connection, tree):
-        connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
+    here = Rig("px4", {b"/d": None}, CLEAN)
+    async with here.mounted(b"/d") as tree:
+        here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
         copy = Latecomer(here, Opcode.CREATE_FILE, after=Opcode.CALC_FILE_CRC32)
-        Faults(here).lose_reply_to(Opcode.CREATE_FILE)
-        await make(tree, b"/d/new", content(300))
+        here.faults.lose_reply_to(Opcode.CREATE_FILE)
+        await write_file(tree, b"/d/new", content(300))
         assert copy.late is not None
-        assert not connection.store.in_doubt()
-        assert here.tree.data(b"/d/new") == content(300)
+        assert not here.connection.store.in_doubt()
+        assert here.card.data(b"/d/new") == content(300)
 
 
 @pytest.mark.holds("promise 2")
@@ -377,7 +320,7 @@ async def test_a_create_that_the_network_repeats_after_the_file_was_compared(
     async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
         tree = here.mount(verify=verify)
         await write_file(tree, b"/d/first", content(300, 1))  # the server renames, as is known from now on
-        copy = Latecomer(here.world, Opcode.CREATE_FILE, after=after)
+        copy = Latecomer(here, Opcode.CREATE_FILE, after=after)
         await write_file(tree, b"/d/new", content(300))
         assert here.data(b"/d/new") == content(300)
         assert copy.late is not None or (verify, after) == ("none", Opcode.CALC_FILE_CRC32)
@@ -420,7 +363,7 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         if known:
             here.connection.scheduler.doubt.raise_it("a copy was late")
             here.connection.scheduler.doubt.late.saw(0.5, trio.current_time())
-        Latecomer(here.world, what, after=after, nth=nth, first=first)
+        Latecomer(here, what, after=after, nth=nth, first=first)
         wanted = content(500, 1)
         for number in (2, 3):
             wanted, before = content(500, number), wanted
@@ -452,21 +395,14 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(
         if known:
             here.connection.scheduler.doubt.raise_it("a copy was late")
             here.connection.scheduler.doubt.late.saw(0.1, trio.current_time())
-        handle = here.world.vehicle.server.handle
-        asked: list[bytes] = []
+        renames: list[bytes] = []
 
-        async def again(wire: bytes, source: Address) -> None:
-            await trio.sleep(5.0)
-            handle(wire, source, trio.current_time())
-            here.world.link.kick()
+        def is_first(wire: bytes) -> bool:
+            if wire[OPCODE] == Opcode.RENAME:
+                renames.append(wire)
+            return wire[OPCODE] == Opcode.RENAME and len(renames) == 1
 
-        def watch(wire: bytes, source: Address, now: float) -> None:
-            if wire[3] == Opcode.RENAME and not asked:
-                asked.append(wire)
-                here.nursery.start_soon(again, wire, source)
-            handle(wire, source, now)
-
-        here.world.vehicle.server.handle = watch  # type: ignore[method-assign]
+        come_again(here, 5.0, is_first)
         await write_file(tree, b"/d/f", content(500, 2))
         await trio.sleep(30.0)
         assert here.data(b"/d/f") == content(500, 2)
@@ -483,7 +419,7 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen(autojump: M
         here.connection.scheduler.doubt.raise_it("a copy was late")
         here.connection.scheduler.doubt.late.saw(0.1, trio.current_time())
         await tree.list(b"/d")
-        copy = Latecomer(here.world, Opcode.RENAME, after=Opcode.LIST_DIRECTORY, nth=4, first=True)
+        copy = Latecomer(here, Opcode.RENAME, after=Opcode.LIST_DIRECTORY, nth=4, first=True)
         await tree.rename(b"/d/g", b"/d/f")
         await trio.sleep(30.0)
         assert copy.late is not None
@@ -491,38 +427,38 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen(autojump: M
 
 
 @pytest.mark.holds("promise 2", "rule 14.12")
-@pytest.mark.parametrize("late", [0.1, 0.3, 0.5, 2.0])
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "mavsdk"])
+@pytest.mark.parametrize(
+    ("profile", "every", "late"),
+    [
+        ("littlefs", 1, 0.5),
+        *((profile, 1, 0.5) for profile in RENAMING),
+        *((profile, 2, late) for profile in RENAMING for late in (0.1, 0.3, 0.5, 2.0)),
+    ],
+)
 async def test_copies_of_a_create_and_of_its_rename_both_late(
-    profile: str, late: float, autojump: MockClock
+    profile: str, every: int, late: float, autojump: MockClock
 ) -> None:
-    """The second radio loses the bytes, so together they would put an empty file under the name."""
-    async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here, trio.open_nursery() as nursery:
-        handle = here.world.vehicle.server.handle
+    """Together they would put an empty file under the name: over two radios of which one loses the bytes, or
+    where all that concerns a file, or every other one, comes twice."""
+    async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
         made: dict[bytes, int] = {}
 
-        async def again(wire: bytes, source: Address) -> None:
-            await trio.sleep(late)
-            handle(wire, source, trio.current_time())
-            here.world.link.kick()
-
-        def twice(wire: bytes, source: Address, now: float) -> None:
+        def is_doubled(wire: bytes) -> bool:
             target = wire[12 : 12 + wire[4]].split(b"\0")[0]
-            if wire[3] == Opcode.CREATE_FILE:
+            if wire[OPCODE] == Opcode.CREATE_FILE:
                 made.setdefault(target, len(made))
-            if wire[3] == Opcode.CREATE_DIRECTORY or not made.get(target, 1) % 2:  # every other file
-                nursery.start_soon(again, wire, source)
-            handle(wire, source, now)
+            unless_of_a_file = 0 if every == 1 else 1
+            return wire[OPCODE] == Opcode.CREATE_DIRECTORY or not made.get(target, unless_of_a_file) % every
 
-        here.world.vehicle.server.handle = twice  # type: ignore[method-assign]
+        come_again(here, late, is_doubled)
         tree = here.mount()
         await tree.mkdir(b"/d/sub")
         await trio.sleep(5.0)  # the copy was seen
         for number in range(5):
-            await write_file(tree, b"/d/new%d" % number, content(300, number))
+            await write_file(tree, b"/d/new%d" % number, content(300 + number, number))
         await trio.sleep(5.0)
         for number in range(5):
-            assert here.data(b"/d/new%d" % number) == content(300, number)
+            assert here.data(b"/d/new%d" % number) == content(300 + number, number)
 
 
 @pytest.mark.holds("promise 2")
@@ -533,7 +469,7 @@ async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str, a
         tree = here.mount(verify=verify)
         await write_file(tree, b"/d/one", content(200, 1))
         await write_file(tree, b"/d/one2", content(200, 1))
-        copy = Latecomer(here.world, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, nth=1, first=True)
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, nth=1, first=True)
         await write_file(tree, b"/d/two", content(200, 2))
         await write_file(tree, b"/d/three", content(200, 3))
         assert copy.late is not None
@@ -543,18 +479,24 @@ async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str, a
 
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, autojump: MockClock) -> None:
-    world = World("px4", DOUBLING)
-    world.tree.add(b"/d/k", b"x")
-    opened = mounted(world, b"/d", verify=verify, verify_max=50_000)
-    async with opened as (_, tree), trio.open_nursery() as nursery:
-        came = come_late(world, nursery, 0.15)
+    here = Rig("px4", {b"/d/k": b"x"}, DOUBLING)
+    async with here.mounted(b"/d", verify=verify, verify_max=50_000) as tree:
+        came = trio.Event()
+
+        def is_first(wire: bytes) -> bool:
+            first = wire[OPCODE] == Opcode.WRITE_FILE and not came.is_set()
+            if first:
+                came.set()
+            return first
+
+        come_again(here, 0.15, is_first)
         file = await tree.create(b"/d/new", exclusive=True)
         await file.write(0, b"B" * 100_000)
         await came.wait()
         await trio.sleep(0.08)
         await file.write(0, b"C" * 100)
         await file.flush()
-        assert bytes(world.tree.data(b"/d/new"))[:200] == b"C" * 100 + b"B" * 100
+        assert here.data(b"/d/new")[:200] == b"C" * 100 + b"B" * 100
         file.close()
 
 
@@ -562,31 +504,25 @@ async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, auto
 @pytest.mark.parametrize(("profile", "leaves"), [("px4", False), ("px4-2026", True), ("px4-nuttx", True)])
 async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, autojump: MockClock) -> None:
     """PX4 has one session, 0, whoever asks: our ACKs may be for the other one's file."""
-    world = World(profile, CLEAN)
-    root = ROOTS.get(profile, b"") + b"/d"
-    world.tree.add(root + b"/f", b"x" * 300_000)
+    here = Rig(profile, {b"/d/f": b"x" * 130_000}, CLEAN)
     new = bytes(range(1, 240)) * 500
-    async with mounted(world, root, verify="size") as (connection, tree):
-        file = await tree.open(root + b"/f", write=True)
+    async with here.mounted(b"/d", verify="size") as tree:
+        file = await tree.open(b"/d/f", write=True)
         await file.write(0, b"A" * 100)
         await file.fsync()
-        seq = 30_000
 
-        def wire(opcode: Opcode, data: bytes) -> bytes:
-            nonlocal seq
-            seq += 10
-            return struct.pack("<HBBBBBBI", seq, 0, opcode, len(data), 0, 0, 0, 0) + data.ljust(239, b"\0")
+        def stranger(seq: int, opcode: Opcode, data: bytes = b"") -> None:
+            here.server.handle(request(seq, opcode, data=data).encode(), STRANGER, trio.current_time())
 
-        def act(count: int, _wire: bytes, source: Address) -> None:
-            if count == 100:
-                stranger(wire(Opcode.RESET_SESSIONS, b""))
-                stranger(wire(Opcode.CREATE_FILE, root + b"/theirs"))
-                connection.vehicle.foreign_at = trio.current_time()
-                connection.vehicle.on_foreign(bytes(251), True)
-            if count == 200 and leaves:
-                stranger(wire(Opcode.TERMINATE_SESSION, b""))
+        def take() -> None:
+            stranger(30_010, Opcode.RESET_SESSIONS)
+            stranger(30_020, Opcode.CREATE_FILE, here.root + b"/d/theirs")
+            here.connection.vehicle.foreign_at = trio.current_time()
+            here.connection.vehicle.on_foreign(bytes(251), True)
 
-        stranger = on_write(world, act)
+        here.faults.at(Opcode.WRITE_FILE, take, nth=100)
+        if leaves:
+            here.faults.at(Opcode.WRITE_FILE, lambda: stranger(30_030, Opcode.TERMINATE_SESSION), nth=200)
         await file.write(0, new)
         for _ in range(3):  # it may be told that the session is shared just now
             try:
@@ -597,7 +533,7 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, a
             break
         else:
             pytest.fail("it never ended well")
-        assert bytes(world.tree.data(root + b"/f")) == new + b"x" * (300_000 - len(new))
+        assert here.data(b"/d/f") == new + b"x" * (130_000 - len(new))
         file.close()
 
 
@@ -609,19 +545,25 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
     profile: str, downtime: float, beat_after: float, autojump: MockClock
 ) -> None:
     """The last sector was in its memory. Who restarted may ACK the Terminate, too, before we hear of that."""
-    world = World(profile, CLEAN)
-    root = ROOTS.get(profile, b"") + b"/d"
-    world.tree.add(root + b"/f", b"x" * 30_000)
-    async with mounted(world, root, verify="size") as (_, tree):
-        file = await tree.open(root + b"/f", write=True)
+    async with rig(profile, {b"/d/f": b"x" * 30_000}, link=CLEAN) as here:
+        tree = here.mount(verify="size")
+        await tree.list(b"/d")
+        file = await tree.open(b"/d/f", write=True)
         await file.write(0, b"A" * 100)
         await file.fsync()
         await trio.sleep(30)
-        before = bytes(world.tree.data(root + b"/f"))
+        before = here.data(b"/d/f")
         await file.write(1000, b"B" * 100)
-        power_goes_at_close(world, downtime=downtime, beat_after=beat_after)
+
+        def power_cut() -> None:
+            [path] = here.server.open_paths
+            data = here.card.data(path)
+            here.vehicle.reboot(trio.current_time(), downtime, beat_after=beat_after)
+            here.card.add(path, data[:-FORGOTTEN] + bytes(FORGOTTEN))
+
+        here.faults.at(Opcode.TERMINATE_SESSION, power_cut, drop=True)
         await file.fsync()
-        assert bytes(world.tree.data(root + b"/f")) == before[:1000] + b"B" * 100 + before[1100:]
+        assert here.data(b"/d/f") == before[:1000] + b"B" * 100 + before[1100:]
         file.close()
 
 
@@ -636,13 +578,10 @@ async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
     """FAT has a sector in memory until the file is closed."""
     rng = random.Random(seed)
     settings = LinkSettings(delay=rng.choice([0.02, 0.1, 0.4]), loss=rng.choice([0.0, 0.05]))
-    world = World(profile, settings, seed=seed)
-    path = ROOTS.get(profile, b"") + b"/d/f"
-    model = bytearray(rng.randbytes(20_000))
-    world.tree.add(path, bytes(model))
-    faults, last = Faults(world), -SWIFTEST
-    async with mounted(world, verify=rng.choice(["auto", "size", "none"])) as (_, tree):
-        file = await tree.open(path, write=True)
+    model, last = bytearray(rng.randbytes(20_000)), -SWIFTEST
+    here = Rig(profile, {b"/d/f": bytes(model)}, settings, seed=seed)
+    async with here.mounted(verify=rng.choice(["auto", "size", "none"])) as tree:
+        file = await tree.open(b"/d/f", write=True)
         for _ in range(12):
             await trio.sleep(rng.uniform(1, 40))
             for _ in range(rng.randrange(1, 4)):
@@ -655,38 +594,36 @@ async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
                 nonlocal last
                 if trio.current_time() - last >= SWIFTEST:  # else one that was left from before just struck
                     last = trio.current_time()
-                    world.vehicle.reboot(last, downtime, beat_after=beat_after)
+                    here.vehicle.reboot(last, downtime, beat_after=beat_after)
 
-            faults.after(rng.randrange(1, 14), restart)
+            here.faults.after(rng.randrange(1, 14), restart)
             for _ in range(8):
                 try:
                     await file.fsync()
                     break
                 except MavftpfsError:
                     await trio.sleep(10)
-            assert bytes(world.tree.data(path)) == bytes(model)
+            assert here.data(b"/d/f") == bytes(model)
         file.close()
 
 
 @pytest.mark.holds("promise 2")
 async def test_where_no_checksum_is_told_the_file_is_read_back(autojump: MockClock) -> None:
     """A byte that is wrong on the card is noticed, and all of it is sent again."""
-    world, data = World("px4", CLEAN), bytes(range(1, 240)) * 300
-    world.tree.add(b"/d/f", b"x")
-    faults = Faults(world)
-    faults.ignore(Opcode.CALC_FILE_CRC32)
+    data = bytes(range(1, 240)) * 300
+    async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
+        tree = here.mount()
+        here.faults.ignore(Opcode.CALC_FILE_CRC32)
+        here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
+        here.connection.scheduler.doubt.raise_it("an answer that came twice")
 
-    def spoil() -> None:
-        (name,) = (entry.name for entry in world.tree.entries(b"/d") if is_reserved(entry.name))
-        world.tree.add(b"/d/" + name, data[:70_000] + b"?" + data[70_001:])
+        def spoil() -> None:
+            here.put(here.litter()[0], data[:70_000] + b"?" + data[70_001:])
 
-    async with mounted(world, b"/d") as (connection, tree):
-        connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
-        connection.scheduler.doubt.raise_it("an answer that came twice")
-        faults.at(Opcode.OPEN_FILE_RO, spoil)  # to see its size
-        await make(tree, b"/d/new", data)
-        assert world.tree.data(b"/d/new") == data
-        assert faults.requests.count(Opcode.CREATE_FILE) == 2
+        here.faults.at(Opcode.OPEN_FILE_RO, spoil)  # to see its size
+        await write_file(tree, b"/d/new", data)
+        assert here.data(b"/d/new") == data
+        assert here.count(Opcode.CREATE_FILE) == 2
         assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
 
 
@@ -711,41 +648,28 @@ async def test_doubt_costs_a_new_file_one_comparison(profile: str, autojump: Moc
 
 # --- and what raises none
 
-FOLDER = b"/fs/microsd/"
-
 USB = LinkSettings(rate=1e6, delay=0.001, queue=100_000)
 
 FILES = 20
 
 
-async def make(tree: Tree, name: bytes, data: bytes) -> None:
-    """Make a file, and close it."""
-    file = await tree.create(name, exclusive=True)
-    try:
-        await file.write(0, data)
-        await file.flush()
-    finally:
-        file.close()
-
-
 async def test_small_files_do_not_wait_for_each_other(autojump: MockClock) -> None:
     """A card that pauses makes us ask twice; that is no reason to fear the path."""
-    here = World("px4-nuttx", USB)
-    here.tree.add(FOLDER + b"log", content(400_000, 1))
-    async with mounted(here) as (connection, tree):
-        file = await tree.open(FOLDER + b"log")
+    here = Rig("px4-nuttx", {b"/d/log": content(400_000, 1)}, USB)
+    async with here.mounted() as tree:
+        file = await tree.open(b"/d/log")
         assert await file.read(0, 400_000) == content(400_000, 1)
         file.close()
-        await make(tree, FOLDER + b"large", content(400_000, 2))
-        stats = connection.engine.stats
+        await write_file(tree, b"/d/large", content(400_000, 2))
+        stats = here.connection.engine.stats
         assert stats.unknown + stats.spurious > 0
         assert stats.unexplained == 0
         begun = trio.current_time()
         for number in range(FILES):
-            await make(tree, FOLDER + b"%d" % number, content(500, number))
+            await write_file(tree, b"/d/%d" % number, content(500, number))
         took = trio.current_time() - begun
         assert stats.unexplained == 0
     for number in range(FILES):
-        assert here.tree.data(FOLDER + b"%d" % number) == content(500, number)
+        assert here.data(b"/d/%d" % number) == content(500, number)
     # Five round trips for each, and the card's own pauses; each waited for 0.25 to 1 s more.
     assert took < FILES * (7 * 2 * USB.delay + 0.1)

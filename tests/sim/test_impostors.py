@@ -13,7 +13,6 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.connect import subscribe
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.udp import UdpLink
@@ -28,11 +27,11 @@ from mavftpfs.sim.profiles import PROFILES, Family
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.lying import CrowdedLink, LyingVehicle, ftp, heartbeat
-from tests.support.mounting import mounted
 from tests.support.replies import ack
+from tests.support.rigs import Rig
 from tests.support.rigs import read_file as read_through
+from tests.support.transfers import read_file
 from tests.support.vehicles import HOST, free_udp_port
-from tests.support.worlds import ROOTS, World, read_file
 
 HERE = ("10.0.0.1", 14550)
 
@@ -47,10 +46,11 @@ class Crowd:
     """A vehicle at HERE. other: another one with a file of that name."""
 
     def __init__(self) -> None:
-        self.world = World("px4", LinkSettings(delay=0.02))
-        self.world.tree.add(b"/f", OURS)
-        self.link = CrowdedLink(self.world, HERE)
-        self.ours = self.world.vehicle
+        self.rig = Rig("px4", link=LinkSettings(delay=0.02))
+        self.rig.card.add(b"/f", OURS)
+        self.link = CrowdedLink(self.rig.vehicle, self.rig.model, HERE)
+        self.rig.link = self.link
+        self.ours = self.rig.vehicle
         tree = MemoryTree()
         tree.add(b"/f", THEIRS)
         self.other = SimVehicle(tree, PROFILES["px4"], rng=random.Random(99))
@@ -79,7 +79,7 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
     autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene = Crowd()
-    async with scene.world.connection() as connection, trio.open_nursery() as nursery:
+    async with scene.rig.connected() as connection, trio.open_nursery() as nursery:
         await told(connection)
         nursery.start_soon(scene.beat, THERE)
         for _ in range(10):
@@ -99,7 +99,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(
     autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene = Crowd()
-    async with scene.world.connection() as connection:
+    async with scene.rig.connected() as connection:
         await told(connection)
         assert await read_file(connection, b"/f") == OURS
         scene.move(scene.ours, THERE)
@@ -121,7 +121,7 @@ async def test_another_vehicle_that_takes_the_address_is_not_read(
     scene = Crowd()
     if not tells:
         monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
-    async with scene.world.connection() as connection, trio.open_nursery() as nursery:
+    async with scene.rig.connected() as connection, trio.open_nursery() as nursery:
         await told(connection)
         scene.move(scene.other, THERE)
         await trio.sleep(60.0)
@@ -141,7 +141,7 @@ async def test_two_links_to_one_vehicle_do_no_harm(
 ) -> None:
     scene = Crowd()
     scene.link.mirrors = [THERE]
-    async with scene.world.connection() as connection:
+    async with scene.rig.connected() as connection:
         for _ in range(5):
             assert await read_file(connection, b"/f") == OURS
             await trio.sleep(3.0)
@@ -159,10 +159,10 @@ async def test_a_companion_has_an_address_of_its_own(
     """Our target is not the autopilot, whose heartbeats come from elsewhere and say whether it is armed."""
     monkeypatch.setitem(sim_vehicle._AUTOPILOT_TYPE, Family.MAVSDK, MAV_AUTOPILOT_INVALID)
     scene = Crowd()
-    scene.world.vehicle = SimVehicle(
-        scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
+    scene.rig.vehicle = SimVehicle(
+        scene.rig.card, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
     )
-    link = CrowdedLink(scene.world, HERE)
+    link = scene.rig.link = CrowdedLink(scene.rig.vehicle, scene.rig.model, HERE)
     async with trio.open_nursery() as nursery:
 
         async def autopilot() -> None:
@@ -171,7 +171,7 @@ async def test_a_companion_has_an_address_of_its_own(
                 await trio.sleep(1.0)
 
         nursery.start_soon(autopilot)
-        async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
+        async with scene.rig.connected(ConnectOptions(target_component=191)) as connection:
             await trio.sleep(2.0)
             assert await read_file(connection, b"/f") == OURS
             assert connection.vehicle.identity.standing is Standing.TRUSTED
@@ -276,6 +276,8 @@ def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Ite
 
 SLOW = LinkSettings(rate=20_000.0, delay=0.02, loss=0.05)
 
+FILE = b"/d/f"
+
 OUR_FILE = random.Random(1).randbytes(60_000)
 
 THEIR_FILE = random.Random(2).randbytes(60_000)
@@ -287,31 +289,27 @@ class Scene:
     """A mount of a vehicle that has a file. other: a vehicle of the same kind, with a file of that name."""
 
     def __init__(self, profile: str, settings: LinkSettings = SLOW) -> None:
-        self.world = World(profile, settings)
-        self.root = ROOTS.get(profile, b"") + b"/d"
-        self.file = self.root + b"/f"
-        self.world.tree.add(self.file, OUR_FILE)
-        self.ours = self.world.vehicle
+        self.rig = Rig(profile, {FILE: OUR_FILE}, settings)
+        self.ours = self.rig.vehicle
         tree = MemoryTree()
-        tree.add(self.file, THEIR_FILE)
+        tree.add(self.rig.root + FILE, THEIR_FILE)
         self.other = SimVehicle(tree, PROFILES[profile], rng=random.Random(99))
 
     @asynccontextmanager
     async def mounted(self) -> AsyncIterator[Tree]:
         """Give a tree that hears the news as a mount does."""
-        async with mounted(self.world) as (connection, tree):
-            subscribe(connection, tree)
+        async with self.rig.mounted() as tree:
             await trio.sleep(3.0)  # it told who it is
             yield tree
 
 
-async def swap(world: World, vehicle: SimVehicle, *, gap: float) -> None:
+async def swap(here: Rig, vehicle: SimVehicle, *, gap: float) -> None:
     """One is switched off, `gap` seconds later the other is there."""
-    world.link.cut()
+    here.link.cut()
     await trio.sleep(gap)
-    world.link.vehicle = vehicle
-    vehicle.server.firmware.tx_room = lambda: world.model.room(Direction.TO_CLIENT)
-    world.link.restore()
+    here.link.vehicle = vehicle
+    vehicle.server.firmware.tx_room = lambda: here.model.room(Direction.TO_CLIENT)
+    here.link.restore()
 
 
 @pytest.mark.holds("fault another vehicle")
@@ -322,8 +320,8 @@ async def test_what_is_held_for_one_is_not_written_to_the_other(
 ) -> None:
     scene = Scene(profile)
     async with scene.mounted() as tree:
-        await tree.list(scene.root)
-        file = await tree.open(scene.file, write=True, truncate=True)
+        await tree.list(b"/d")
+        file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, NEW)
         async with trio.open_nursery() as nursery:
 
@@ -333,18 +331,18 @@ async def test_what_is_held_for_one_is_not_written_to_the_other(
 
             nursery.start_soon(close)
             await trio.sleep(1.0)
-            await swap(scene.world, scene.other, gap=gap)
+            await swap(scene.rig, scene.other, gap=gap)
         await trio.sleep(100.0)
         assert scene.other.server.requests.total() == 0
-        assert tree.undelivered() == [scene.file]
-        again = await tree.open(scene.file, write=True)
+        assert tree.undelivered() == [FILE]
+        again = await tree.open(FILE, write=True)
         with pytest.raises(VehicleLost, match="another vehicle answers"):
             await again.fsync()
         again.close()
-        await swap(scene.world, scene.ours, gap=4.0)
+        await swap(scene.rig, scene.ours, gap=4.0)
         await trio.sleep(100.0)
         assert tree.undelivered() == []
-        assert scene.world.tree.data(scene.file) == NEW
+        assert scene.rig.data(FILE) == NEW
 
 
 @pytest.mark.holds("fault another vehicle")
@@ -352,17 +350,17 @@ async def test_what_is_held_for_one_is_not_written_to_the_other(
 async def test_no_file_is_read_half_from_each(profile: str, autojump: MockClock) -> None:
     scene = Scene(profile)
     async with scene.mounted() as tree:
-        file = await tree.open(scene.file)
+        file = await tree.open(FILE)
         head = bytes(await file.read(0, 10_000))
-        await swap(scene.world, scene.other, gap=4.0)
+        await swap(scene.rig, scene.other, gap=4.0)
         with pytest.raises(MavftpfsError):
             await file.read(30_000, 30_000)
         assert scene.other.server.requests.total() == 0
-        await swap(scene.world, scene.ours, gap=4.0)
+        await swap(scene.rig, scene.ours, gap=4.0)
         await trio.sleep(5.0)
         file.close()
         assert head == OUR_FILE[:10_000]
-        assert await read_through(tree, scene.file) == OUR_FILE
+        assert await read_through(tree, FILE) == OUR_FILE
 
 
 @pytest.mark.holds("fault another vehicle")
@@ -372,14 +370,14 @@ async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
 ) -> None:
     """Later, if it told once: it was asked for seconds."""
     scene = Scene("px4", LinkSettings(delay=0.02))
-    silent = scene.world.vehicle.framer.encode_heartbeat(2, 12)
+    silent = scene.rig.vehicle.framer.encode_heartbeat(2, 12)
     if tells == "never":
-        monkeypatch.setattr(scene.world.vehicle, "_version", lambda: silent)
+        monkeypatch.setattr(scene.rig.vehicle, "_version", lambda: silent)
     async with scene.mounted() as tree:
-        monkeypatch.setattr(scene.world.vehicle, "_version", lambda: silent)
-        await swap(scene.world, scene.world.vehicle, gap=4.0)
+        monkeypatch.setattr(scene.rig.vehicle, "_version", lambda: silent)
+        await swap(scene.rig, scene.rig.vehicle, gap=4.0)
         start = trio.current_time()
-        assert await read_through(tree, scene.file) == OUR_FILE
+        assert await read_through(tree, FILE) == OUR_FILE
         assert (trio.current_time() - start > 5.0) == (tells == "once")
 
 
@@ -391,14 +389,14 @@ async def test_ours_is_known_again_though_nobody_was_silent(
     caplog.set_level(logging.INFO)
     scene = Scene("px4", LinkSettings(delay=0.02))
     async with scene.mounted() as tree:
-        await swap(scene.world, scene.other, gap=0.5)
-        scene.world.model.push(Direction.TO_CLIENT, scene.other._version(), trio.current_time())
+        await swap(scene.rig, scene.other, gap=0.5)
+        scene.rig.model.push(Direction.TO_CLIENT, scene.other._version(), trio.current_time())
         await trio.sleep(2.0)
         with pytest.raises(VehicleLost, match="another vehicle answers"):
-            await tree.open(scene.file)
-        await swap(scene.world, scene.ours, gap=0.5)
+            await tree.open(FILE)
+        await swap(scene.rig, scene.ours, gap=0.5)
         await trio.sleep(10.0)
-        assert await read_through(tree, scene.file) == OUR_FILE
+        assert await read_through(tree, FILE) == OUR_FILE
     assert len([line for line in caplog.messages if "another vehicle" in line]) == 1
 
 
@@ -407,15 +405,15 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = Crowd()
-    scene.world.vehicle = SimVehicle(
-        scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
+    scene.rig.vehicle = SimVehicle(
+        scene.rig.card, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
     )
     monkeypatch.setattr(
-        scene.world.vehicle,
+        scene.rig.vehicle,
         "_beat",
-        lambda frames, now: scene.world.vehicle.__setattr__("_next_beat", now + 1),
+        lambda frames, now: scene.rig.vehicle.__setattr__("_next_beat", now + 1),
     )
-    link = CrowdedLink(scene.world, HERE)
+    link = scene.rig.link = CrowdedLink(scene.rig.vehicle, scene.rig.model, HERE)
     async with trio.open_nursery() as nursery:
 
         async def autopilot() -> None:
@@ -424,7 +422,7 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(
                 await trio.sleep(1.0)
 
         nursery.start_soon(autopilot)
-        async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
+        async with scene.rig.connected(ConnectOptions(target_component=191)) as connection:
             assert await read_file(connection, b"/f") == OURS
             link.address = THERE
             await trio.sleep(20.0)
@@ -445,6 +443,6 @@ async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
         await trio.sleep(120.0)
         start = trio.current_time()
         for _ in range(10):
-            assert await read_through(tree, scene.file) == OUR_FILE
+            assert await read_through(tree, FILE) == OUR_FILE
             await trio.sleep(5.0)
         assert trio.current_time() - start < 120.0

@@ -16,7 +16,7 @@ from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, Mavf
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.replies import ack, nak
 from tests.support.rigs import Rig, read_file, rig
-from tests.support.worlds import content
+from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("promise 10")
 

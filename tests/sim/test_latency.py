@@ -14,9 +14,9 @@ from trio.testing import MockClock
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.sources import MemorySource
+from tests.support.rigs import Rig
 from tests.support.takingturns import ALIKE
-from tests.support.worlds import ROOTS, MemorySink, World, read_file
+from tests.support.transfers import ROOTS, MemorySink, MemorySource, read_file
 
 SAMPLES = 20
 BEFORE = 3.0
@@ -52,14 +52,14 @@ class Copy:
         self.samples = samples
         self.link = link
         self.rate = link.rate
-        self.world = World(profile, link, serial=serial)
+        self.rig = Rig(profile, link=link, serial=serial)
         self.keeps = not PROFILES[profile].write_only_truncates
         self.root = ROOTS.get(profile, b"") + b"/d"
         self.size = int((samples * 1.35 + BEFORE) * link.rate)
         self.data = random.Random(2).randbytes(self.size)  # zeros would not be sent
-        self.world.tree.add(self.root + b"/big", self.data)
+        self.rig.card.add(self.root + b"/big", self.data)
         for number in range(samples):
-            self.world.tree.add(self.root + b"/fresh%d/f" % number, b"%d" % number * 100)
+            self.rig.card.add(self.root + b"/fresh%d/f" % number, b"%d" % number * 100)
         self.rng = random.Random(5)
 
     def allowed(self, frames: int, *, working: float = 0.0) -> float:
@@ -98,7 +98,7 @@ class Copy:
         acked = source.acked.total + source.proven.total
         await trio.sleep(2.0)
         assert source.acked.total + source.proven.total > acked, "the upload goes on"
-        there = self.world.tree.data(target)
+        there = self.rig.card.data(target)
         assert all(there[start:stop] == self.data[start:stop] for start, stop in source.proven)
         await upload.end()
         return waits
@@ -164,7 +164,7 @@ async def test_nobody_waits_long_beside_a_copy(
     way: str, what: str, profile: str, link: str, autojump: MockClock
 ) -> None:
     copy = Copy(profile, LINKS[link])
-    async with copy.world.connection() as connection:
+    async with copy.rig.connected() as connection:
         waits = await (copy.waits if way == "download" else copy.waits_beside_upload)(connection, what)
     working = PROFILES[profile].latency if link.startswith("far") and profile in SHORT_QUEUES else 0.0
     assert p95(waits) <= copy.allowed(FRAMES[what], working=working)
@@ -174,7 +174,7 @@ async def test_nobody_waits_long_beside_a_copy(
 async def test_nor_beside_a_copy_that_is_interrupted_for_minutes(autojump: MockClock) -> None:
     """The copy never gets more than a window, and must not pass for a light user."""
     copy = Copy("px4-nuttx", NEAR, samples=40)
-    async with copy.world.connection() as connection:
+    async with copy.rig.connected() as connection:
         waits = await copy.waits(connection, "read")
     assert p95(waits) <= copy.allowed(3)
 
@@ -186,7 +186,7 @@ async def test_nobody_waits_long_at_a_serial_port(
     way: str, what: str, link: str, autojump: MockClock
 ) -> None:
     copy = Copy("px4-nuttx", LINKS[link], samples=SAMPLES if link == "radio" else 40, serial=True)
-    async with copy.world.connection() as connection:
+    async with copy.rig.connected() as connection:
         waits = await (copy.waits if way == "download" else copy.waits_beside_upload)(connection, what)
     assert p95(waits) <= copy.allowed(FRAMES[what])
 
@@ -199,7 +199,7 @@ async def test_an_upload_goes_on_beside_endless_small_reads(
     """Three readers without a pause: somebody always waits who used little. Nothing was sent."""
     copy = Copy(profile, link)
     root = copy.root
-    async with copy.world.connection() as connection, trio.open_nursery() as nursery:
+    async with copy.rig.connected() as connection, trio.open_nursery() as nursery:
         connection.store.traits.wo_truncates = False
         source = MemorySource(copy.data)
         upload = await connection.store.open_upload(root + b"/new", source)
@@ -220,5 +220,5 @@ async def test_an_upload_goes_on_beside_endless_small_reads(
             await trio.sleep(20)
             assert source.proven.total > before
         nursery.cancel_scope.cancel()
-    there = copy.world.tree.data(root + b"/new")
+    there = copy.rig.card.data(root + b"/new")
     assert all(there[start:stop] == copy.data[start:stop] for start, stop in source.proven)

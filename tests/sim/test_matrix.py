@@ -213,7 +213,7 @@ class Scene:
 
     def whole(self) -> None:
         """Each file is there, old or new."""
-        if self.operation not in IN_PLACE or not in_place(self.here.world.profile):
+        if self.operation not in IN_PLACE or not in_place(self.here.profile):
             found = on_card(self.here)
             shown = {name: data for name, data in found.items() if not is_reserved(name)}
             assert shown in allowed(self.operation)
@@ -258,8 +258,8 @@ def cut(scene: Scene, count: int) -> None:
     """Cut the link for 4 s."""
 
     def action() -> None:
-        scene.here.world.link.cut()
-        scene.later(4.0, scene.here.world.link.restore)
+        scene.here.link.cut()
+        scene.later(4.0, scene.here.link.restore)
 
     scene.here.faults.after(count, action)
 
@@ -278,8 +278,8 @@ def reboot(scene: Scene, count: int) -> None:
     """Restart the vehicle."""
 
     def action() -> None:
-        scene.here.world.vehicle.reboot(trio.current_time(), 2.0)
-        scene.here.world.link.kick()
+        scene.here.vehicle.reboot(trio.current_time(), 2.0)
+        scene.here.link.kick()
 
     scene.here.faults.after(count, action)
 
@@ -288,10 +288,10 @@ def arm(scene: Scene, count: int) -> None:
     """Take off, and land 20 s later."""
 
     def action() -> None:
-        scene.here.world.vehicle.arm()
-        scene.here.world.link.kick()
+        scene.here.vehicle.arm()
+        scene.here.link.kick()
         scene.later(5.0, scene.whole)
-        scene.later(20.0, scene.here.world.vehicle.disarm)
+        scene.later(20.0, scene.here.vehicle.disarm)
 
     scene.here.faults.after(count, action)
 
@@ -300,11 +300,11 @@ def fly_away(scene: Scene, count: int) -> None:
     """Cut the link, and take off before it is back: what lost its name gets it in flight."""
 
     def action() -> None:
-        scene.here.world.link.cut()
-        scene.later(30.0, scene.here.world.vehicle.arm)
-        scene.later(40.0, scene.here.world.link.restore)
+        scene.here.link.cut()
+        scene.later(30.0, scene.here.vehicle.arm)
+        scene.later(40.0, scene.here.link.restore)
         scene.later(50.0, scene.whole)
-        scene.later(55.0, scene.here.world.vehicle.disarm)
+        scene.later(55.0, scene.here.vehicle.disarm)
 
     scene.here.faults.after(count, action)
 
@@ -314,8 +314,8 @@ def rival(scene: Scene, count: int) -> None:
 
     def action() -> None:
         wire = request(77, Opcode.RESET_SESSIONS).encode()
-        scene.here.world.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
-        scene.here.world.link.kick()
+        scene.here.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
+        scene.here.link.kick()
 
     scene.here.faults.after(count, lambda: scene.later(0.0, action))
 
@@ -338,7 +338,7 @@ def give_up_in_silence(scene: Scene, count: int) -> None:
 
 def power_off(scene: Scene, count: int) -> None:
     """Take the power from the vehicle and from us."""
-    scene.here.faults.after(count, scene.here.world.link.cut)
+    scene.here.faults.after(count, scene.here.link.cut)
 
 
 def nothing(scene: Scene, count: int) -> None:
@@ -384,7 +384,7 @@ async def mounted(here: Rig, place: Path, seed: int) -> AsyncIterator[Tree]:
     """Give what a mount has. place: where it keeps what is held back."""
     spool = SpoolDirectory(place, Random(seed))
     async with here.connected(QUICK, seed=seed):
-        inplace = in_place(here.world.profile)
+        inplace = in_place(here.profile)
         yield here.mount(seed=seed, spool=spool, inplace=inplace, op_deadline=8.0)
     spool.close()
 
@@ -407,15 +407,15 @@ async def meet(profile: str, operation: Call, event: Event, count: int, place: P
             assert_done(here, OPERATIONS[operation])
         requests = faults.requests[began:]
         if event is power_off:
-            here.world.link.cut()  # or leaving would tidy up
+            here.link.cut()  # or leaving would tidy up
         else:
             await trio.sleep(OVER.get(event, 10.0))
             done = done or tree.undelivered() != []
             assert await tree.drain(300.0) == []
             await settle(tree, here, (OPERATIONS[operation],) if done else allowed(operation)[:2])
     if event is power_off:
-        here.world.vehicle.reboot(trio.current_time())
-        here.world.link.restore()
+        here.vehicle.reboot(trio.current_time())
+        here.link.restore()
         async with mounted(here, place, 9) as tree:
             await settle(tree, here, (OPERATIONS[operation],) if done else allowed(operation))
     assert profile in LEAKS or here.server.open_sessions == 0

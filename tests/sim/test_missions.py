@@ -146,7 +146,7 @@ async def test_armed_and_cut() -> None:
         with pytest.raises(Armed):
             await save(tree, MISSION, PLAN)
         await here.disarm()
-        here.faults.at(Opcode.WRITE_FILE, here.world.link.cut)
+        here.faults.at(Opcode.WRITE_FILE, here.link.cut)
         with pytest.raises((RequestTimeout, VehicleLost)):
             await save(tree, MISSION, PLAN)
         assert b"not known" in await read_file(tree, ERRORS)

@@ -65,7 +65,7 @@ rewriting = st.lists(rewriting_calls(20_000, 3000), min_size=CALLS, max_size=CAL
 
 def mount(here: Rig, seed: int) -> Tree:
     """Make the tree of a mount."""
-    inplace = PROFILES[here.world.profile].storage is Storage.LITTLEFS
+    inplace = PROFILES[here.profile].storage is Storage.LITTLEFS
     return here.mount(seed=seed, inplace=inplace, dir_timeout=seed % 3 * 10.0)
 
 
@@ -141,7 +141,7 @@ class Below:
 
 async def trouble(here: Rig, rng: Random) -> None:
     """Cut the link, restart the vehicle, fly."""
-    link, vehicle = here.world.link, here.world.vehicle
+    link, vehicle = here.link, here.vehicle
     for number in range(10_000):
         await trio.sleep(rng.uniform(5, 20))
         if number % 7 == 3:
@@ -189,9 +189,9 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
                 for number, (model, sequence) in enumerate(zip(models, programs, strict=True)):
                     working.start_soon(work, model, sequence, Random(number))
             troubles.cancel_scope.cancel()
-        here.world.link.restore()
-        here.world.vehicle.disarm()
-        here.world.link.kick()
+        here.link.restore()
+        here.vehicle.disarm()
+        here.link.kick()
         await trio.sleep(20.0)
         for model in models:
             while model.handles:
@@ -201,7 +201,7 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
 
 
 @pytest.mark.holds("promise 3")
-@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES), soak=("px4", "ardupilot")))
 @settings(max_examples=1, phases=ONCE)
 @given(programs=st.lists(short, min_size=3, max_size=3), seed=st.integers(0, 99))
 def test_a_day_of_trouble_loses_no_byte(

@@ -348,7 +348,7 @@ async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, aut
     """Also before a request has timed out."""
     async with rig(profile) as here:
         tree = await deep(here)
-        here.world.link.cut()
+        here.link.cut()
         await trio.sleep(20.0)
         began, asked = trio.current_time(), tree.status()["listings_asked"]
         await tree.list(b"/")
@@ -370,7 +370,7 @@ async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, aut
                 await act()
         assert trio.current_time() == began
         assert tree.status()["listings_asked"] == asked
-        here.world.link.restore()
+        here.link.restore()
         await trio.sleep(3.0)
         assert await read_file(tree, UNKNOWN + b"/a") == b"ours"
 
@@ -382,7 +382,7 @@ async def test_known_directories_wait_until_the_vehicle_is_lost_and_no_longer(
 ) -> None:
     async with rig(profile) as here:
         tree = await deep(here)
-        here.world.link.cut()
+        here.link.cut()
         began = trio.current_time()
         await show(tree)
         assert 4.0 < trio.current_time() - began < 7.0

@@ -331,11 +331,11 @@ async def test_a_look_at_a_vehicle_that_sends_nothing_but_heartbeats_ends(fat: R
 @pytest.mark.holds("promise 9")
 async def test_a_refused_finish_is_undone_in_flight(torn: Rig) -> None:
     tree = torn.mount()
-    torn.faults.at(Opcode.RENAME, torn.world.vehicle.arm, nth=2)
+    torn.faults.at(Opcode.RENAME, torn.vehicle.arm, nth=2)
     torn.faults.refuse(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EIO, nth=2, times=2)  # it asks twice
     with pytest.raises(FtpNak):
         await write_file(tree, FILE, NEW)
-    assert torn.world.vehicle.armed
+    assert torn.vehicle.armed
     assert torn.data(FILE) == OLD
 
 
@@ -344,7 +344,7 @@ async def test_a_finish_that_is_refused_and_cannot_be_undone(torn: Rig) -> None:
     tree = torn.mount()
     await tree.list(b"/d")
     torn.faults.refuse(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EIO, nth=2, times=2)
-    torn.faults.at(Opcode.RENAME, torn.world.link.cut, nth=4, drop=True)
+    torn.faults.at(Opcode.RENAME, torn.link.cut, nth=4, drop=True)
     with pytest.raises(FtpNak):
         await tree.rename(OTHER, FILE)
     assert FILE not in torn.files()
@@ -441,7 +441,7 @@ async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(profi
             await file.read(0, 10)
 
             def power_off(here: Rig = here, cut: trio.Event = cut) -> None:
-                here.world.link.cut()
+                here.link.cut()
                 cut.set()
 
             here.faults.after(count, power_off)
@@ -449,10 +449,10 @@ async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(profi
                 await tree.rename(b"/d/a", b"/d/long")
             file.close()
             done = not cut.is_set()
-            here.world.link.cut()  # or leaving would tidy up
+            here.link.cut()  # or leaving would tidy up
         here.faults.call_off()
-        here.world.vehicle.reboot(trio.current_time())
-        here.world.link.restore()
+        here.vehicle.reboot(trio.current_time())
+        here.link.restore()
         async with here.connected(QUICK):
             await list_all(here, here.mount())  # of the same name, so that what is left is nobody's
         files = here.files()

@@ -30,7 +30,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, card, rig, write_file
-from tests.support.worlds import content
+from tests.support.transfers import content
 
 DATA = bytes(range(256)) * 300
 FILE, NEW, OTHER = b"/d/file.bin", b"/d/new", b"/d/other"

@@ -1,13 +1,16 @@
 """Calls that overlap: with the release of a file, with its delivery, with changes of its name.
 
-What happens to a name or a content at any request of a delivery: test_overtaken.
+A file that is removed, renamed over or emptied while it is on its way: what sends it is called off. A local
+disk does that at once, whatever the size, and fsync and close of what lost its name succeed. Here it costs a
+few round trips, at any moment of a delivery; the old file stays until there is another one, and nothing of
+what is gone comes back or stays on the card.
 """
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
 
 import pytest
 import trio
@@ -16,11 +19,10 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FileBusy, FtpNak, LinkError, NotFound, RequestTimeout
+from mavftpfs.shared.errors import FileBusy, FtpNak, LinkError, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.deliveries import in_the_middle
-from tests.support.rigs import KINDS, Rig, card, rig, write_file
-from tests.support.worlds import content
+from tests.support.rigs import KINDS, RENAMING, Rig, card, read_file, rig, write_file
+from tests.support.transfers import content
 
 FILE, NEW, OTHER = b"/d/file", b"/d/new", b"/d/other"
 OLD, LATER = b"old" * 300, b"new" * 300
@@ -30,6 +32,7 @@ FAR = LinkSettings(delay=0.05)
 SLOW = LinkSettings(rate=3000.0, queue=2000, delay=0.02)
 QUICK = ConnectOptions(op_deadline=5.0)
 PROMPT = 2.0
+"""Seconds for a few round trips, with what is in the queue of a slow link at the time."""
 
 slow = card({FILE: OLD, OTHER: OLD}, profiles=["px4", "ardupilot5", "mavsdk"], link=SLOW, options=QUICK)
 
@@ -41,6 +44,16 @@ async def begun(tree: Tree, path: bytes, data: bytes = DATA) -> OpenFile:
     )
     await file.write(0, data)
     return file
+
+
+@asynccontextmanager
+async def in_the_middle(file: OpenFile, waiting: int = 1, *, after: float = 1.05) -> AsyncIterator[None]:
+    """Enter when so many waited for the delivery for so many seconds; leaving waits for its end."""
+    async with trio.open_nursery() as nursery:
+        for _ in range(waiting):  # one delivers, the others wait for their turn
+            nursery.start_soon(file.fsync)
+        await trio.sleep(after)
+        yield
 
 
 async def settle(here: Rig, tree: Tree) -> None:
@@ -208,38 +221,252 @@ async def test_a_name_that_stays_gets_its_file(slow: Rig, refused: bool) -> None
     await settle(slow, tree)
 
 
-@pytest.mark.holds("fault overlap")
-@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
-@pytest.mark.parametrize("path", [NEW, FILE])
-async def test_a_name_goes_in_the_moment_of_any_answer(path: bytes, profile: str) -> None:
-    """Called off, the delivery may have got what it waited for, and may just be about to go on. Answers
-    take no time here."""
-    data = content(700)
-    for count in range(1, 50):
-        async with rig(profile, {FILE: OLD, OTHER: OLD}) as here:
-            tree, now, delivered = here.mount(verify="none"), trio.Event(), trio.Event()
-            file = await begun(tree, path, data)
-            here.faults.after(count, now.set)
+GOOD = LinkSettings(rate=50_000.0, delay=0.02)
+AT_ONCE = LinkSettings()
+"""Called off, a delivery may have got what it waited for, and may just be about to go on."""
 
-            async def deliver(
-                file: OpenFile = file, now: trio.Event = now, delivered: trio.Event = delivered
-            ) -> None:
-                await file.fsync()
-                delivered.set()
-                now.set()
+BYTES, NEWER, PLAIN = content(3000, 1), content(3500, 2), content(500, 3)
+MOST_REQUESTS = 120
 
-            async with trio.open_nursery() as waiting:
-                waiting.start_soon(deliver)
-                await now.wait()
-                if delivered.is_set():
-                    assert count > 5
-                    return
-                await tree.unlink(path)
-            assert bytes(await file.read(0, len(data))) == data
-            await file.release()
+
+async def create(tree: Tree) -> OpenFile:
+    await tree.unlink(FILE)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, NEWER)
+    return file
+
+
+async def replace(tree: Tree) -> OpenFile:
+    return await begun(tree, FILE, NEWER)
+
+
+async def change(tree: Tree) -> OpenFile:
+    file = await tree.open(FILE, write=True)
+    await file.write(100, NEWER[100:])
+    return file
+
+
+async def empty(tree: Tree) -> OpenFile:
+    await tree.unlink(FILE)
+    return await tree.create(FILE, exclusive=True)
+
+
+async def cut(tree: Tree) -> OpenFile:
+    file = await tree.open(FILE, write=True)
+    await file.truncate(1000)
+    return file
+
+
+Write = Callable[[Tree], Awaitable[OpenFile]]
+WRITES: dict[Write, bytes] = {
+    create: NEWER,
+    replace: NEWER,
+    change: BYTES[:100] + NEWER[100:],
+    empty: b"",
+    cut: BYTES[:1000],
+}
+"""How a file is made, or one changed that has BYTES, and what it is then; nothing of that is delivered."""
+
+Take = Callable[[Tree], Awaitable[None]]
+
+
+async def unlink(tree: Tree) -> None:
+    await tree.unlink(FILE)
+
+
+async def rename_over(tree: Tree) -> None:
+    await tree.rename(OTHER, FILE)
+
+
+TAKES: dict[Take, dict[bytes, bytes]] = {unlink: {OTHER: PLAIN}, rename_over: {FILE: PLAIN}}
+"""How it loses its name, and what is there then."""
+
+
+async def overtake(
+    count: int,
+    profile: str,
+    link: LinkSettings,
+    write: Write,
+    act: Callable[[Tree, OpenFile, trio.Event], Awaitable[float]],
+) -> tuple[Rig, float | None]:
+    """Act when `count` requests of a delivery came; return how long that took, None if it needed fewer.
+
+    act: is given the tree, the file and what tells that it is delivered; returns how long it took.
+    """
+    taken: float | None = None
+    async with rig(profile, {FILE: BYTES, OTHER: PLAIN}, link=link, seed=count + 1) as here:
+        tree = here.mount(inplace=not here.renames)
+        await tree.list(b"/d")
+        file = await write(tree)
+        now, delivered = trio.Event(), trio.Event()
+        here.faults.after(count, now.set)
+
+        async def flush() -> None:
+            await file.fsync()
+            delivered.set()
+
+        here.nursery.start_soon(flush)
+        with trio.move_on_after(60):
+            await now.wait()
+            if not delivered.is_set():
+                taken = await act(tree, file, delivered)
+        await delivered.wait()
+        await file.release()
+        if taken is not None:
             await settle(here, tree)
-            assert set(here.files()) == {FILE, OTHER} - {path}, f"answer {count}"
+        return here, taken
+
+
+async def at_each_request(attempt: Callable[[int], Awaitable[float | None]], *, step: int = 1) -> None:
+    """Try something when so many requests of a delivery came, until it needs fewer (None). attempt: returns
+    how long that took, a few round trips at most."""
+    for count in range(1, MOST_REQUESTS, step):
+        taken = await attempt(count)
+        if taken is None:
+            assert count > 2
+            return
+        assert taken < PROMPT, f"after request {count}"
     raise AssertionError("it was never delivered")
+
+
+@pytest.mark.holds("fault overlap")
+@pytest.mark.parametrize(
+    ("profile", "link", "write", "take"),
+    [
+        ("px4", GOOD, change, rename_over),
+        ("px4", AT_ONCE, create, unlink),
+        ("px4-nuttx", GOOD, replace, unlink),
+        ("ardupilot", GOOD, empty, rename_over),
+        ("ardupilot5", AT_ONCE, replace, unlink),
+        ("mavsdk", GOOD, create, unlink),
+    ],
+)
+async def test_a_name_goes_at_any_request_of_its_delivery(
+    profile: str, link: LinkSettings, write: Write, take: Take
+) -> None:
+    expected = WRITES[write]
+
+    async def act(tree: Tree, file: OpenFile, delivered: trio.Event) -> float:
+        began = trio.current_time()
+        await take(tree)
+        took = trio.current_time() - began
+        await delivered.wait()
+        assert bytes(await file.read(0, len(expected) + 1)) == expected
+        await file.write(len(expected), b"more")
+        assert bytes(await file.read(len(expected), 5)) == b"more"
+        await file.flush()
+        if take is rename_over:
+            assert await read_file(tree, FILE) == PLAIN
+        return took
+
+    async def attempt(count: int) -> float | None:
+        here, taken = await overtake(count, profile, link, write, act)
+        assert taken is None or here.files() == TAKES[take], f"after request {count}"
+        return taken
+
+    await at_each_request(attempt)
+
+
+@pytest.mark.holds("fault overlap")
+@pytest.mark.parametrize(
+    ("profile", "write", "then"),
+    [
+        ("px4", change, content(5000, 4)),
+        ("px4-nuttx", replace, content(700, 4)),
+        ("ardupilot", cut, content(700, 4)),
+        ("littlefs", replace, b""),
+        ("mavsdk", create, content(5000, 4)),
+    ],
+    ids=lambda value: len(value) if isinstance(value, bytes) else None,
+)
+async def test_emptied_at_any_request_of_its_delivery(profile: str, write: Write, then: bytes) -> None:
+    """By O_TRUNC; something else is written then."""
+
+    async def act(tree: Tree, file: OpenFile, delivered: trio.Event) -> float:
+        began = trio.current_time()
+        opened = await tree.open(FILE, write=True, truncate=True)
+        took = trio.current_time() - began
+        await opened.write(0, then)
+        await delivered.wait()
+        await opened.release()
+        assert (await tree.stat(FILE)).size == len(then)
+        return took
+
+    async def attempt(count: int) -> float | None:
+        here, taken = await overtake(count, profile, GOOD, write, act)
+        assert taken is None or here.files() == {FILE: then, OTHER: PLAIN}, f"after request {count}"
+        return taken
+
+    await at_each_request(attempt, step=2)
+
+
+RADIO = LinkSettings(rate=6000.0, delay=0.05)
+LONG = content(60_000)
+MOMENTS = (0.1, 1.0, 5.0, 9.0)
+"""Seconds since the delivery of that began; it takes 11 and more on the radio."""
+
+
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("take", TAKES)
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(profile: str, take: Take) -> None:
+    for moment in MOMENTS:
+        async with rig(profile, {OTHER: PLAIN}, link=RADIO) as here:
+            tree = here.mount()
+            file = await tree.create(FILE, exclusive=True)
+            await file.write(0, LONG)
+            async with in_the_middle(file, waiting=3, after=moment):
+                began = trio.current_time()
+                await take(tree)
+                assert trio.current_time() - began < PROMPT
+            assert trio.current_time() - began < PROMPT
+            assert bytes(await file.read(0, len(LONG) + 1)) == LONG
+            await file.release()
+
+
+@pytest.mark.holds("fault overlap")
+@pytest.mark.parametrize("profile", ["px4-nuttx", "mavsdk"])
+async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> None:
+    """What was accepted is on the card then, and the program goes on; on some servers that means all anew."""
+    piece = content(32768)
+    async with rig(profile, {b"/d/z": b""}, link=RADIO) as here:
+        tree = here.mount(dirty_max=65536)
+        file = await tree.create(FILE, exclusive=True)
+
+        async def write() -> None:
+            for number in range(4):
+                await file.write(number * len(piece), piece)
+            await file.flush()
+            await file.release()
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(write)
+            await trio.sleep(10)
+            await tree.rename(FILE, OTHER)
+            assert len(here.data(OTHER)) >= 2 * len(piece)
+        assert here.data(OTHER) == 4 * piece
+
+
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_the_old_file_stays_while_nobody_waits(profile: str) -> None:
+    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
+    async with rig(profile, {FILE: BYTES}, link=RADIO) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        file = await begun(tree, FILE, LONG)
+        here.faults.cut_after(60)
+        with pytest.raises(MavftpfsError):
+            await file.release()
+        here.faults.cut_after(None)
+        await trio.sleep(5)
+        began = trio.current_time()
+        file = await tree.open(FILE, write=True, truncate=True)
+        assert trio.current_time() - began < PROMPT
+        await trio.sleep(100)
+        assert here.data(FILE) == BYTES
+        await file.write(0, NEWER)
+        await file.release()
+        assert here.data(FILE) == NEWER
 
 
 @pytest.mark.holds("fault overlap")

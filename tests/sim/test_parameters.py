@@ -490,7 +490,7 @@ async def test_nothing_is_set_in_flight_nor_after_it(profile: str) -> None:
 @MARKS
 async def test_arming_in_the_middle_ends_it(profile: str) -> None:
     async with vehicle(profile) as (here, tree):
-        here.faults.at(Opcode.WRITE_FILE, here.world.vehicle.arm, nth=5)
+        here.faults.at(Opcode.WRITE_FILE, here.vehicle.arm, nth=5)
         with pytest.raises(Armed):
             await Editor(tree).save("".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(300)))
         took = sum(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300))
@@ -524,7 +524,7 @@ async def test_cut_in_the_middle(profile: str, opcode: Opcode, nth: int) -> None
         await tree.stat(ALL)
         await trio.sleep(2)
         before = {one.name: one.number for one in table_of(here).visible(0)}
-        here.faults.at(opcode, here.world.link.cut, nth=nth)
+        here.faults.at(opcode, here.link.cut, nth=nth)
         with pytest.raises((RequestTimeout, VehicleLost)):
             await Editor(tree).save(text)
         assert "set" in await errors(tree)

@@ -13,8 +13,8 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from tests.support.memory import MemoryLink
-from tests.support.mounting import mounted
-from tests.support.worlds import ROOTS, World, content, path, read_file, world
+from tests.support.rigs import Rig
+from tests.support.transfers import ROOTS, content, path, read_file
 
 RTT = 0.3
 
@@ -29,11 +29,11 @@ READY = 0.1
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_a_directory_is_listed_in_two_round_trips(profile: str, autojump_clock: MockClock) -> None:
     """The names, and that there are no more of them: two requests."""
-    world = World(profile, LONG)
+    here = Rig(profile, link=LONG)
     directory = ROOTS.get(profile, b"") + b"/d"
     for name in (b"a", b"b"):
-        world.tree.add(directory + b"/" + name, name)
-    async with world.connection() as connection:
+        here.card.add(directory + b"/" + name, name)
+    async with here.connected() as connection:
         store = connection.store
 
         async def names() -> tuple[float, set[bytes]]:
@@ -58,7 +58,7 @@ async def test_a_directory_is_listed_in_two_round_trips(profile: str, autojump_c
         await store.rename(directory + b"/f", directory + b"/e2")  # it might have replaced a file
         await names()
         assert connection.engine.stats.requests == requests + 3
-        world.tree.add(directory + b"/g", b"of somebody else")
+        here.card.add(directory + b"/g", b"of somebody else")
         took, seen = await names()
         assert (took <= 2 * RTT + READY, seen) == (True, {b"b", b"c", b"e", b"e2", b"g"})
         assert (await names())[0] <= 2 * RTT + READY
@@ -78,17 +78,15 @@ async def test_a_small_file_is_written_and_proven_in_five_round_trips(
     """CreateFile, its bytes, Terminate, the CRC32 together with a look whether the name is free, and the
     rename; no matter how full the window is. The first two files also find out what the card can."""
     data = bytes(range(239)) * chunks
-    world = World(profile, LONG)
-    world.tree.add_directory(ROOTS.get(profile, b"") + b"/d")
-    path = ROOTS.get(profile, b"") + b"/d/f"
-    async with mounted(world, split(path)[0]) as (_, tree):
+    here = Rig(profile, {b"/d": None}, LONG)
+    async with here.mounted(b"/d") as tree:
         for name in (b"1", b"2", b""):
             began = trio.current_time()
-            file = await tree.create(path + name, exclusive=False)
+            file = await tree.create(b"/d/f" + name, exclusive=False)
             await file.write(0, data)
             await file.flush()
             took = trio.current_time() - began
-            assert world.tree.data(path + name) == data
+            assert here.data(b"/d/f" + name) == data
             await file.release()
         assert tree.status()["verified_by_crc"] in (3, 4)
     assert took <= 5 * RTT + READY
@@ -99,21 +97,19 @@ async def test_the_first_large_file_costs_two_round_trips_more(
     profile: str, autojump_clock: MockClock
 ) -> None:
     """An empty file is made and closed; that it is renamed and removed costs no round trip of its own."""
-    world = World(profile, LONG)
-    world.tree.add_directory(ROOTS.get(profile, b"") + b"/d")
-    path = ROOTS.get(profile, b"") + b"/d/f"
+    here = Rig(profile, {b"/d": None}, LONG)
     took: list[float] = []
-    async with mounted(world, split(path)[0]) as (connection, tree):
+    async with here.mounted(b"/d") as tree:
         for name in (b"1", b"2"):
             if took:
                 await trio.sleep(60.0)
             began = trio.current_time()
-            file = await tree.create(path + name, exclusive=False)
+            file = await tree.create(b"/d/f" + name, exclusive=False)
             await file.write(0, bytes(range(1, 240)) * 20)
             await file.flush()
             took.append(trio.current_time() - began)
             await file.release()
-        assert connection.store.traits.rename_works
+        assert here.connection.store.traits.rename_works
     assert took[0] <= took[1] + 2 * RTT + READY
 
 
@@ -148,10 +144,10 @@ class OneLoss(LinkModel):
 
 async def first_steps(profile: str, victim: int) -> tuple[float, int]:
     """Mount, list and read a small file at once; return how long that took, and how many frames it was."""
-    here, model = world(profile, WIFI, f=content(SMALL)), OneLoss(victim)
+    here, model = Rig(profile, {b"/d/f": content(SMALL)}, WIFI), OneLoss(victim)
     here.link = MemoryLink(here.vehicle, model)
     target = path(profile, "f")
-    async with mounted(here) as (_, tree):
+    async with here.mounted() as tree:
         began = trio.current_time()
         assert dict(await tree.list(target[:-2])).keys() == {b"f"}
         handle = await tree.open(target)
@@ -173,17 +169,17 @@ async def test_no_one_loss_costs_a_second(profile: str, autojump: MockClock) -> 
 
 async def upload(profile: str, victim: int) -> float:
     """Return how long a close takes of a new file; victim: which frame about its checksum is lost."""
-    data = content(600_000)
-    here = world(profile, WIFI)
+    data = content(200_000)
+    here = Rig(profile, {b"/d": None}, WIFI)
     here.link = MemoryLink(here.vehicle, model := OneLoss(victim, Opcode.CALC_FILE_CRC32))
     target = path(profile, "new")
-    async with mounted(here, target[:-4]) as (_, tree):
+    async with here.mounted(target[:-4]) as tree:
         file = await tree.create(target, exclusive=False)
         await file.write(0, data)
         began = trio.current_time()
         await file.flush()
         took = trio.current_time() - began
-        assert here.tree.data(target) == data
+        assert here.card.data(target) == data
         await file.release()
     assert model.ftp > max(1, victim)
     return took
@@ -203,9 +199,9 @@ async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(
 async def test_changing_many_names_of_a_long_directory_seldom_lists_it(autojump: MockClock) -> None:
     """Over a slow link each rename, and every seventh removal, listed the directory: five seconds each."""
     count = 100
-    here = world("px4", LONG, **{f"a_file_with_a_long_name_{number}": b"x" for number in range(count)})
+    here = Rig("px4", {b"/d/a_file_with_a_long_name_%d" % number: b"x" for number in range(count)}, LONG)
     directory = split(path("px4", "f"))[0]
-    async with mounted(here, directory) as (_, tree):
+    async with here.mounted(directory) as tree:
         names = [f"a_file_with_a_long_name_{number}".encode() for number in range(count)]
         began = trio.current_time()
         for name in names[: count // 2]:
@@ -213,7 +209,7 @@ async def test_changing_many_names_of_a_long_directory_seldom_lists_it(autojump:
         for name in names[count // 2 :]:
             await tree.unlink(directory + b"/" + name)
         took = trio.current_time() - began
-    assert len(here.tree.entries(directory)) == 2 + count // 2  # "." and ".."
+    assert len(here.card.entries(directory)) == 2 + count // 2  # "." and ".."
     assert took <= 1.5 * count * RTT
 
 
@@ -235,9 +231,9 @@ class Swallowing(LinkModel):
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_a_parser_that_lost_the_thread_costs_no_second(profile: str, autojump: MockClock) -> None:
     """A dozen short frames had to be lost on it, of which the last came every 3 s."""
-    here = world(profile, WIFI, f=content(100), g=content(100))
+    here = Rig(profile, {b"/d/f": content(100), b"/d/g": content(100)}, WIFI)
     here.link = MemoryLink(here.vehicle, model := Swallowing())
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         store = connection.store
         await store.list_directory(split(path(profile, "f"))[0])
         await read_file(connection, path(profile, "f"))

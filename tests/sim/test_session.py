@@ -31,10 +31,9 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.faults import Faults
+from tests.support.rigs import DEFAULTS, Rig
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import put
-from tests.support.worlds import DEFAULTS, MemorySink, World, begin_to_read, content, path, read_file, world
+from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -43,8 +42,8 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_small_file_costs_open_transfer_terminate(profile: str, autojump: MockClock) -> None:
-    here = world(profile, small=b"hello")
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/small": b"hello"})
+    async with here.connected() as connection:
         assert await read_file(connection, path(profile, "small")) == b"hello"
         await trio.sleep(5)
         costs = {Opcode.OPEN_FILE_RO: 1, Opcode.READ_FILE: 1, Opcode.TERMINATE_SESSION: 1}
@@ -52,28 +51,28 @@ async def test_a_small_file_costs_open_transfer_terminate(profile: str, autojump
         await put(connection, path(profile, "new"), b"hello")
         costs |= {Opcode.CREATE_FILE: 1, Opcode.WRITE_FILE: 1, Opcode.TERMINATE_SESSION: 2}
         assert connection.engine.stats.by_opcode == costs
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
 
 
 @pytest.mark.holds("rule 14.7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_several_files_at_once_share_the_session(profile: str, autojump: MockClock) -> None:
-    files = {f"f{index}": content(20_000, index) for index in range(5)}
-    here = world(profile, BAD, **files)
-    got: dict[str, bytes] = {}
+    files = {b"/d/f%d" % index: content(20_000, index) for index in range(5)}
+    here = Rig(profile, files, BAD)
+    got: dict[bytes, bytes] = {}
     most_open = 0
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    async with here.connected() as connection, trio.open_nursery() as nursery:
 
-        async def fetch(name: str) -> None:
+        async def fetch(name: bytes) -> None:
             nonlocal most_open
-            got[name] = await read_file(connection, path(profile, name))
-            most_open = max(most_open, here.vehicle.server.open_sessions)
+            got[name] = await read_file(connection, here.root + name)
+            most_open = max(most_open, here.server.open_sessions)
 
         for name in files:
             nursery.start_soon(fetch, name)
     assert got == files
     assert most_open == 1, "also where the server has more"
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.holds("promise 7")
@@ -83,8 +82,8 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
 ) -> None:
     """It may be asked for before who serves the session has seen that it has nothing more to do."""
     rtt, step, steps = 0.1, 239, 60
-    here = world(profile, LinkSettings(rate=1e6, delay=rtt / 2), f=content(steps * step))
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": content(steps * step)}, LinkSettings(rate=1e6, delay=rtt / 2))
+    async with here.connected() as connection:
         sink = MemorySink(steps * step)
         reader = await connection.store.open_reader(path(profile, "f"), sink)
         began = trio.current_time()
@@ -97,20 +96,20 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, autojump: MockClock) -> None:
-    small = {f"s{index}": bytes([index]) * 100 for index in range(200)}
-    here = world(profile, LinkSettings(rate=60_000.0, delay=0.015), big=content(2_000_000), **small)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        sink = MemorySink(2_000_000)
+    small = {b"/d/s%d" % index: bytes([index]) * 100 for index in range(200)}
+    here = Rig(profile, {b"/d/big": content(1_200_000), **small}, LinkSettings(rate=60_000.0, delay=0.015))
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        sink = MemorySink(1_200_000)
         reader = await connection.store.open_reader(path(profile, "big"), sink)
-        reader.want(0, 2_000_000, demand=True)
+        reader.want(0, 1_200_000, demand=True)
         await trio.sleep(2)
 
         async def read_small() -> None:
             for name, data in small.items():
-                assert await read_file(connection, path(profile, name)) == data
+                assert await read_file(connection, name) == data
 
         began, before = trio.current_time(), sink.have.total
-        with trio.move_on_after(30):
+        with trio.move_on_after(15):
             await read_small()
         copied = (sink.have.total - before) / (trio.current_time() - began)
         assert copied > {"px4": 4_000, "ardupilot": 1_800}[profile]  # half of it without the rule
@@ -119,8 +118,8 @@ async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, a
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autojump: MockClock) -> None:
-    here = world(profile, small=b"hello")
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/small": b"hello"})
+    async with here.connected() as connection:
         await trio.sleep(8)
         await connection.store.list_directory(path(profile, "")[:-1])
         assert await read_file(connection, path(profile, "small")) == b"hello"
@@ -138,20 +137,20 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
-    here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
+    here = Rig(profile, {b"/d/big": data}, LinkSettings(rate=100_000.0, delay=0.02))
     with trio.CancelScope():
-        async with here.connection(seed=3) as connection:
+        async with here.connected(seed=3) as connection:
             await begin_to_read(connection, path(profile, "big"), 1000)
             here.link.cut()  # so that the farewell does not arrive: kill -9
     here.link.restore()
-    async with here.connection(seed=4) as connection:
+    async with here.connected(seed=4) as connection:
         assert await read_file(connection, path(profile, "big")) == data
         assert connection.engine.stats.by_opcode[Opcode.RESET_SESSIONS] == 0
 
 
 async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: MockClock) -> None:
-    here = world("px4", LinkSettings(delay=0.01), first=b"one", second=b"two")
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/first": b"one", b"/d/second": b"two"}, LinkSettings(delay=0.01))
+    async with here.connected() as connection:
         assert await read_file(connection, path("px4", "first")) == b"one"
         here.link.cut()
 
@@ -166,8 +165,8 @@ async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: M
 
 @pytest.mark.holds("promise 4", "rule 14.36")
 async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockClock) -> None:
-    here = world("px4", small=b"hello")
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/small": b"hello"})
+    async with here.connected() as connection:
         here.link.cut()
         began = trio.current_time()
         with pytest.raises(RequestTimeout):
@@ -186,9 +185,9 @@ async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockCloc
 
 
 async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
-    here = world("px4")
+    here = Rig("px4", {b"/d": None})
     with pytest.raises(VehicleLost, match=r"heard only 1/1 \(PX4 quadrotor, disarmed\); check target_system"):
-        async with here.connection(ConnectOptions(target_system=9)):
+        async with here.connected(ConnectOptions(target_system=9)):
             raise AssertionError("connected to nobody")
 
 
@@ -201,9 +200,7 @@ ROUNDS = 10_000
 async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = World("px4", LinkSettings(rate=5760.0, delay=0.02))
-    here.tree.add(b"/big", content(20_000))
-    here.tree.add(b"/changing", b"old")
+    here = Rig("px4", {b"/big": content(20_000), b"/changing": b"old"}, LinkSettings(rate=5760.0, delay=0.02))
     rounds = 0
     choose = Scheduler.first
 
@@ -214,7 +211,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
         return choose(queue)
 
     monkeypatch.setattr(Scheduler, "first", counted)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    async with here.connected() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
         async with scheduler.excluded(b"/changing"):
             nursery.start_soon(connection.store.stat_size, b"/changing")
@@ -228,8 +225,8 @@ async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(
     profile: str, autojump: MockClock
 ) -> None:
     """In the queue, between its call and its first step, while it opens, reads or closes."""
-    here = world(profile, LinkSettings(delay=0.02), f=content(3000), g=b"g")
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": content(3000), b"/d/g": b"g"}, LinkSettings(delay=0.02))
+    async with here.connected() as connection:
         for step in range(60):
             with trio.move_on_after(step * 0.01):
                 async with trio.open_nursery() as nursery:
@@ -239,13 +236,13 @@ async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(
             assert await read_file(connection, path(profile, "g")) == b"g"
             assert trio.current_time() - began < 1.0
         await trio.sleep(10)
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
 
 
 async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn(autojump: MockClock) -> None:
     """It would wait for itself: a change waits until the session is off its path."""
-    here = world("px4", LINK, f=DATA)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
         async with connection.scheduler.turn(SessionUser(b"/d/f", trio.current_time())) as turn:
             await turn.open(b"/d/f")
             with pytest.raises(AssertionError):
@@ -264,14 +261,15 @@ async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
     old, new = content(5000, 1), content(5000, 2)
     for lost in (False, True):
         for later in range(0, 60, 3):
-            here = World(profile, LinkSettings(delay=0.1))
+            here = Rig(profile, link=LinkSettings(delay=0.1))
             for name, data in ((b"/a", old), (b"/b", new), (b"/other", new)):
-                here.tree.add(name, data)
-            async with here.connection() as connection, trio.open_nursery() as nursery:
+                here.card.add(name, data)
+            async with here.connected() as connection, trio.open_nursery() as nursery:
                 store, sink = connection.store, MemorySink(5000)
                 assert await read_file(connection, b"/other") == new
                 reader = await store.open_reader(b"/a", sink, expected_size=5000)
-                faults = Faults(here)
+                faults = here.faults
+                faults.requests.clear()
                 if lost:
                     faults.lose_reply_to(Opcode.TERMINATE_SESSION)
 
@@ -307,11 +305,11 @@ CHECK_PERIOD = STALL / 2
 class Log:
     """When the server was asked what by us, and what it should do after that."""
 
-    def __init__(self, here: World, *, after: Callable[[int], None] = lambda opcode: None) -> None:
+    def __init__(self, here: Rig, *, after: Callable[[int], None] = lambda opcode: None) -> None:
         self.asked: list[tuple[float, int]] = []
-        self._handle = here.vehicle.server.handle
+        self._handle = here.server.handle
         self._after = after
-        here.vehicle.server.handle = self._take  # type: ignore[method-assign]
+        here.server.handle = self._take  # type: ignore[method-assign]
 
     def _take(self, wire: bytes, source: Address, now: float) -> None:
         self._handle(wire, source, now)
@@ -331,7 +329,7 @@ class Log:
         return [later - earlier for (earlier, _), (later, _) in pairwise(self.asked)]
 
 
-def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, heard: bool = True) -> None:
+def rival_asks(here: Rig, opcode: Opcode, data: bytes = b"", *, seq: int, heard: bool = True) -> None:
     """Let another client of the vehicle ask something, so that we hear it on our link or not."""
     opens = opcode in (Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE)
     session = RIVALS_SESSION if opens or here.profile.startswith("ardupilot") else 0
@@ -340,18 +338,18 @@ def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, hear
     if heard:
         here.vehicle.foreign_request(wire, RIVAL, now)
     else:
-        here.vehicle.server.handle(wire, RIVAL, now)
+        here.server.handle(wire, RIVAL, now)
     here.link.kick()
 
 
 @pytest.mark.holds("fault stale session", "rule 14.10")
 async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: MockClock) -> None:
     """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
-    here = world("ardupilot", LINK, f=DATA, stale=OTHER)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    here = Rig("ardupilot", {b"/d/f": DATA, b"/d/stale": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
         rival_asks(here, Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), seq=5, heard=False)
         await trio.sleep(0.1)
-        assert here.vehicle.server.open_sessions == 1
+        assert here.server.open_sessions == 1
         connection.scheduler.server.others = OtherClients()  # its answer went to its own link
         log = Log(here)
 
@@ -385,8 +383,8 @@ ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
 @pytest.mark.parametrize("profile", ONE_SESSION)
 async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
-    here = world(profile, LINK, f=DATA, theirs=OTHER)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
         log = Log(here)
         rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
 
@@ -402,7 +400,7 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
             await read_file(connection, path(profile, "f"))
         assert trio.current_time() - began == pytest.approx(DEFAULTS.op_deadline, abs=1.0)
         await trio.sleep(3.0)
-        assert here.vehicle.server.open_paths == [path(profile, "theirs")]
+        assert here.server.open_paths == [path(profile, "theirs")]
         asked = (Opcode.OPEN_FILE_RO, Opcode.RESET_SESSIONS, Opcode.TERMINATE_SESSION)
         assert sum(map(log.count, asked)) == 0
         nursery.cancel_scope.cancel()
@@ -414,8 +412,8 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
 async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(
     closes: bool, profile: str, autojump: MockClock
 ) -> None:
-    here = world(profile, LINK, f=DATA, theirs=OTHER)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection:
         log = Log(here)
         rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
         await trio.sleep(4.0)
@@ -436,8 +434,8 @@ async def test_a_session_that_another_client_took_is_its_own(
     profile: str, ours: str, autojump: MockClock
 ) -> None:
     """Only what was on its way goes into its file, which stays open, and ours is whole in the end."""
-    here = world(profile, SLOW, f=DATA, theirs=OTHER)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, SLOW)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
         if ours == "reading":
             _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
         else:
@@ -445,15 +443,15 @@ async def test_a_session_that_another_client_took_is_its_own(
             await trio.sleep(1.0)
         rival_asks(here, Opcode.CREATE_FILE, path(profile, "its"), seq=5)
         await trio.sleep(1.0)
-        spoilt = here.tree.data(path(profile, "its"))
+        spoilt = here.data(b"/d/its")
         await trio.sleep(7.0)
-        assert path(profile, "its") in here.vehicle.server.open_paths
-        assert here.tree.data(path(profile, "its")) == spoilt
+        assert path(profile, "its") in here.server.open_paths
+        assert here.data(b"/d/its") == spoilt
         rival_asks(here, Opcode.TERMINATE_SESSION, seq=7)
         if ours == "reading":
             assert await sink.wait_for(0, len(DATA)) == DATA
     if ours == "writing":
-        assert here.tree.data(path(profile, "new")) == DATA
+        assert here.data(b"/d/new") == DATA
 
 
 @pytest.mark.holds("rule 14.9")
@@ -462,15 +460,15 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
     outage: float, autojump: MockClock
 ) -> None:
     """Meanwhile the session of a PX4, which all share, may have become another client's."""
-    here = world("px4", SLOW, f=DATA, theirs=OTHER)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, SLOW)
+    async with here.connected() as connection:
         log = Log(here)
         _, sink = await begin_to_read(connection, path("px4", "f"), 10_000)
         here.link.cut()
         await trio.sleep(0.2)
         rival_asks(here, Opcode.TERMINATE_SESSION, seq=5, heard=False)
         rival_asks(here, Opcode.OPEN_FILE_RO, path("px4", "theirs"), seq=7, heard=False)
-        assert here.vehicle.server.open_paths == [path("px4", "theirs")]
+        assert here.server.open_paths == [path("px4", "theirs")]
         assert outage > STALL + CHECK_PERIOD
         await trio.sleep(outage)
         here.link.restore()
@@ -480,13 +478,13 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
 
 @pytest.mark.holds("fault idle close")
 async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump: MockClock) -> None:
-    here = world("px4", LINK, f=DATA)
+    here = Rig("px4", {b"/d/f": DATA}, LINK)
 
     def close_at_once(opcode: int) -> None:
         if opcode == Opcode.OPEN_FILE_RO:
             rival_asks(here, Opcode.TERMINATE_SESSION, seq=60_000 + len(log.asked), heard=False)
 
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         log = Log(here, after=close_at_once)
         with trio.fail_after(100), pytest.raises(SessionLost):
             await read_file(connection, path("px4", "f"))
@@ -498,15 +496,15 @@ async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump:
 async def test_a_server_that_closed_an_idle_session_during_an_outage(
     profile: str, outage: float, autojump: MockClock
 ) -> None:
-    here = world(profile, SLOW, f=DATA)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": DATA}, SLOW)
+    async with here.connected() as connection:
         log = Log(here)
         _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
         here.link.cut()
         await trio.sleep(outage)
         here.link.kick()
         await trio.sleep(0.01)
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
         here.link.restore()
         assert await sink.wait_for(0, len(DATA)) == DATA
         assert sink.suspicions == []
@@ -520,8 +518,8 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
     shrinks: bool, profile: str, autojump: MockClock
 ) -> None:
     """It is opened again for more. What is smaller then is another file."""
-    here = world(profile, LINK, f=DATA)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
         log = Log(here)
         sink = MemorySink(len(DATA))
         reader = await connection.store.open_reader(path(profile, "f"), sink)
@@ -532,9 +530,9 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
         assert log.count(Opcode.TERMINATE_SESSION) == 0
         await trio.sleep(5.0)
         assert log.last(Opcode.TERMINATE_SESSION) - log.last(Opcode.READ_FILE) < 2.0
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
         if shrinks:
-            here.tree.add(path(profile, "f"), OTHER[:50_000])
+            here.put(b"/d/f", OTHER[:50_000])
         reader.want(40_000, 41_000, demand=True)
         if shrinks:
             with pytest.raises(FileChanged):
@@ -544,7 +542,7 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
             assert await sink.wait_for(40_000, 41_000) == DATA[40_000:41_000]
         assert log.count(Opcode.OPEN_FILE_RO) == 2
         await trio.sleep(5.0)
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
 
 
 @pytest.mark.holds("promise 9")
@@ -552,8 +550,8 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
 async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(
     profile: str, autojump: MockClock
 ) -> None:
-    here = world(profile, LINK, f=DATA)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
         log = Log(here)
         reader, sink = await begin_to_read(connection, path(profile, "f"), 1000)
         await sink.wait_for(0, 1000)
@@ -563,14 +561,14 @@ async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(
         assert log.count(Opcode.TERMINATE_SESSION) == 0, "it is still open here"
         reader.close()
         await trio.sleep(0.5)
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
 
 
 @pytest.mark.holds("rule 14.31")
 async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
-    here = world("mavsdk-old", LINK, f=DATA)
-    async with here.connection() as connection:
+    here = Rig("mavsdk-old", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
         log = Log(here)
         for known in (None, False, False):
             assert await _listed(connection) == [b"f"]
@@ -585,8 +583,8 @@ async def test_two_silences_prove_that_listings_show_no_times(autojump: MockCloc
 
 @pytest.mark.holds("rule 14.31")
 async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None:
-    here = world("ardupilot5", LINK, f=DATA)
-    async with here.connection() as connection:
+    here = Rig("ardupilot5", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
         here.link.cut()
         with trio.CancelScope() as scope:
             async with trio.open_nursery() as nursery:
@@ -606,9 +604,9 @@ async def _listed(connection: Connection) -> list[bytes]:
 # --- what a killed client left keeps listings and changes out
 
 
-def ardupilot() -> World:
-    here = World("ardupilot")
-    here.tree.mkdir(b"/d")
+def ardupilot() -> Rig:
+    here = Rig("ardupilot")
+    here.card.mkdir(b"/d")
     return here
 
 
@@ -627,13 +625,13 @@ async def open_elsewhere(connection: Connection) -> None:
 async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:
     here = ardupilot()
     options = ConnectOptions(op_deadline=20.0)
-    async with here.connection(options) as connection, trio.open_nursery() as nursery:
+    async with here.connected(options) as connection, trio.open_nursery() as nursery:
         await open_elsewhere(connection)
         wire = request(77, Opcode.NONE, session=others_session(connection)).encode()
 
         async def keep_in_use() -> None:
             while True:
-                here.vehicle.server.handle(wire, Address(255, 190), trio.current_time())
+                here.server.handle(wire, Address(255, 190), trio.current_time())
                 await trio.sleep(1)
 
         nursery.start_soon(keep_in_use)
@@ -647,7 +645,7 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autoj
 
 async def test_a_change_outlasts_it_too(autojump_clock: MockClock) -> None:
     here = ardupilot()
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         await open_elsewhere(connection)
         began = trio.current_time()
         await connection.store.make_directory(b"/d/new")

@@ -19,12 +19,11 @@ from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
-from tests.support.mounting import mounted
-from tests.support.sources import MemorySource
-from tests.support.worlds import ROOTS, MemorySink, World
+from tests.support.rigs import Rig
+from tests.support.transfers import MemorySink, MemorySource
 
 LONG = 60.0
-SHORT = 20.0
+SHORT = 10.0
 START = 0.06
 """What the start of a short run may cost of its share."""
 
@@ -72,9 +71,9 @@ def test_a_radio_of_57600_baud_is_written_and_little_in_vain(profile: str, loss:
         assert result.requests <= 1.05 / (1 - loss) ** 2
 
 
-async def copy(tree: Tree, world: World, case: Case, data: bytes) -> None:
+async def copy(tree: Tree, here: Rig, case: Case, data: bytes) -> None:
     """Read, or write, as cp does."""
-    path = ROOTS.get(case.profile, b"") + b"/d/log.bin"
+    path = b"/d/log.bin"
     if case.direction == "read":
         file = await tree.open(path)
         assert b"".join([bytes(await file.read(at, 1 << 17)) for at in range(0, len(data), 1 << 17)]) == data
@@ -84,27 +83,26 @@ async def copy(tree: Tree, world: World, case: Case, data: bytes) -> None:
     await file.write(0, data)
     await file.flush()
     await file.release()
-    assert world.tree.data(path) == data
+    assert here.data(path) == data
 
 
 def serial_share(case: Case, seed: int) -> float:
     """Return the share of the limit that one run through the caches reaches on a serial port."""
     link = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=SHORT_QUEUE)
-    world = World(case.profile, link, seed=seed, serial=True)
-    directory = ROOTS.get(case.profile, b"") + b"/d"
-    world.tree.add_directory(directory)
+    here = Rig(case.profile, link=link, seed=seed, serial=True)
+    here.put_directory(b"/d")
     data = random.Random(1).randbytes(int(case.limit * LONG))
     if case.direction == "read":
-        world.tree.add(directory + b"/log.bin", data)
+        here.put(b"/d/log.bin", data)
 
     async def run() -> float:
-        async with mounted(world, directory, verify="size") as (_, tree):
+        async with here.mounted(b"/d", verify="size") as tree:
             began = trio.current_time()
-            await copy(tree, world, case, data)
+            await copy(tree, here, case, data)
             return trio.current_time() - began
 
     took = trio.run(run, clock=MockClock(autojump_threshold=0))
-    return len(data) / took / case.limit_beside(world.vehicle.server.firmware.pauses)
+    return len(data) / took / case.limit_beside(here.vehicle.server.firmware.pauses)
 
 
 @BOTH
@@ -147,7 +145,9 @@ def test_the_pauses_of_a_card_cost_their_time_once(
     direction: Direction, rate: float, rtt: float, share: float, requests: float
 ) -> None:
     """Without answers in reserve the link is idle in a third of them, or the server for as long again."""
-    result = measure(Case("px4-nuttx", rate, rtt, 0.0, direction), 30.0 if rate == 100_000.0 else 10.0)
+    result = measure(
+        Case("px4-nuttx", rate, rtt, 0.0, direction), LONG / 2 if direction == "write" else SHORT
+    )
     assert result.share >= share
     assert result.requests <= requests
 
@@ -226,7 +226,7 @@ def test_telemetry_gets_through_beside_a_copy(
 ) -> None:
     """It shares a short queue with the answers, which must not fill it for long."""
     case = Case(profile, rate, rtt, loss, direction)
-    seconds, telemetry = (LONG, 400.0) if rate == 5760.0 else (10.0, 4000.0)
+    seconds, telemetry = (LONG, 400.0) if rate == 5760.0 else (SHORT / 2, 4000.0)
     result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=telemetry)
     assert result.dropped <= 0.1 * case.limit * seconds / MAX_DATA
     assert result.share >= (target(case) - START if direction == "read" else 0.7)
@@ -243,15 +243,15 @@ def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
 async def test_never_more_is_written_than_a_short_queue_holds(
     profile: str, autojump_clock: MockClock
 ) -> None:
-    here = World(profile, LinkSettings(rate=1e6, delay=0.005))
-    here.tree.add_directory(b"/d")
+    here = Rig(profile, link=LinkSettings(rate=1e6, delay=0.005))
+    here.card.add_directory(b"/d")
     source = MemorySource(bytes(range(256)) * 400)
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         await upload.end()
-    assert here.tree.data(b"/d/f") == source.content
-    assert here.vehicle.server.firmware.dropped_requests == 0
+    assert here.card.data(b"/d/f") == source.content
+    assert here.server.firmware.dropped_requests == 0
     assert connection.engine.stats.retransmissions == 0
 
 
@@ -260,14 +260,15 @@ async def test_a_way_that_becomes_longer_for_good_is_found_out(autojump: MockClo
     """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
     away."""
     loss, size = 0.02, 8 << 20
-    world = World("px4", LinkSettings(rate=3000.0, delay=0.025, loss=loss))
-    world.tree.add(b"/d/f", random.Random(1).randbytes(size))
-    async with world.connection() as connection:
+    here = Rig(
+        "px4", {b"/d/f": random.Random(1).randbytes(size)}, LinkSettings(rate=3000.0, delay=0.025, loss=loss)
+    )
+    async with here.connected() as connection:
         sink = MemorySink(size)
         reader = await connection.store.open_reader(b"/d/f", sink)
         reader.want(0, size, demand=True)
         await trio.sleep(20.0)
-        world.model.settings = replace(world.model.settings, rate=60_000.0, delay=0.25)
+        here.model.settings = replace(here.model.settings, rate=60_000.0, delay=0.25)
         await trio.sleep(90.0)
         before = sink.have.total
         await trio.sleep(10.0)
@@ -297,10 +298,10 @@ def allowed(case: Case) -> float:
     return (1 - LAST) * SIZE / (target(case) * case.limit) + RTT + (losses + 1) * TIMER * RTT + close
 
 
-async def last_read(here: World) -> float:
+async def last_read(here: Rig) -> float:
     """Return how long the end of a read takes."""
     data, almost = random.Random(1).randbytes(SIZE), 0.0
-    here.tree.add(b"/d/f", data)
+    here.card.add(b"/d/f", data)
 
     class Sink(MemorySink):
         def on_data(self, offset: int, data: bytes) -> None:
@@ -309,7 +310,7 @@ async def last_read(here: World) -> float:
             if offset + len(data) >= LAST * SIZE:
                 almost = almost or trio.current_time()
 
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         sink = Sink(SIZE)
         reader = await connection.store.open_reader(b"/d/f", sink)
         reader.want(0, SIZE, demand=True)
@@ -319,7 +320,7 @@ async def last_read(here: World) -> float:
     return took
 
 
-async def last_write(here: World) -> float:
+async def last_write(here: Rig) -> float:
     """Return how long the end of an upload takes."""
     almost = 0.0
 
@@ -330,17 +331,17 @@ async def last_write(here: World) -> float:
             if offset + count >= LAST * SIZE:
                 almost = almost or trio.current_time()
 
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         source = Source(random.Random(1).randbytes(SIZE))
         upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         took = trio.current_time() - almost
         await upload.end()
-    assert here.tree.data(b"/d/f") == source.content
+    assert here.card.data(b"/d/f") == source.content
     return took
 
 
-ENDS: dict[Direction, Callable[[World], Awaitable[float]]] = {"read": last_read, "write": last_write}
+ENDS: dict[Direction, Callable[[Rig], Awaitable[float]]] = {"read": last_read, "write": last_write}
 
 
 @HARDER
@@ -349,8 +350,8 @@ def test_the_last_percent_is_not_slow(direction: Direction) -> None:
 
     def run(seed: int) -> float:
         link = LinkSettings(rate=RATE, delay=RTT / 2, loss=LOSS, queue=int(RATE / 2))
-        here = World("px4", link, seed=seed)
-        here.tree.add_directory(b"/d")
+        here = Rig("px4", link=link, seed=seed)
+        here.card.add_directory(b"/d")
         return trio.run(ENDS[direction], here, clock=MockClock(autojump_threshold=0))
 
     assert mean(map(run, (1, 2))) <= allowed(Case("px4", RATE, RTT, LOSS, direction))

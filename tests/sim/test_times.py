@@ -6,8 +6,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
-from tests.support.rigs import Rig, card, write_file
-from tests.support.worlds import EPOCH
+from tests.support.rigs import EPOCH, Rig, card, write_file
 
 SECOND = 10**9
 DATA = bytes(range(256)) * 3
@@ -35,7 +34,7 @@ async def test_times_are_kept_until_the_file_changes(here: Rig, tree: Tree) -> N
     for _ in range(2):
         assert (await tree.stat(FILE)).mtime_ns == 1_234_567_890_123_456_789
         tree.forget_caches()
-    if here.world.profile != "px4":
+    if here.profile != "px4":
         here.put(FILE, b"data", 1_600_000_000)  # a server that tells mtimes has its own idea
         tree.forget_caches()
         assert await seconds(tree, FILE) == 1_600_000_000

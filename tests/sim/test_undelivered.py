@@ -29,7 +29,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
 )
 from tests.support.rigs import Rig, card, read_file, rig, write_file
-from tests.support.worlds import content
+from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("promise 3")
 
@@ -129,7 +129,7 @@ async def test_an_upload_of_what_was_taken_back_is_called_off(end: str) -> None:
         await file.truncate(len(OLD))
         await getattr(file, end)()
         assert here.files() == {FILE: b"y" + OLD[1:]}
-        assert here.world.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
         await file.release()
         await tree.unlink(FILE)
         await tree.rmdir(b"/d")

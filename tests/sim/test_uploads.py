@@ -18,13 +18,9 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
-from tests.support.faults import Faults
-from tests.support.mounting import mounted
-from tests.support.rigs import write_file
-from tests.support.sources import MemorySource
+from tests.support.rigs import Rig, write_file
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import know, put, start, under_way
-from tests.support.worlds import World, content, path, read_file, world
+from tests.support.transfers import MemorySource, content, know, path, put, read_file, start, under_way
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -37,12 +33,12 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: MockClock) -> None:
     sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
-    here = world(profile, BAD, f1=b"something older and longer")
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/f1": b"something older and longer"}, BAD)
+    async with here.connected() as connection:
         for size in sizes:
             await put(connection, path(profile, f"f{size}"), content(size, size))
-            assert here.tree.data(path(profile, f"f{size}")) == content(size, size)
-    assert here.vehicle.server.open_sessions == 0
+            assert here.card.data(path(profile, f"f{size}")) == content(size, size)
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
@@ -50,45 +46,45 @@ async def test_little_of_the_first_large_file_is_sent_twice_where_the_card_canno
     size: int, autojump: MockClock
 ) -> None:
     """It begins while the refusal of the trial is on its way: that is one round trip, whatever its size."""
-    here = world("littlefs")
+    here = Rig("littlefs", {b"/d": None})
     target, data = path("littlefs", "new"), content(size)
-    async with mounted(here, target[:-4]) as (connection, tree):
+    async with here.mounted(target[:-4]) as tree:
         await write_file(tree, target, data)
-        again = connection.engine.stats.by_opcode[Opcode.WRITE_FILE] - -(-size // MAX_DATA)
+        again = here.connection.engine.stats.by_opcode[Opcode.WRITE_FILE] - -(-size // MAX_DATA)
         assert again <= 3 * FIRST
-        assert here.tree.data(target) == data
-    assert {entry.name for entry in here.tree.entries(target[:-4])} == {b".", b"..", b"new"}
+        assert here.card.data(target) == data
+    assert {entry.name for entry in here.card.entries(target[:-4])} == {b".", b"..", b"new"}
 
 
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 
-async def cut(here: World, connection: Connection, length: float) -> None:
+async def cut(here: Rig, connection: Connection, length: float) -> None:
     here.link.cut()
     await trio.sleep(length)
     here.link.restore()
 
 
-async def reboot(here: World, connection: Connection) -> None:
+async def reboot(here: Rig, connection: Connection) -> None:
     here.vehicle.reboot(trio.current_time(), downtime=4.0)
     here.link.kick()
 
 
-async def take_session(here: World, connection: Connection) -> None:
+async def take_session(here: Rig, connection: Connection) -> None:
     """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
     for source in (STRANGER, connection.vehicle.own):
         steal(here, connection, source)
     here.link.kick()
 
 
-def steal(here: World, connection: Connection, source: Address = STRANGER) -> None:
+def steal(here: Rig, connection: Connection, source: Address = STRANGER) -> None:
     """Have the session terminated; nobody hears it."""
     session = connection.scheduler.server.session
     wire = request(77, Opcode.TERMINATE_SESSION, session=session.id if session else 0).encode()
-    here.vehicle.server.handle(wire, source, trio.current_time())
+    here.server.handle(wire, source, trio.current_time())
 
 
-INTERRUPTIONS: dict[str, Callable[[World, Connection], Awaitable[None]]] = {
+INTERRUPTIONS: dict[str, Callable[[Rig, Connection], Awaitable[None]]] = {
     "cut": partial(cut, length=3.0),
     "long cut": partial(cut, length=14.0),  # PX4 closes an idle session after 10 s
     "reboot": reboot,
@@ -104,8 +100,8 @@ async def test_what_interrupts_it_is_bridged(
     profile: str, probed: bool, interruption: str, autojump: MockClock
 ) -> None:
     data = content(60_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         if probed:
             know(connection, profile)
         await trio.sleep(5)
@@ -119,7 +115,7 @@ async def test_what_interrupts_it_is_bridged(
         if interruption == "reboot":
             assert True in source.rollbacks
             assert connection.store.traits.wo_truncates is None
-    assert here.tree.data(path(profile, "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -128,8 +124,8 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
 ) -> None:
     """The upload goes on at once, in a session that is forgotten when the boot time tells of the restart."""
     data = content(80_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         await trio.sleep(5)
         async with under_way(connection, profile, data):
             here.vehicle.reboot(trio.current_time(), beat_after=0.9)
@@ -137,15 +133,15 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
             began = trio.current_time()
         assert connection.vehicle.reboots == 1
         assert trio.current_time() - began < 9
-    assert here.tree.data(path(profile, "new")) == data
-    assert here.vehicle.server.open_sessions == 0
+    assert here.data(b"/d/new") == data
+    assert here.server.open_sessions == 0
 
 
 async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(autojump: MockClock) -> None:
     """PX4 says NAK 2 with errno 0 to a write whose session another ground station reset meanwhile."""
     data = content(60_000)
-    here = world("px4", PLAIN)
-    server = here.vehicle.server
+    here = Rig("px4", {b"/d": None}, PLAIN)
+    server = here.server
     outgoing, refused = server.outgoing, []
 
     def without_errno(now: float) -> list[tuple[Address, bytes]]:
@@ -158,22 +154,22 @@ async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(aut
         return replies
 
     server.outgoing = without_errno  # type: ignore[method-assign]
-    async with here.connection() as connection, under_way(connection, "px4", data) as source:
+    async with here.connected() as connection, under_way(connection, "px4", data) as source:
         wire = request(77, Opcode.RESET_SESSIONS).encode()
         server.handle(wire, Address(255, 190), trio.current_time())
         here.link.kick()
     assert refused
     assert source.all_proven
-    assert here.tree.data(path("px4", "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 @pytest.mark.holds("rule 14.23")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
-    here = world(profile, PLAIN)
-    here.tree.capacity = 5_000
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    here.card.capacity = 5_000
+    faults = here.faults
+    async with here.connected() as connection:
         source = MemorySource(content(9_000))
         upload = await start(connection, profile, source)
         silent = PROFILES[profile].family is Family.ARDUPILOT  # partly written, ACKed: the size tells later
@@ -184,11 +180,11 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
         assert faults.requests.count(Opcode.CREATE_FILE) <= 2
         assert not source.all_proven
         assert source.proven.end <= 5_000 + (238 if silent else 0) + 239
-        here.tree.capacity = None
+        here.card.capacity = None
         await upload.finish()
         assert source.all_proven or profile.startswith("mavsdk")
         await upload.end()
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 class FailingSource(MemorySource):
@@ -208,8 +204,8 @@ class FailingSource(MemorySource):
 async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
     profile: str, bad: int, probed: bool, autojump: MockClock
 ) -> None:
-    here = world(profile, PLAIN, other=b"of another file")
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d/other": b"of another file"}, PLAIN)
+    async with here.connected() as connection:
         if probed:
             know(connection, profile)
         source = FailingSource(content(9_000))
@@ -226,16 +222,16 @@ async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
         await upload.finish()
         assert source.all_proven
         await upload.end()
-    assert here.tree.data(path(profile, "new")) == bytes(source.content)
-    assert here.vehicle.server.open_sessions == 0
+    assert here.data(b"/d/new") == bytes(source.content)
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump: MockClock) -> None:
     data = content(60_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         source = MemorySource(data)
         upload = await start(connection, profile, source)
         async with trio.open_nursery() as nursery:
@@ -258,16 +254,16 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
             began = trio.current_time()
         assert trio.current_time() - began < 1
         await trio.sleep(0.5)
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
         with pytest.raises(Armed):
             await upload.finish()
         with pytest.raises(Armed):
             await connection.store.remove(path(profile, "new"))
         with pytest.raises(Armed):
             await start(connection, profile, MemorySource(b"x"), "other")
-        written = len(here.tree.data(path(profile, "new")))
+        written = len(here.data(b"/d/new"))
         await trio.sleep(20)
-        assert len(here.tree.data(path(profile, "new"))) == written
+        assert len(here.data(b"/d/new")) == written
         here.vehicle.disarm()
         here.link.kick()
         await trio.sleep(20)  # by itself
@@ -282,16 +278,16 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
             await upload.finish()
         await upload.end()
         assert source.in_flight.empty
-    assert here.tree.data(path(profile, "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 async def test_when_armed_ok_writes_in_flight(autojump: MockClock) -> None:
-    here = world("px4")
+    here = Rig("px4", {b"/d": None})
     here.vehicle.arm()
-    async with here.connection(ConnectOptions(when_armed="ok")) as connection:
+    async with here.connected(ConnectOptions(when_armed="ok")) as connection:
         upload = await start(connection, "px4", MemorySource(b"hello"))
         await upload.finish()
-    assert here.tree.data(b"/d/new") == b"hello"
+    assert here.card.data(b"/d/new") == b"hello"
 
 
 @pytest.mark.parametrize("more", [b"", b"more"])
@@ -300,10 +296,10 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
     profile: str, more: bytes, autojump: MockClock
 ) -> None:
     """Nothing was under way just then, and nothing is sent before it is known who is at the other end."""
-    here = world(profile, PLAIN)
+    here = Rig(profile, {b"/d": None}, PLAIN)
     here.link.is_stream = True
     here.vehicle.set_stream(True)
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         await trio.sleep(3)  # it told who it is
         source = MemorySource(content(2_000))
         upload = await start(connection, profile, source)
@@ -323,14 +319,14 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
 
 async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
     """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
-    here = world("ardupilot5", PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("ardupilot5", {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
         source = MemorySource(content(3000))
         upload = await start(connection, "ardupilot5", source)
 
         def break_close() -> None:
-            slot = next(slot for slot in here.vehicle.server.firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
+            slot = next(slot for slot in here.server.firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
             opened = slot.file
 
             def close() -> None:
@@ -346,13 +342,13 @@ async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
         assert not source.all_proven
         await upload.finish()
         assert source.all_proven
-    assert here.tree.data(b"/d/new") == bytes(source.content)
+    assert here.card.data(b"/d/new") == bytes(source.content)
 
 
 async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: MockClock) -> None:
     data = content(200_000)
-    here = world("px4", LinkSettings(rate=1_000.0, delay=0.05))
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, LinkSettings(rate=1_000.0, delay=0.05))
+    async with here.connected() as connection:
         know(connection, "px4")
         source = MemorySource(data)
         upload = await start(connection, "px4", source)
@@ -366,8 +362,8 @@ async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: Mock
 async def test_with_another_client_about_silence_is_not_survived(probed: bool, autojump: MockClock) -> None:
     """After a gap the one session may be the other client's: writing on would damage its file."""
     data = content(60_000)
-    here = world("mavsdk", PLAIN)
-    async with here.connection() as connection:
+    here = Rig("mavsdk", {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         if probed:
             know(connection, "mavsdk")
         async with under_way(connection, "mavsdk", data) as source:
@@ -381,15 +377,15 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool, a
         assert source.all_proven
         assert source.checkpoints == 2
         assert source.rollbacks == [True]
-    assert here.tree.data(path("mavsdk", "new")) == data
+    assert here.data(b"/d/new") == data
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, autojump: MockClock) -> None:
     """A write that is refused wherever it is tried ends in its refusal, after few attempts."""
-    here = world(profile, PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
 
         async def steal_always() -> None:
             while True:
@@ -409,9 +405,9 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_finish_again_after_success_sends_only_what_is_new(profile: str, autojump: MockClock) -> None:
-    here = world(profile, PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
         know(connection, profile)
         source = MemorySource(content(1000))
         upload = await start(connection, profile, source)
@@ -427,15 +423,15 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, a
         again = PROFILES[profile].write_only_truncates
         assert faults.requests.count(Opcode.WRITE_FILE) == (5 if again else 1)
         assert source.all_proven
-    assert here.tree.data(path(profile, "new")) == bytes(source.content)
+    assert here.data(b"/d/new") == bytes(source.content)
 
 
 async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock) -> None:
     """Bytes that come while another caller's Terminate is under way are not covered by it."""
-    here = world("px4", LinkSettings(rate=60_000.0, delay=0.3))
-    faults = Faults(here)
+    here = Rig("px4", {b"/d": None}, LinkSettings(rate=60_000.0, delay=0.3))
+    faults = here.faults
     proven: list[int] = []
-    async with here.connection() as connection:
+    async with here.connected() as connection:
         know(connection, "px4")
         source = MemorySource(b"first")
         upload = await start(connection, "px4", source)
@@ -451,40 +447,40 @@ async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock)
             await upload.finish()
             proven.append(source.proven.total)
     assert proven == [5, 12]
-    assert here.tree.data(b"/d/new") == b"first second"
+    assert here.card.data(b"/d/new") == b"first second"
 
 
 async def test_nothing_is_created_before_there_is_something(autojump: MockClock) -> None:
-    here = world("px4")
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None})
+    async with here.connected() as connection:
         source = MemorySource()
         upload = await start(connection, "px4", source)
         await trio.sleep(10)
-        assert [entry.name for entry in here.tree.entries(b"/d")][2:] == []
+        assert [entry.name for entry in here.card.entries(b"/d")][2:] == []
         await upload.finish()  # an empty file was wanted, then
-        assert here.tree.data(b"/d/new") == b""
+        assert here.card.data(b"/d/new") == b""
 
 
 async def test_a_file_that_shrank_between_two_openings_is_sent_again(autojump: MockClock) -> None:
-    here = world("px4", PLAIN)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         know(connection, "px4")
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
         await upload.finish()
-        here.tree.open(b"/d/new", write=True).resize(100)
+        here.card.open(b"/d/new", write=True).resize(100)
         source.add(b"more")
         upload.wake()
         await upload.finish()
         assert source.rollbacks[0] is True
-    assert here.tree.data(b"/d/new") == bytes(source.content)
+    assert here.card.data(b"/d/new") == bytes(source.content)
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, autojump: MockClock) -> None:
-    here = world("px4", PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
         if probed:
             know(connection, "px4")
         source = MemorySource(content(3000))
@@ -498,9 +494,9 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, au
 
 async def test_a_terminate_done_twice_is_done(autojump: MockClock) -> None:
     """The first one's reply is lost, and a listing in between ends PX4's replay: NAK 4 to the second."""
-    here = world("px4", PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
         faults.lose_reply_to(Opcode.TERMINATE_SESSION)
@@ -518,9 +514,9 @@ async def test_a_terminate_done_twice_is_done(autojump: MockClock) -> None:
 
 
 async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
-    here = world("px4", PLAIN)
-    faults = Faults(here)
-    async with here.connection() as connection:
+    here = Rig("px4", {b"/d": None}, PLAIN)
+    faults = here.faults
+    async with here.connected() as connection:
         know(connection, "px4")
         source = MemorySource(content(20_000))
         upload = await start(connection, "px4", source)
@@ -535,7 +531,7 @@ async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
         assert source.rollbacks == [False]
         assert source.all_proven
         assert faults.requests.count(Opcode.CREATE_FILE) == 0
-    assert here.tree.data(b"/d/new") == bytes(source.content)
+    assert here.card.data(b"/d/new") == bytes(source.content)
 
 
 @pytest.mark.parametrize("pause", [0.02, 1.0], ids=["while it is opened", "while it is sent"])
@@ -543,20 +539,20 @@ async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
 async def test_abort_leaves_nothing_open_and_asks_for_nothing(
     profile: str, pause: float, autojump: MockClock
 ) -> None:
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         source = MemorySource(content(60_000))
         upload = await start(connection, profile, source)
         await trio.sleep(pause)
         await upload.end()
         await upload.end()
         assert source.in_flight.empty
-        assert here.vehicle.server.open_sessions == 0
+        assert here.server.open_sessions == 0
         left = source.todo.total
         await trio.sleep(5)
         assert source.todo.total == left
         assert upload not in connection.scheduler.users
-    assert here.vehicle.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("leaves", [False, True])
@@ -565,17 +561,17 @@ async def test_who_stops_waiting_does_not_stop_the_upload_and_who_leaves_termina
     profile: str, leaves: bool, autojump: MockClock
 ) -> None:
     data = content(40_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
+    here = Rig(profile, {b"/d": None}, PLAIN)
+    async with here.connected() as connection:
         source = MemorySource(data)
         upload = await start(connection, profile, source)
         with trio.move_on_after(1) as impatience:
             await upload.finish()
         assert impatience.cancelled_caught
-        assert here.vehicle.server.open_sessions == 1
+        assert here.server.open_sessions == 1
         if not leaves:
             await trio.sleep(20)
             assert source.all_proven
-            assert here.vehicle.server.open_sessions == 0
-            assert here.tree.data(path(profile, "new")) == data
-    assert here.vehicle.server.open_sessions == 0
+            assert here.server.open_sessions == 0
+            assert here.data(b"/d/new") == data
+    assert here.server.open_sessions == 0

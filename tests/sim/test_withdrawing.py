@@ -11,7 +11,7 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError, NotFound
 from tests.support.rigs import KINDS, Rig, card, read_file
-from tests.support.worlds import content
+from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("promise 2", "promise 3")
 

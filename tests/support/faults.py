@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, Payload, decode_request
-from tests.support.worlds import World
+from mavftpfs.sim.vehicle import FtpServer
 
 _OPCODE, _REQ_OPCODE = 3, 5
-LOST = 400
-"""Bytes that a card forgets: less than a sector."""
 
 
 @dataclass
@@ -38,17 +36,16 @@ class _Meeting:
 
 
 class Faults:
-    """Stands between a world's vehicle and its FTP server.
+    """Stands before a simulated vehicle's FTP server.
 
     Attributes:
         requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
         spoil: in so many more WriteFiles the first byte arrives as another one.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, server: FtpServer) -> None:
         self.requests: list[int] = []
         self.refused: list[int] = []
-        self._world = world
         self._cut_after: int | None = None
         self._lose: list[int] = []
         self._deaf: set[int] = set()
@@ -57,7 +54,6 @@ class Faults:
         self._naks: list[tuple[Address, bytes]] = []
         self.spoil = 0
         self._repeated: set[int] = set()
-        server = world.vehicle.server
         self._handle, self._outgoing = server.handle, server.outgoing
         server.handle = self._on_request  # type: ignore[method-assign]
         server.outgoing = self._on_replies  # type: ignore[method-assign]
@@ -160,21 +156,3 @@ def _refusal(request: Payload, data: bytes) -> bytes:
         (request.seq + 1) & 0xFFFF, request.session, Opcode.NAK, len(data), request.opcode, data=data
     )
     return reply.encode()
-
-
-def power_goes_at_close(world: World, *, downtime: float, beat_after: float) -> None:
-    """Have the vehicle restart where the next TerminateSession comes; it forgets the end of the file."""
-    server = world.vehicle.server
-    handle = server.handle
-
-    def power_cut(wire: bytes, source: Address, now: float) -> None:
-        if wire[_OPCODE] != Opcode.TERMINATE_SESSION:
-            handle(wire, source, now)
-            return
-        server.handle = handle  # type: ignore[method-assign]
-        [path] = server.open_paths
-        data = bytes(world.tree.data(path))
-        world.vehicle.reboot(now, downtime, beat_after=beat_after)
-        world.tree.add(path, data[:-LOST] + bytes(LOST))
-
-    server.handle = power_cut  # type: ignore[method-assign]

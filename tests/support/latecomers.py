@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
-from tests.support.worlds import World
+from tests.support.rigs import Rig
 
 _OPCODE = 3
 
@@ -20,7 +20,7 @@ class Latecomer:
 
     def __init__(
         self,
-        world: World,
+        here: Rig,
         what: Opcode,
         *,
         after: Opcode,
@@ -28,13 +28,12 @@ class Latecomer:
         first: bool = False,
     ) -> None:
         self.late: float | None = None
-        self._world = world
+        self._here = here
         self._what, self._after, self._left = what, after, nth
         self._first = first
         self._kept: tuple[bytes, float] | None = None
-        server = world.vehicle.server
-        self._handle = server.handle
-        server.handle = self._on_request  # type: ignore[method-assign]
+        self._handle = here.server.handle
+        here.server.handle = self._on_request  # type: ignore[method-assign]
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         self._handle(wire, source, now)
@@ -45,6 +44,6 @@ class Latecomer:
             if self._left == 0:
                 self.late = now - self._kept[1]
                 self._handle(self._kept[0], source, now)
-                self._world.link.kick()
+                self._here.link.kick()
         if wire[_OPCODE] == self._what and not (self._first and self._kept is not None):
             self._kept = (wire, now)

@@ -1,8 +1,8 @@
 """A vehicle whose answers can be changed, over any link, and frames for forgers.
 
-`LyingServer` is a simulated server with two hooks. `lie_for` puts one into a `World` (in memory, on the
-test's clock); `LyingVehicle` runs one in a thread and speaks UDP or TCP, as a vehicle of the mount tier does.
-`frame`, `heartbeat` and `ftp` build MAVLink by hand, for a socket that pretends to be the vehicle.
+`LyingServer` is a simulated server with two hooks; each `Rig` has one. `LyingVehicle` runs one in a thread
+and speaks UDP or TCP, as a vehicle of the mount tier does. `frame`, `heartbeat` and `ftp` build MAVLink by
+hand, for a socket that pretends to be the vehicle.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload, decode_request
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
+from mavftpfs.sim.linkmodel import LinkModel
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import Tree
 from mavftpfs.sim.vehicle import FtpServer, SimVehicle
 from tests.support.memory import MemoryLink
 from tests.support.replies import decode_reply
-from tests.support.worlds import World
 
 _FTP = (110, 84)
 _HEARTBEAT = (0, 50)
@@ -56,6 +56,9 @@ class LyingServer(FtpServer):
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Take a request."""
+        if self.change is None and self.answer is None:
+            super().handle(wire, source, now)
+            return
         request = decode_request(wire)
         self._asked[request.seq] = request
         replies = None if self.answer is None else self.answer(request)
@@ -73,11 +76,14 @@ class LyingServer(FtpServer):
     def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
         """Return the replies to send now, as the hooks want them."""
         forged, self._forged = self._forged, []
+        honest = super().outgoing(now)
+        if self.change is None:
+            return forged + honest
         out = forged
-        for target, wire in super().outgoing(now):
+        for target, wire in honest:
             reply = decode_reply(wire)
             request = self._asked.get((reply.seq - 1) & 0xFFFF)
-            if self.change is None or request is None:
+            if request is None:
                 out.append((target, wire))
             else:
                 out += [(target, changed.encode()) for changed in self.change(request, reply)]
@@ -86,15 +92,6 @@ class LyingServer(FtpServer):
     def next_deadline(self) -> float | None:
         """Return when something is to be sent."""
         return self._forged_at if self._forged else super().next_deadline()
-
-
-def lie_for(world: World) -> LyingServer:
-    """Put a lying server in the place of a world's own, before anything was asked, and return it."""
-    vehicle = world.vehicle
-    server = LyingServer(world.tree, vehicle.profile, rng=random.Random(world.seed))
-    server.firmware.tx_room = vehicle.server.firmware.tx_room
-    vehicle.server = server
-    return server
 
 
 class CrowdedLink(MemoryLink):
@@ -106,14 +103,13 @@ class CrowdedLink(MemoryLink):
         answered: where our frames go.
     """
 
-    def __init__(self, world: World, address: NetAddress) -> None:
-        super().__init__(world.vehicle, world.model)
+    def __init__(self, vehicle: SimVehicle, model: LinkModel, address: NetAddress) -> None:
+        super().__init__(vehicle, model)
         self.address = address
         self.mirrors: list[NetAddress] = []
         self.answered: NetAddress | None = None
         self._queue: list[tuple[NetAddress, bytes]] = []
         self._senders: list[NetAddress] = []
-        world.link = self
 
     def intrude(self, address: NetAddress, frame: bytes) -> None:
         """Let somebody else send a datagram."""

@@ -1,10 +1,12 @@
-"""A simulated vehicle with a mount, in memory and on virtual time, and all that a test may do to the two.
+"""A simulated vehicle, a link to it, a connection and mounts, in memory and on virtual time, and all that a
+test may do to them.
 
     async with rig("px4", {FILE: b"content"}) as here:
         tree = here.mount(verify="size")
 
 `card` makes a fixture of it. Paths are the mount's: where only a part of the card may be written (px4-nuttx),
-that part is the root of the mount. What happens to single requests is `here.faults`.
+that part is the root of the mount. What happens to single requests is `here.faults`. What goes through the
+session alone, by `here.connection.store`, is in `transfers`.
 """
 
 from __future__ import annotations
@@ -23,15 +25,21 @@ from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import subscribe
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
-from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
-from mavftpfs.sim.tree import Kind
+from mavftpfs.sim.tree import Kind, MemoryTree
+from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.faults import Faults
-from tests.support.lying import LyingServer, lie_for
-from tests.support.worlds import DEFAULTS, GOOD_LINK, ROOTS, World, wall
+from tests.support.lying import LyingServer
+from tests.support.memory import MemoryLink
+from tests.support.transfers import ROOTS
+
+GOOD_LINK = LinkSettings()
+DEFAULTS = ConnectOptions()
+EPOCH = 1_700_000_000.0
 
 KINDS = ("px4", "px4-nuttx", "ardupilot5", "littlefs", "mavsdk")
 """One profile of each kind that is written differently: a rename over a file replaces it; it removes the file
@@ -40,28 +48,53 @@ first; it is refused (FAT); nothing can be renamed; and OpenFileWO empties files
 RENAMING = tuple(name for name in KINDS if PROFILES[name].storage is not Storage.LITTLEFS)
 
 
+def wall() -> float:
+    """Return the card's time of day: it goes on with the test's clock, so a write changes the mtime."""
+    try:
+        return EPOCH + trio.current_time()
+    except RuntimeError:  # it is made before the test's clock runs
+        return EPOCH
+
+
 class Rig:
-    """One vehicle, one connection to it, and any number of trees over that.
+    """One vehicle, one link, one connection at a time, and any number of trees over that.
 
     Attributes:
-        server: its answers may be changed. faults: what happens to single requests.
+        card: what the vehicle has. server: its answers may be changed.
+        faults: what happens to single requests.
         invalidated: paths whose pages the kernel was told to drop.
     """
 
     def __init__(
-        self, profile: str, files: Mapping[bytes, bytes], link: LinkSettings = GOOD_LINK, **world: Any
+        self,
+        profile: str,
+        files: Mapping[bytes, bytes | None] | None = None,
+        link: LinkSettings = GOOD_LINK,
+        *,
+        seed: int = 1,
+        telemetry: float = 0.0,
+        serial: bool = False,
+        card: MemoryTree | None = None,
     ) -> None:
-        """`world`: more of World."""
-        self.world = World(profile, link, **world)
+        """files: None for a directory. telemetry: bytes per second. serial: the link is a serial port."""
+        self.profile = profile
         self.root = ROOTS.get(profile, b"")
-        self.world.tree.add_directory(self.root or b"/")
-        for path, data in files.items():
-            self.put(path, data)
-        self.server: LyingServer = lie_for(self.world)
-        self.faults = Faults(self.world)
+        self.card = card or MemoryTree(clock=wall)
+        self.vehicle = SimVehicle(self.card, PROFILES[profile], rng=Random(seed), telemetry=telemetry)
+        self.server = LyingServer(self.card, PROFILES[profile], rng=Random(seed))
+        self.vehicle.server = self.server
+        self.faults = Faults(self.server)
+        self.model = LinkModel(Random(seed + 1), link)
+        self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []
         self.connection: Connection
         self.nursery: trio.Nursery
+        self.card.add_directory(self.root or b"/")
+        for path, data in (files or {}).items():
+            if data is None:
+                self.put_directory(path)
+            else:
+                self.put(path, data)
 
     # --- this side
 
@@ -69,11 +102,13 @@ class Rig:
     async def connected(
         self, options: ConnectOptions = DEFAULTS, *, seed: int = 7
     ) -> AsyncIterator[Connection]:
-        """Connect; a second time is another process, after the first one was killed."""
-        connection = self.world.connection(options, seed=seed)
-        async with connection as self.connection, trio.open_nursery() as self.nursery:
-            yield self.connection
-            self.nursery.cancel_scope.cancel()
+        """Connect and wait for the first heartbeat; a second time is another process, after the first one was
+        killed."""
+        async with connected(self.link, options, rng=Random(seed)) as self.connection:
+            await self.connection.ready(30.0)
+            async with trio.open_nursery() as self.nursery:
+                yield self.connection
+                self.nursery.cancel_scope.cancel()
 
     def mount(
         self, *, seed: int = 1, spool: SpoolDirectory | None = None, keep: Any = None, **options: Any
@@ -93,33 +128,42 @@ class Rig:
         subscribe(self.connection, tree)
         return tree
 
+    @asynccontextmanager
+    async def mounted(self, listed: bytes | None = None, **options: Any) -> AsyncIterator[Tree]:
+        """Connect and mount. listed: a directory that is listed first. options: as for `mount`."""
+        async with self.connected():
+            tree = self.mount(**options)
+            if listed is not None:
+                await tree.list(listed)
+            yield tree
+
     @property
     def renames(self) -> bool:
         """Whether the card can rename."""
-        return self.world.profile in RENAMING
+        return self.profile in RENAMING
 
     # --- the card
 
     def put(self, path: bytes, data: bytes, mtime: int | None = None) -> None:
         """Put a file there, as others would; into the file that is there, if one is."""
-        self.world.tree.add(self.root + path, data, mtime)
+        self.card.add(self.root + path, data, mtime)
 
     def replace(self, path: bytes, data: bytes, mtime: int | None = None) -> None:
         """Move another file over it, as others would: who has the old one open keeps it."""
         self.put(b"/another", data, mtime)
-        self.world.tree.rename(self.root + b"/another", self.root + path)
+        self.card.rename(self.root + b"/another", self.root + path)
 
     def put_directory(self, path: bytes) -> None:
         """Make a directory and those above it."""
-        self.world.tree.add_directory(self.root + path)
+        self.card.add_directory(self.root + path)
 
     def take(self, path: bytes) -> None:
         """Remove a file, as others would."""
-        self.world.tree.remove(self.root + path)
+        self.card.remove(self.root + path)
 
     def data(self, path: bytes) -> bytes:
         """Return what a file on the card holds."""
-        return self.world.tree.data(self.root + path)
+        return self.card.data(self.root + path)
 
     def files(self) -> dict[bytes, bytes]:
         """Return every file on the card, those under names of ours included."""
@@ -135,7 +179,7 @@ class Rig:
         return [path for path in self.files() if is_reserved(split(path)[1])]
 
     def _below(self, folder: bytes) -> Iterator[tuple[bytes, Kind]]:
-        for entry in self.world.tree.entries(self.root + folder):
+        for entry in self.card.entries(self.root + folder):
             if entry.name not in (b".", b".."):
                 path = folder.rstrip(b"/") + b"/" + entry.name
                 yield path, entry.stat.kind
@@ -150,7 +194,7 @@ class Rig:
 
     async def lose(self) -> None:
         """Cut the link, and wait until the vehicle counts as lost: no heartbeat came, and no answer."""
-        self.world.link.cut()
+        self.link.cut()
         await self._until(lambda: self.connection.store.why_lost() is not None)
         for _ in range(2):
             with suppress(RequestTimeout, VehicleLost):
@@ -158,27 +202,27 @@ class Rig:
 
     async def find(self) -> None:
         """Mend the link, and wait until the vehicle is heard."""
-        self.world.link.restore()
+        self.link.restore()
         await self._until(lambda: self.connection.store.why_lost() is None)
 
     async def arm(self) -> None:
         """Have the vehicle armed, and wait until that is known."""
-        self.world.vehicle.arm()
-        self.world.link.kick()
+        self.vehicle.arm()
+        self.link.kick()
         await self._until(lambda: self.connection.vehicle.armed)
 
     async def disarm(self) -> None:
         """Have it disarmed, and wait until that is known."""
-        self.world.vehicle.disarm()
-        self.world.link.kick()
+        self.vehicle.disarm()
+        self.link.kick()
         await self._until(lambda: not self.connection.vehicle.armed)
 
     async def reboot(self) -> None:
         """Restart the vehicle, and wait until that is known."""
         await trio.sleep(5.0)  # a boot time has to go back by some seconds to tell of a restart
         before = self.connection.vehicle.reboots
-        self.world.vehicle.reboot(trio.current_time())
-        self.world.link.kick()
+        self.vehicle.reboot(trio.current_time())
+        self.link.kick()
         await self._until(lambda: self.connection.vehicle.reboots > before)
 
     async def _until(self, done: Callable[[], bool]) -> None:
@@ -192,14 +236,14 @@ class Rig:
 @asynccontextmanager
 async def rig(
     profile: str = "px4",
-    files: Mapping[bytes, bytes] | None = None,
+    files: Mapping[bytes, bytes | None] | None = None,
     *,
     link: LinkSettings = GOOD_LINK,
     options: ConnectOptions = DEFAULTS,
-    **world: Any,
+    **more: Any,
 ) -> AsyncIterator[Rig]:
-    """Connect to a vehicle that has these files. world: as for Rig."""
-    here = Rig(profile, files or {}, link, **world)
+    """Connect to a vehicle that has these files. more: as for Rig."""
+    here = Rig(profile, files, link, **more)
     async with here.connected(options):
         yield here
 

@@ -17,8 +17,7 @@ from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.client.trace import JsonTrace, TlogWriter
 from mavftpfs.mount.daemon import log_to_file
 from mavftpfs.mount.farewell import keep_the_rest
-from tests.support.mounting import mounted
-from tests.support.worlds import world
+from tests.support.rigs import Rig
 from tests.unit.test_daemon import restored_logging
 
 pytestmark = pytest.mark.holds("promise 10")
@@ -81,8 +80,8 @@ def test_what_is_kept_of_files_is_private(tmp_path: Path) -> None:
 
 
 async def test_what_could_not_be_delivered_is_private(autojump_clock: MockClock, tmp_path: Path) -> None:
-    state, made = tmp_path / "state", world("px4")
-    async with mounted(made) as (_, tree):
+    state, made = tmp_path / "state", Rig("px4", {b"/d": None})
+    async with made.mounted() as tree:
         file = await tree.create(b"/d/f", exclusive=True)
         await file.write(0, b"precious")
         made.link.cut()

@@ -122,7 +122,7 @@ async def test_a_file_is_never_listed(here: Rig, tree: Tree) -> None:
 async def test_a_refused_directory_is_looked_for_again(px4: Rig) -> None:
     tree = px4.mount()
     await tree.stat(b"/fs/microsd")
-    px4.world.tree.rename(b"/fs/microsd", b"/elsewhere")
+    px4.card.rename(b"/fs/microsd", b"/elsewhere")
     with pytest.raises(FtpNak):
         await tree.list(b"/fs/microsd")
     asked = listed(px4)
@@ -260,7 +260,7 @@ async def test_a_root_that_no_listing_shows_may_be_listed(px4: Rig) -> None:
     hide(px4, b"Dfs\0")
     tree = px4.mount(root=b"/fs/microsd")
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
-    px4.world.tree.rename(b"/fs", b"/elsewhere")
+    px4.card.rename(b"/fs", b"/elsewhere")
     await px4.reboot()
     with pytest.raises(FtpNak):
         await tree.list(b"/")

@@ -17,7 +17,7 @@ from mavftpfs.shared.errors import (
     SessionLost,
 )
 from tests.support.replies import ack, nak, sent
-from tests.support.sources import MemorySource
+from tests.support.transfers import MemorySource
 
 CONTENT = random.Random(5).randbytes(239 * 6 + 11)
 
