@@ -262,7 +262,7 @@ def made(profile: str, settings: LinkSettings | None = None) -> Rig:
 @pytest.mark.holds("promise 4")
 async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> None:
     here = made("mavsdk", RADIO)
-    here.card.add(D + b"/long", bytes(900_000))
+    here.card.add(D + b"/long", content(300_000))
     async with here.mounted(D) as tree:
         file = await tree.open(D + b"/long", write=True)
         await file.write(100, b"s" * 1000)
