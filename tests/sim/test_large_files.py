@@ -84,7 +84,7 @@ class HugeTree(MemoryTree):
 async def huge(profile: str) -> AsyncIterator[OpenFile]:
     """Open such a file."""
     path = b"/d/huge"
-    async with rig(profile, {path: b""}, link=LinkSettings(delay=0.01), tree=HugeTree()) as here:
+    async with rig(profile, {path: b""}, link=LinkSettings(delay=0.01), card=HugeTree()) as here:
         tree = here.mount(cache_size=1 << 20)
         assert (await tree.stat(path)).size == SIZE
         file = await tree.open(path)
