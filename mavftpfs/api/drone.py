@@ -33,7 +33,7 @@ def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
 
     Raises:
         TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
-        opened. UsageError (a ValueError): of source or options, which it names.
+        opened. UsageError (a ValueError): source or an option is wrong; the text names it.
     """
     return Drone(source, LoopThread(lambda: vehicle.connect(source, use_mount=use_mount, **options), source))
 
@@ -67,7 +67,8 @@ class Drone:
         return self._drone.has_open_files
 
     def close(self) -> None:
-        """Close the vehicle's session. What is written and still open is withdrawn, and named in the log."""
+        """Close the vehicle's session. Files that were written and are still open are withdrawn, and named in
+        the log."""
         self._loop.close()
 
     def __enter__(self) -> Drone:
@@ -81,7 +82,7 @@ class Drone:
         self.close()
 
     def __del__(self) -> None:
-        """Have it closed, and wait for nothing."""
+        """Have it closed, and do not wait."""
         loop = getattr(self, "_loop", None)
         if loop is not None and not loop.closed:
             loop.stop()
@@ -97,7 +98,7 @@ class Drone:
         return self._loop.call(self._drone.stat, path)
 
     def scandir(self, path: PathLike = "/") -> Iterator[Entry]:
-        """Yield what is in a directory. A listing that did not come whole is an error."""
+        """Yield what is in a directory. An incomplete listing is an error."""
         return iter(self._loop.call(self._drone.scandir, path))
 
     def listdir(self, path: PathLike = "/") -> list[str]:
@@ -129,7 +130,7 @@ class Drone:
         return self._loop.call(self._drone.status)
 
     def refresh(self) -> None:
-        """Have the vehicle asked again for what is remembered of it; others may have changed it."""
+        """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
         self._loop.call(self._drone.refresh)
 
     # --- parameters
@@ -209,7 +210,7 @@ class Drone:
 
         try:
             self._loop.call(work)
-        except BaseException:  # Ctrl-C may come when it is open already
+        except BaseException:  # Ctrl-C may come after it was opened
             for one in opened:
                 self._loop.post(one.abandon)
             raise

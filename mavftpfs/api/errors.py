@@ -1,4 +1,4 @@
-"""What programs are told: OSErrors of the right kind, with the sentence that people get. Layer: api."""
+"""Errors for programs: OSErrors of the right kind, with the sentence that people get. Layer: api."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["NotDelivered", "UsageError", "os_error", "translated"]
 
 
 class NotDelivered(OSError):
-    """A file that was written is not on the vehicle, or not provably.
+    """A file that was written is not on the vehicle, or that is not proven.
 
     It is also of the kind of its reason: a TimeoutError, a PermissionError.
 
     Attributes:
         on_vehicle: what is there now. True: the file as it was written. False: what was there before, or
-            nothing; what was written is withdrawn, and nothing of it is sent later. None: nobody can tell.
+            nothing; what was written is withdrawn, and nothing of it is sent later. None: that is not known.
     """
 
     on_vehicle: bool | None = None
 
 
 def os_error(error: MavftpfsError) -> Exception:
-    """Return what a program is told in the place of an error of ours.
+    """Return the error that a program gets in place of one of ours.
 
     A UsageError stays one, which is a ValueError, unless the operating system is behind it.
     """
@@ -44,7 +44,7 @@ def os_error(error: MavftpfsError) -> Exception:
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Raise errors of ours in the body as what programs are told."""
+    """Turn errors of ours in the body into those that programs get."""
     try:
         yield
     except MavftpfsError as exc:
@@ -53,7 +53,7 @@ def translated() -> Iterator[None]:
 
 
 def whereabouts(there: bool | None) -> str:
-    """Return what is said of a file that was not delivered; see NotDelivered.on_vehicle."""
+    """Return the words about a file that was not delivered; see NotDelivered.on_vehicle."""
     if there is None:
         return "nobody can tell what is on the vehicle now: look before you use it"
     if there:

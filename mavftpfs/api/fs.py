@@ -144,7 +144,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
             return _info(drone.stat(self._strip_protocol(path)))
 
     def exists(self, path: str, **kwargs: Any) -> bool:
-        """Return whether there is something of that name; an error that says nothing of that is raised."""
+        """Return whether there is something of that name; raise an error that does not tell."""
         with self._connection.used() as drone:
             return drone.exists(self._strip_protocol(path))
 
@@ -187,11 +187,11 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
             return drone.crc32(self._strip_protocol(path))
 
     def close(self) -> None:
-        """Close the connection now, if nobody uses it."""
+        """Close the connection now, if no call uses it."""
         self._connection.close()
 
     def invalidate_cache(self, path: str | None = None) -> None:
-        """Have the vehicle asked again for what is remembered of it."""
+        """Forget what is remembered of the vehicle, so that it is asked again."""
         super().invalidate_cache(path)
         if self._connection.open:
             with self._connection.used() as drone:
@@ -234,7 +234,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
                 drone.rename(old, new)
 
     def cp_file(self, path1: str, path2: str, **kwargs: Any) -> None:
-        """Copy a file, by way of this computer; of a directory the name only."""
+        """Copy a file, by way of this computer; a directory is only made."""
         old, new = self._strip_protocol(path1), self._strip_protocol(path2)
         with self._connection.used() as drone:
             if drone.is_dir(old):

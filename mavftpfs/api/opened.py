@@ -19,7 +19,7 @@ PIECE = 1 << 20
 
 
 class Opened:
-    """An open file. All raise OSErrors (see api.errors), and run in the event loop but `size`.
+    """An open file. All methods raise OSErrors (see api.errors). All but `size` run in the event loop.
 
     Attributes:
         name: for people. writable: whether it may be changed by this. there: after a close that was
@@ -39,7 +39,7 @@ class Opened:
 
     @property
     def closed(self) -> bool:
-        """Whether it is closed, and what was to be said of that was."""
+        """Whether it is closed, and any error of that was raised."""
         return self._closed
 
     @property
@@ -82,7 +82,7 @@ class Opened:
                 raise
 
     async def close(self) -> None:
-        """Have what was written on the card, checked; or have nothing of it there, and say so.
+        """Deliver what was written; or have nothing of it on the card, and raise NotDelivered.
 
         Raises:
             NotDelivered.
@@ -103,15 +103,15 @@ class Opened:
         self.there = there
 
     def _require_whole(self) -> None:
-        """A part of what was to be written is not to pass for the whole."""
+        """Raise the error of an earlier write: a part of the file must not pass for the whole."""
         if isinstance(self._failure, MavftpfsError):
             raise self._failure
         if self._failure is not None:
             raise MavftpfsError(f"{self.name}: writing it was interrupted")
 
     async def abandon(self) -> None:
-        """Close it without delivering what was written, which is withdrawn, or said where it cannot be. Twice
-        is harmless; raises nothing of ours."""
+        """Close it, and withdraw what was written; log it if that cannot be done. Twice is harmless. Raises
+        no MavftpfsError."""
         if self._closed:
             return
         self._closed = True

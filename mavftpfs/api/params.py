@@ -24,7 +24,7 @@ async def get_values(session: Session) -> dict[str, Number]:
 
 
 def _number(one: Parameter) -> Number:
-    """Return a value; of a 32-bit float the shortest decimal that gives it: 0.1, not 0.10000000149."""
+    """Return a value; for a 32-bit float its shortest decimal: 0.1, not 0.10000000149."""
     text = client.value_text(one)
     return float(text) if one.kind is Kind.FLOAT else int(text)
 
@@ -37,11 +37,12 @@ def _text(name: str, value: Number) -> str:
 
 
 async def set_values(session: Session, values: Mapping[str, Number]) -> None:
-    """Set parameters; each is read back. Those that hold already are not sent.
+    """Set parameters; each is read back. Values that the vehicle has already are not sent.
 
     Raises:
         UsageError: a name that the vehicle does not have, or a value that is no number: nothing is set.
-        InvalidText: one that does not fit: likewise. NotTaken: some do not hold; the text names them.
+        InvalidText: a value does not fit: nothing is set. NotTaken: the vehicle did not take some; the text
+            names them.
     """
     lines = client.assignments([f"{name}={_text(name, value)}" for name, value in values.items()])
     wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
@@ -57,8 +58,9 @@ async def set_values(session: Session, values: Mapping[str, Number]) -> None:
 
 
 class Params(Mapping[str, Number]):
-    """The parameters of a Drone. Each look at one asks for all, which takes a moment: `dict(drone.params)` is
-    for many. Setting one, or several by `update`, is back when the vehicle has it, read back."""
+    """The parameters of a Drone. Reading one asks the vehicle for all, which takes a moment: use
+    `dict(drone.params)` for many. Setting one, or several by `update`, returns when the new values were read
+    back."""
 
     def __init__(
         self, read: Callable[[], dict[str, Number]], write: Callable[[Mapping[str, Number]], None]
@@ -98,7 +100,7 @@ class Params(Mapping[str, Number]):
         """Set several at once.
 
         Raises:
-            UsageError (a ValueError), OSError of EINVAL: a name or value cannot be, and nothing is set.
-            OSError: some do not hold on the vehicle, and the text names them; EROFS: it is armed.
+            UsageError (a ValueError), OSError of EINVAL: a name or value is invalid, and nothing is set.
+            OSError: the vehicle did not take some, and the text names them; EROFS: it is armed.
         """
         self._write(values)

@@ -1,7 +1,7 @@
 """An event loop in a thread of its own, and calls into it from any other. Layer: api.
 
-What waits can be interrupted: Ctrl-C cancels the call, which then ends in order. What may not wait, a
-finalizer, posts. The thread is a daemon: an interpreter that ends does not wait for it, but closes what is
+A call that waits can be interrupted: Ctrl-C cancels it, and it ends in order. A finalizer may not wait, so it
+posts. The thread is a daemon: when the interpreter ends it does not wait for the thread, but closes what is
 open, for EXIT_PATIENCE at most.
 """
 
@@ -31,7 +31,8 @@ class Portal(Protocol):
         """Have an async function run in the loop; return its result, or raise its error."""
 
     def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """Have it run, and do not wait for it. For finalizers: from any thread, also the loop's, any time."""
+        """Have a function run, and do not wait. For finalizers: from any thread, also the loop's, at any
+        time."""
 
 
 class TaskPortal:
@@ -84,7 +85,7 @@ class _Call(Generic[ResultT]):
             self.done.set()
 
     def result(self) -> ResultT:
-        """Return or raise what came of it."""
+        """Return the result, or raise the error."""
         if self.error is not None:
             raise self.error
         if not self._results:
@@ -160,7 +161,7 @@ class LoopThread(Generic[T]):
             self._calls.discard(call)
 
     def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """See Portal. Does nothing where there is no loop any more."""
+        """See Portal. Does nothing after the loop has ended."""
         if os.getpid() == self._pid and not self._ended.is_set():
             with suppress(trio.RunFinishedError):
                 self._start(_Call(function, args))
@@ -214,7 +215,7 @@ class LoopThread(Generic[T]):
     def _wait(self, call: _Call[Any]) -> None:
         try:
             call.done.wait()
-        except BaseException:  # Ctrl-C: let it end in order. A second one does not wait for that
+        except BaseException:  # Ctrl-C: let the call end in order; a second Ctrl-C does not wait
             if self._token is not None:
                 with suppress(trio.RunFinishedError):
                     self._token.run_sync_soon(call.scope.cancel)
@@ -261,7 +262,7 @@ class LoopThread(Generic[T]):
 
 
 def _first(error: BaseException) -> BaseException:
-    """Return what several errors at once began with."""
+    """Return the first of several errors."""
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
     return error
@@ -271,7 +272,7 @@ _running: set[LoopThread[Any]] = set()
 
 
 def _close_all() -> None:
-    """The interpreter ends: what was not closed is, and its vehicle's session with it."""
+    """Close, as the interpreter ends, all connections that are open, with their vehicles' sessions."""
     loops = [loop for loop in _running if not loop.closed]
     for loop in loops:
         loop.stop()

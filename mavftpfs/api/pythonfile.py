@@ -1,8 +1,8 @@
 """Python's files over an open file of a vehicle. Layer: api.
 
-`RawFile` is the raw one; Python's own buffers and text lie over it. A finalizer must not wait: garbage is
-collected anywhere, also in the event loop's thread. So none of these delivers anything when it is collected
-without having been closed: the raw file posts that it is to be abandoned, and says what is lost.
+`RawFile` has no buffer; Python's own buffers and text lie over it. Garbage is collected in any thread, also
+in the event loop's, so a finalizer must not wait. A file that is collected without having been closed
+delivers nothing: the raw file posts that it is to be abandoned, and says what is lost.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Mode:
         errors: str | None = None,
         newline: str | None = None,
     ) -> None:
-        """Raises: ValueError, LookupError: they cannot be, or contradict one another."""
+        """Raises: ValueError, LookupError: they are invalid, or contradict one another."""
         letters = set(mode)
         kinds = letters & set("rwax")
         known = len(letters) == len(mode) and letters <= set("rwaxbt+")
@@ -71,10 +71,10 @@ class Mode:
 
 
 class _Ending:
-    """How a `with` statement ends that wrote a file."""
+    """How a `with` statement of a written file ends."""
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: Any) -> None:
-        """Close. An interruption of the body stays one, and says what became of the file."""
+        """Close. If the body was interrupted, that error stays, with a note of what became of the file."""
         try:
             self.close()  # type: ignore[attr-defined]
         except NotDelivered as exc:
@@ -137,7 +137,7 @@ class RawFile(_Ending, io.RawIOBase):
 
     def write(self, data: Any, /) -> int:
         """Take all of it; see Opened.write."""
-        taken = bytes(memoryview(data))  # whoever interrupts the call may change the buffer while it is read
+        taken = bytes(memoryview(data))  # a copy: the program may interrupt the call, and change the buffer
         self._require(self._mode.writes, "writable")
         at = None if self._mode.plain[0] == "a" else self._at
         self._at = self._portal.call(self._opened.write, at, taken)
@@ -183,7 +183,7 @@ class RawFile(_Ending, io.RawIOBase):
             raise
 
     def __del__(self) -> None:
-        """Post what is left to do, and wait for nothing."""
+        """Post the rest of the work, and do not wait."""
         if self.closed or getattr(self, "_pid", None) != os.getpid():
             return
         super().close()

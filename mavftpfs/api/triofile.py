@@ -14,8 +14,8 @@ ResultT = TypeVar("ResultT")
 
 
 class AsyncFile:
-    """An open file, binary or text. Where trio.open_file's would go on and deliver though its task is
-    cancelled, this one is closed without delivery, and what was written is withdrawn.
+    """An open file, binary or text. If its task is cancelled it is closed without delivery, and what was
+    written is withdrawn; a file of trio.open_file would go on and deliver.
 
     Attributes:
         wrapped: the file of which these are the methods.

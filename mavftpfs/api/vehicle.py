@@ -35,13 +35,13 @@ from mavftpfs.shared.readable import name_text
 
 log = logging.getLogger("mavftpfs.api")
 logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
-"""What the caches warn of is raised, too: a program that set up no logging reads it once."""
+"""The caches' warnings are raised as errors, too: a program without logging sees them once."""
 
 PathLike = str | bytes | os.PathLike[str]
 """A path on the vehicle. A relative one begins at the root."""
 
 NEVER_LOCAL = ""
-"""local=: an editor's swap file may stay in a mount's memory; what a program writes is meant for the card."""
+"""local=: a mount keeps editors' swap files in memory, but a program's files are meant for the card."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def names_directory(path: PathLike) -> bool:
 
 
 def entry(path: bytes, stat: Stat) -> Entry:
-    """Return what a program is told of a path."""
+    """Return what a program gets for a path."""
     mtime = None if known_time(stat.mtime) is None else stat.mtime_ns / 1e9
     name = split(path)[1]
     return Entry(os.fsdecode(name), os.fsdecode(path), stat.size, mtime, stat.kind)
@@ -119,7 +119,7 @@ class Drone:
         return bool(self._opened)
 
     async def _existing(self, path: PathLike) -> bytes:
-        """Return a path as the client has it, after a look if it ends in a slash: then it is no file's.
+        """Return a path as the client has it. If it ends in a slash, it is checked that it is no file.
 
         Raises:
             NotADirectory, NotFound: it ends in a slash.
@@ -142,7 +142,7 @@ class Drone:
             return entry(wanted, await self._files.stat(wanted))
 
     async def scandir(self, path: PathLike = "/") -> list[Entry]:
-        """Return what is in a directory. A listing that did not come whole is an error.
+        """Return what is in a directory. An incomplete listing is an error.
 
         Raises:
             FileNotFoundError, NotADirectoryError.
@@ -198,7 +198,7 @@ class Drone:
             return dict(await self._status())
 
     async def refresh(self) -> None:
-        """Have the vehicle asked again for what is remembered of it; others may have changed it."""
+        """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
         self._files.forget_caches()
 
     # --- parameters
@@ -207,7 +207,7 @@ class Drone:
         """Return all parameters, in the vehicle's order.
 
         Raises:
-            FileNotFoundError: it does not show them by MAVLink FTP.
+            FileNotFoundError: the vehicle does not offer them by MAVLink FTP.
         """
         with translated():
             return await params.get_values(self._session)
@@ -317,7 +317,8 @@ class Drone:
     ) -> list[Path]:
         """Fetch a file, or with `recursive` a directory, proven; return what came.
 
-        A file goes into `local` if that is a directory, else under that name. All else goes into `local`.
+        A file goes into `local` if that is a directory, else it gets that name. A directory goes into
+        `local`.
 
         Raises:
             OSError: something did not come; the text says how much did.
@@ -432,7 +433,7 @@ class Drone:
         return opened
 
     async def close_files(self) -> None:
-        """Close what is open, take back what was written to it, and say so."""
+        """Close the open files, take back what was written to them, and log it."""
         for opened in list(self._opened):
             if opened.writable:
                 log.error("%s was not closed: what was written to it is withdrawn", opened.name)
@@ -452,7 +453,7 @@ def _ignore(told: object) -> None:
 
 @asynccontextmanager
 async def connect(source: str, *, use_mount: bool = True, **options: object) -> AsyncIterator[Drone]:
-    """Give a vehicle's files to the body; back when its session is closed.
+    """Give a vehicle's files to the body; return after its session is closed.
 
     source: as for `mavftpfs`: a link (`udpin:0.0.0.0:14550`, `/dev/ttyACM0`), or where it is mounted. A mount
     of that vehicle that is up is used, unless `use_mount` is False. options: those of a mount, by name:
@@ -460,7 +461,7 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
 
     Raises:
         TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
-        opened. UsageError (a ValueError): of source or options, which it names.
+        opened. UsageError (a ValueError): source or an option is wrong; the text names it.
     """
     with translated():
         target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))

@@ -1,7 +1,7 @@
 """The hub: sockets around the router. Layer: hub.
 
-It ends with its last client. While an armed vehicle and an endpoint that is heard need it, it stays: the link
-of a ground station outlives the mount.
+It ends with its last client. But it stays while a vehicle is armed and an endpoint is heard: the link of a
+ground station outlives the mount.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
 log = logging.getLogger("mavftpfs.hub")
 
 QUIET = 0.1
-"""Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for."""
+"""Seconds of silence within a frame after which the rest of a stream's frame is not waited for."""
 ACTIVE = 10.0
 """Seconds for which an endpoint that was heard keeps the hub up, while a vehicle is armed."""
 FIRST_PATIENCE = 10.0
@@ -73,7 +73,8 @@ class _Client:
 
 @dataclass(slots=True)
 class _Endpoint:
-    """A ground station's side, or whatever else `forward=` names. link: None while it cannot be opened."""
+    """The side of a ground station, or of another program that `forward=` names. link: None while it cannot
+    be opened."""
 
     side: int
     text: str
@@ -113,7 +114,7 @@ class Hub:
         self._said_doubles: set[Address] = set()
 
     async def run(self, first: socket.socket | None, on_ready: Callable[[], None]) -> None:
-        """Serve until nobody needs us any more. first: a client that waits already."""
+        """Serve until the hub is not needed any more. first: a client that waits already."""
         async with AsyncExitStack() as stack:
             stack.callback(self._door.remove)
             port = self._port = await stack.enter_async_context(open_link(self.spec, self._inherited))
@@ -124,7 +125,7 @@ class Hub:
                 if first is not None:
                     nursery.start_soon(self._serve, first, nursery)
                 on_ready()
-                # The one that had the port until now keeps the address that it has.
+                # The program that had the port until now keeps its address.
                 with trio.move_on_after(FIRST_PATIENCE):
                     await self._came.wait()
                 nursery.start_soon(self._accept, nursery)
@@ -165,7 +166,7 @@ class Hub:
             if client is not None:
                 self._leave(client)
             elif not self._came.is_set():
-                self._ended.set()  # the client that we were started for does not stay
+                self._ended.set()  # the client that started the hub does not stay
                 self._came.set()
 
     async def _answered(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
@@ -220,8 +221,8 @@ class Hub:
         return client
 
     def _granted(self, wanted: Address, number: int | None) -> tuple[Address, int]:
-        """Return the address that a client gets, and the link id of its signatures: what it asks for, unless
-        another one has it."""
+        """Return the address that a client gets, and the link id of its signatures: those that it asks for,
+        unless another client has them."""
         now = trio.current_time()
         owns = {client.own for client in self._clients.values()}
         for _ in range(255):
@@ -386,7 +387,7 @@ class Hub:
                 endpoint.link.send_nowait(frames)
 
     def _send_to_client(self, client: _Client, messages: Sequence[bytes]) -> None:
-        """A client that does not take what it gets loses it, as on a full socket of its own."""
+        """Send messages to a client. It loses those for which its socket is full, as on a port of its own."""
         for message in messages:
             try:
                 client.sock.send(message)
@@ -435,7 +436,7 @@ class Hub:
     # -- the end
 
     async def _watch(self) -> None:
-        """Look each second whether anybody needs us; say what should not be."""
+        """Check each second whether the hub is still needed, and warn of second vehicles."""
         while True:
             self._end_if_done()
             for sender, where in self.router.doubles.items():
@@ -458,7 +459,7 @@ class Hub:
         return heard is not None and trio.current_time() - heard < ACTIVE
 
     def _is_needed(self) -> bool:
-        """Return whether a ground station flies a vehicle over us."""
+        """Return whether a ground station controls an armed vehicle through the hub."""
         return any(self.router.armed.values()) and any(map(self._is_active, self._endpoints.values()))
 
     def status(self) -> dict[str, Any]:

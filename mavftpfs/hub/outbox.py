@@ -1,8 +1,8 @@
 """What waits to go out over the port, and which frame is next. Layer: hub; pure.
 
-Forwarded frames and frames of our own programs take turns, and so do the sides among them: a forwarded frame
-waits for at most one frame of ours, whatever else is queued. On a serial port no more is handed to the kernel
-than the line carries in 50 ms, since nothing overtakes what the kernel has.
+Forwarded frames and frames of our own programs go out alternately, and so do the sides among each. So a
+forwarded frame waits for at most one frame of ours, whatever is queued. On a serial port no more is handed to
+the kernel than the line carries in 50 ms, since nothing overtakes what the kernel has.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from mavftpfs.hub.routing import Place
 
 LINE_TIME = 0.05
-"""Seconds of a serial line that may be in the kernel."""
+"""Seconds of a serial line's rate that may be queued in the kernel."""
 _BITS_PER_BYTE = 10
 
 
@@ -69,7 +69,7 @@ class Outbox:
 
 
 class Line:
-    """When a line takes more. baud: None where the kernel's own word is enough (sockets, USB)."""
+    """When a line takes more. baud: None where the kernel itself tells (sockets, USB)."""
 
     def __init__(self, baud: int | None) -> None:
         self._rate = None if baud is None else baud / _BITS_PER_BYTE
@@ -80,6 +80,6 @@ class Line:
         return self._busy_until - LINE_TIME
 
     def sent(self, size: int, now: float) -> None:
-        """So many bytes were handed to the kernel."""
+        """Note that so many bytes were handed to the kernel."""
         if self._rate is not None:
             self._busy_until = max(now, self._busy_until) + size / self._rate

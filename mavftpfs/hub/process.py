@@ -16,7 +16,7 @@ from mavftpfs.link.uri import parse_source
 
 
 def serve(source: str, inherited: Sequence[int], on_ready: Callable[[], None]) -> None:
-    """Be the hub of a port until nobody needs it, or a signal ends it.
+    """Be the hub of a port until it is not needed any more, or a signal ends it.
 
     inherited: the descriptors of the first client's connection, of the door, and of the port.
 

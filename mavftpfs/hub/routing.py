@@ -3,11 +3,12 @@
 Frames come from *sides* and go to sides: the port that SOURCE names (side 0), an endpoint, a client. A side
 may have several *places*: the network addresses that are heard there.
 
-- A sender counts from where it was first heard, as on a port of one's own (link.addresses). So a loop of
-  cables and forwards ends here: what comes back by another way is not believed.
-- A frame for somebody goes where that one was heard; a frame for all, or for one that was never heard, goes
-  to all other sides. It never goes to a side where its sender was heard.
-- Clients are programs of ours. Each gets what concerns its vehicle, and its frames go to its vehicle.
+- A sender counts only from where it was first heard, as on a port of our own (link.addresses). So a loop of
+  cables and forwards ends here: a frame that comes back by another way is not believed.
+- A frame with a target goes where the target was heard. A frame for all, or for a target that was never
+  heard, goes to all other sides. No frame goes to a side where its sender was heard.
+- Clients are programs of ours. Each gets the frames that concern its vehicle, and its frames go to its
+  vehicle.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ PORT = 0
 ALL = 0
 """The focus of a client that does not know its vehicle yet."""
 BEATS = -1
-"""The focus of a client that wants to know what is there, and no more."""
+"""The focus of a client that wants only heartbeats."""
 
 BEAT_PERIOD = 0.5
 """Seconds between two heartbeats of one sender that clients with another vehicle get."""
 MEMORY = 60.0
-"""Seconds for which a place that fell silent still gets what goes to all."""
+"""Seconds for which a place that fell silent still gets the frames for all."""
 _MOST_PLACES = 64
 _MOST_SENDERS = 64
 """Of one side."""
@@ -49,7 +50,7 @@ class Kind(Enum):
 
 
 class Place(NamedTuple):
-    """A side, and an address there; None where the side has only one, or it is the side's own business."""
+    """A side, and an address there; None where the side has only one, or chooses it itself."""
 
     side: int
     address: NetAddress | None
@@ -57,8 +58,8 @@ class Place(NamedTuple):
 
 @dataclass(slots=True)
 class _Side:
-    """fixed: all that is sent there goes to one address. focus: the system that a client is about.
-    answers: the address that a client sends to."""
+    """fixed: all frames go there to one address. focus: the system that concerns a client. answers: the
+    address that a client sends to."""
 
     kind: Kind
     fixed: bool
@@ -87,12 +88,12 @@ class Router:
     # -- sides
 
     def add(self, side: int, kind: Kind, *, fixed: bool) -> None:
-        """A side is there. fixed: its frames have one way out, whatever the address."""
+        """Add a side. fixed: its frames have one way out, whatever the address."""
         self._sides[side] = _Side(kind, fixed)
         self._plans.clear()
 
     def remove(self, side: int) -> None:
-        """A side is gone, and what was heard there."""
+        """Forget a side, and what was heard there."""
         del self._sides[side]
         for sender, places in list(self._elsewhere.items()):
             for place in [place for place in places if place.side == side]:
@@ -102,17 +103,17 @@ class Router:
         self._plans.clear()
 
     def focus(self, side: int, system: int) -> None:
-        """A client is about one system from now on, or ALL, or BEATS."""
+        """Only one system concerns a client from now on, or ALL, or BEATS."""
         self._sides[side].focus = system
         self._plans.clear()
 
     def answer(self, side: int, address: NetAddress | None) -> None:
-        """A client knows at which address its vehicle is."""
+        """Note the address of a client's vehicle."""
         self._sides[side].answers = address
         self._plans.clear()
 
     def taken(self, wanted: Address, now: float) -> bool:
-        """Return whether somebody uses a MAVLink address."""
+        """Return whether a program uses a MAVLink address."""
         return wanted in self._elsewhere or self._book.place_of(wanted, now) is not None
 
     def heard_at(self, side: int) -> float | None:
@@ -127,7 +128,7 @@ class Router:
         if not self._is_believed(frame, place, side.kind, now):
             if side.kind is not Kind.PORT or frame.source in self._elsewhere:
                 return ()
-            # Which of two vehicles is the mounted one each client judges for itself, by unique ids.
+            # Each client judges by unique ids which of two vehicles is the mounted one.
             return tuple(self._clients(frame, place, now))
         if place.address not in side.heard:
             self._welcome(place.address, side, now)
@@ -144,7 +145,7 @@ class Router:
         return plan
 
     def _is_believed(self, frame: Frame, place: Place, kind: Kind, now: float) -> bool:
-        """Return whether a frame counts that came from a place, and note its sender."""
+        """Return whether a frame from a place is believed, and note its sender."""
         sender, book = frame.source, self._book
         if kind is Kind.PORT:
             others = self._elsewhere.get(sender)
@@ -162,7 +163,7 @@ class Router:
                 self._plans.clear()
             return True
         if book.place_of(sender, now) is not None:
-            return False  # it comes back, or says that it is the vehicle
+            return False  # it comes back, or claims to be the vehicle
         places = self._elsewhere.get(sender)
         if places is not None and place in places:
             places[place] = now
@@ -175,7 +176,8 @@ class Router:
         return True
 
     def _make_room(self, side: int) -> None:
-        """Forget the sender that was silent for longest, where a side has too many: it makes them up."""
+        """If a side has too many senders, because it makes them up, forget the one that was silent for
+        longest."""
         heard = [
             (at, sender, place)
             for sender, places in self._elsewhere.items()
@@ -250,7 +252,7 @@ class Router:
         """Yield the clients that a frame concerns."""
         kind, heartbeat = self._sides[place.side].kind, frame.id == HEARTBEAT_ID
         if kind is not Kind.PORT and frame.id != FTP_MESSAGE_ID:
-            # Vehicles are on the port. Ours need not hear of each other, but of ground stations.
+            # Vehicles are on the port. Clients need to hear of ground stations, but not of each other.
             station = heartbeat and kind is Kind.ENDPOINT and armed_by(frame) is None
             if not station:
                 return

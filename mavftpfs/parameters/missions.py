@@ -6,8 +6,8 @@ options, first item, items) and 38 bytes an item, those of MAVLink's MISSION_ITE
 longitude are degrees times ten million, x and y of local frames metres times ten thousand, and plain
 numbers where the command has no place.
 
-What a vehicle says of an item is not what it was told: it has no room for all of it. `differences` says
-what counts.
+A vehicle has no room for all of an item, so an item reads back differently. `differences` says which
+differences count.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NO_PLACE = 2**31 - 1
 
 _GLOBAL = frozenset((0, 3, 5, 6, 10, 11))
 _SAME_FRAME = {5: 0, 6: 3, 11: 10}
-"""Frames that mean the same as another, for integers."""
+"""Frames that mean the same as another frame, with integers."""
 _HAS_PLACE = frozenset(
     [
         *(*range(16, 20), *range(21, 26), 31, *range(34, 37), *range(80, 83), 84, 85, 94, 179, 188, 189),
@@ -48,7 +48,7 @@ _HAS_PLACE = frozenset(
 _HEIGHT_STEP = {MISSION: 0.011, FENCE: 0.011, RALLY: 1.0}
 """How exactly a vehicle keeps heights, in metres: centimetres, and whole metres of rally points."""
 _STEP = 1e-4
-"""Of the four parameters, relative; they are 32-bit floats."""
+"""Relative: how exactly a vehicle keeps the four parameters, which are 32-bit floats."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Item:
 
     @property
     def scale(self) -> float:
-        """What x and y are to be divided by to be degrees, metres or plain numbers."""
+        """The number by which x and y are divided to get degrees, metres or plain numbers."""
         if self.command not in _HAS_PLACE:
             return _PLAIN
         return _DEGREES if self.frame in _GLOBAL else _METRES
@@ -136,8 +136,8 @@ def _place_text(value: int, scale: float) -> str:
 
 
 def parse(text: str) -> tuple[list[Item], list[Problem]]:
-    """Read a file. Items are numbered from 0, in the order of their lines: where the first is missing, the
-    next one would be taken for the vehicle's home.
+    """Read a file. Items are numbered from 0, in the order of their lines: if the first is missing, the next
+    one would be taken for the vehicle's home.
     """
     items: list[Item] = []
     problems: list[Problem] = []
@@ -261,7 +261,7 @@ def _item_differences(place: int, wanted: Item, got: Item, kind: int) -> list[Di
 
 
 def _alike(one: float, other: float) -> bool:
-    """Return whether two parameters are equal; what is no number means the vehicle's own value."""
+    """Return whether two parameters are equal; NaN stands for the vehicle's own value."""
     return one != one or math.isclose(one, other, rel_tol=_STEP, abs_tol=_STEP)
 
 

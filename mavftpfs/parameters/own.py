@@ -1,8 +1,8 @@
 """Parameters that the vehicle sets by itself. Layer: parameters; pure.
 
-Counters, what it measures whenever it starts, how many items its missions have, and the format of its
-memory. They are not what anybody restores, and most clients leave them out when they load a file. Source:
-docs/servers.md 17.
+These are counters, values that it measures at each start, the numbers of items in its missions, and the
+format of its memory. No user wants to restore them, and most clients leave them out when they load a file.
+Source: docs/servers.md 17.
 """
 
 from __future__ import annotations

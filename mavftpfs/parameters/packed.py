@@ -6,7 +6,7 @@ one of the length of the name's beginning that it shares with the entry before (
 less one, that rest, the value, and with flag 1 the default. Zeros before an entry are padding. All is
 little-endian.
 
-A vehicle may send anything: what does not add up is an error.
+A vehicle may send anything: a file that does not add up is an error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mavftpfs.shared.errors import RemoteProtocolError
 
 MAGIC = 0x671B
 MAGIC_DEFAULTS = 0x671C
-"""Where defaults may stand behind values."""
+"""Of a file in which defaults may follow values."""
 
 MAX_NAME = 16
 HEADER = struct.Struct("<HHH")
@@ -35,7 +35,7 @@ _VALUES = {
 }
 _BY_TYPE = {int(kind): (kind, WIDTHS[kind], _VALUES[kind].unpack_from) for kind in Kind}
 _NAME = re.compile(rb"(?![^,#=]*[,#=])[!-~]{1,16}")
-"""Without what would end a name in a text."""
+"""Without the characters that would end a name in a text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +107,8 @@ def pack_upload(parameters: Sequence[Parameter]) -> list[bytes]:
     """Return an upload that sets these values, in pieces that are not to be cut: the header with the first
     entry, then one entry each.
 
-    An upload that ends early may be carried out as far as it came (ArduPilot fills the rest with zeros): a
-    value of which only a part came would be set to something else.
+    An upload that ends early may be carried out as far as it came (ArduPilot fills the rest with zeros). A
+    value that came in part would be set to something else.
     """
     entries = list(_entries(parameters))
     length = HEADER.size + sum(map(len, entries))

@@ -1,8 +1,8 @@
-"""What a saved text asks for, and whether it came true. Layer: parameters; pure.
+"""What a saved text asks for, and what the vehicle has of it afterwards. Layer: parameters; pure.
 
-A program that saves a text of all parameters means the lines that it changed: barometers, counters and
-learned values have moved since it read the others. So a save has a *base*, what the same program read
-before, and lines that are as in the base ask for nothing. Without one (`cp`, `>`) every line counts.
+A program that saves a text of all parameters means only the lines that it changed: counters, barometers and
+learned values have changed on the vehicle since it read them. So a save has a *base*: what the same program
+read before. Lines that are as in the base ask for nothing. Without a base (`cp`, `>`) every line counts.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ def unchanged(line: Line, base: Values) -> bool:
 
 
 def pick_base(lines: Sequence[Line], bases: Sequence[Values], *, rereads: bool) -> Values | None:
-    """Return what a text was made from: the base that it shares the most lines with, of several the last.
+    """Return the base that a text was made from: the one with which it shares the most lines, of several the
+    last.
 
-    bases: what the program read, the oldest first. rereads: it was seen to read the file once more as an
-    editor does to make a backup (vim). Without that a text that is wholly an older one is meant as it is:
-    the program knew the last one, and goes back.
+    bases: what the program read, the oldest first. rereads: the program reads the file again to make a
+    backup, as vim does. Else a text that equals an older base is meant as it is: the program knew the last
+    one, and goes back.
     """
     if len(bases) < 2:
         return bases[0] if bases else None
@@ -49,8 +50,9 @@ def pick_base(lines: Sequence[Line], bases: Sequence[Values], *, rereads: bool) 
 class Plan:
     """What is to be done about a text.
 
-    wanted: what is to be set, and does not hold yet. problems: lines that cannot be; conflicts: why nothing
-    is set though the lines are good; either means that nothing is sent. notes: what the user should know.
+    wanted: parameters that are to be set, and that the vehicle does not have yet. problems: invalid lines.
+    conflicts: why nothing is set although the lines are valid. With a problem or a conflict nothing is sent.
+    notes: what the user should know.
     """
 
     wanted: list[Parameter] = field(default_factory=list)
@@ -62,7 +64,7 @@ class Plan:
 def make_plan(lines: Sequence[Line], base: Values | None, current: Values, *, meant: bool) -> Plan:
     """Compare a text with what the vehicle has.
 
-    meant: each line was written by itself (`>>`), so that also a parameter which is the vehicle's own is set.
+    meant: each line was written by itself (`>>`), so even a parameter that the vehicle sets by itself is set.
     """
     plan = Plan()
     left_alone: list[str] = []
@@ -99,7 +101,8 @@ def _conflict(now: Parameter, wanted: Number, before: Number) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of a plan: names that hold, a line for each that does not, and notes."""
+    """What became of a plan: the names that the vehicle took, a line for each one that it did not, and
+    notes."""
 
     taken: list[str]
     missed: list[str]

@@ -42,7 +42,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A line that cannot be. number: of the line, from 1; 0 where it concerns no single line."""
+    """Why a line is invalid. number: of the line, from 1; 0 if it concerns no single line."""
 
     number: int
     reason: str
@@ -54,7 +54,7 @@ def render_all(parameters: Iterable[Parameter]) -> str:
 
 
 def render_changed(parameters: Iterable[Parameter]) -> str:
-    """Return those that differ from their defaults, with these."""
+    """Return the parameters that differ from their defaults, each with its default."""
     lines = [
         f"{one.name},{text_of(one.kind, one.value)} # default {text_of(one.kind, one.default)}\n"
         for one in parameters
@@ -73,7 +73,7 @@ def render_qgc(parameters: Iterable[Parameter], system: int, component: int) -> 
 
 
 def parse(text: str, component: int | None = None) -> tuple[list[Line], list[Problem]]:
-    """Read lines of any spelling. component: the only one whose QGroundControl lines are meant."""
+    """Read lines of any spelling. component: lines of QGroundControl for other components are problems."""
     lines: list[Line] = []
     problems: list[Problem] = []
     for number, raw in enumerate(text.split("\n"), 1):

@@ -54,7 +54,7 @@ class Parameter:
 
     @property
     def changed(self) -> bool:
-        """Whether its default is known and another one."""
+        """Whether its default is known, and differs."""
         return self.default is not None and not same(self.value, self.default)
 
 
@@ -63,7 +63,7 @@ class BadValue(ValueError):
 
 
 def same(one: Number, other: Number) -> bool:
-    """Return whether two values are equal; two that are no number are."""
+    """Return whether two values are equal; two NaN are."""
     return one == other or (one != one and other != other)
 
 
@@ -73,10 +73,9 @@ def text_of(kind: Kind, value: Number) -> str:
 
 
 def float_text(value: float) -> str:
-    """Return the shortest decimal whose nearest 32-bit float is this one, which must be one.
+    """Return the shortest decimal whose nearest 32-bit float is this value, which must be a 32-bit float.
 
-    Six digits always survive the way through a normal float, so no shorter rounding has to be tried: `%g`
-    drops the zeros.
+    Six digits always survive a normal float. So no shorter rounding has to be tried: `%g` drops the zeros.
     """
     if not math.isfinite(value):
         return "nan" if value != value else "inf" if value > 0 else "-inf"
@@ -105,7 +104,7 @@ def parse_number(text: str) -> Number:
     """Read a decimal number: an int where it has neither point nor exponent.
 
     Raises:
-        BadValue: it is none.
+        BadValue: it is no number.
     """
     if not _NUMBER.fullmatch(text.lower()):
         raise BadValue(f"{text!r} is not a number")
