@@ -4,13 +4,14 @@ Servers with one session give it to the client that opens last, or refuse the se
 2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and ArduPilot that
 of a client that paused for 3 s. So nothing is opened while another client may have a file open: from its
 first request that uses a session, until its Terminate or Reset, or 10 s after its last request was heard.
+An open of a file that is not there leaves nothing open, and is often a question: is this name free?
 """
 
 from __future__ import annotations
 
 from math import inf
 
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode
 
 LEFT_OPEN = 10.0
 """Seconds after another client's last request for which its file counts as open. PX4 closes it then; PX4 of
@@ -22,7 +23,7 @@ STAYS_ITS_OWN = 2.5
 OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _USING = OPENING | {Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE}
 _CLOSING = frozenset((Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS))
-_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
+_SESSION, _OPCODE, _REQ_OPCODE, _REASON = 2, 3, 5, 12  # where they are in a payload
 
 
 class OtherClients:
@@ -35,6 +36,7 @@ class OtherClients:
     def __init__(self) -> None:
         self.session: int | None = None
         self._has_file = False
+        self._had_file = False  # before an open that is not answered yet
         self._heard_at = self._answered_at = -inf
         self._answered_since = inf  # without a gap in which its session may have gone
 
@@ -45,11 +47,16 @@ class OtherClients:
         directories makes nobody's bytes doubtful.
         """
         opcode, answered = _opcode_of(payload)
+        had_file = now < self.file_open_until
         self._heard_at = now
         if opcode not in _USING | _CLOSING:
             return None
         self.session = payload[_SESSION]
-        self._has_file = opcode in _USING
+        if _found_nothing(payload):
+            self._has_file = self._had_file
+        else:
+            self._has_file = opcode in _USING
+            self._had_file = had_file if payload[_OPCODE] in OPENING else self._has_file
         if answered and self._has_file:
             if now - self._answered_at >= STAYS_ITS_OWN:
                 self._answered_since = now
@@ -72,6 +79,13 @@ def took_session(payload: bytes) -> bool:
     """Return whether what was heard shows that another client has the session that all share."""
     opcode, answered = _opcode_of(payload)
     return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
+
+
+def _found_nothing(payload: bytes) -> bool:
+    """Return whether this refuses an open because the file is not there. Another refusal may be because a
+    session is taken, whatever it says (docs/servers.md 12)."""
+    refused = payload[_OPCODE] == Opcode.NAK and payload[_REQ_OPCODE] in OPENING
+    return refused and payload[_REASON] == NakCode.FILE_NOT_FOUND
 
 
 def _opcode_of(payload: bytes) -> tuple[int, bool]:

@@ -427,6 +427,25 @@ async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(
         assert opened - done == pytest.approx(1.0 if closes else LEFT_OPEN, abs=0.2)
 
 
+@pytest.mark.holds("promise 6")
+@pytest.mark.parametrize("profile", ONE_SESSION)
+@pytest.mark.parametrize("reads", [True, False])
+async def test_another_clients_open_of_nothing_leaves_what_was_open(
+    reads: bool, profile: str, autojump: MockClock
+) -> None:
+    """Programs ask so whether a name is free: nobody waits for them, but for the file that they read."""
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection:
+        if reads:
+            rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+            await trio.sleep(0.5)
+        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "nothing"), seq=7)
+        await trio.sleep(0.5)
+        began = trio.current_time()
+        assert await read_file(connection, path(profile, "f")) == DATA
+        assert (trio.current_time() - began > LEFT_OPEN - 1.0) is reads
+
+
 @pytest.mark.holds("promise 1", "promise 6")
 @pytest.mark.parametrize("ours", ["reading", "writing"])
 @pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
