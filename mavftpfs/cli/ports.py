@@ -33,7 +33,7 @@ def hub(args: argparse.Namespace) -> int:
         return daemon.in_background(lambda report: _serve(args, report))
     if args.stop:
         return _stop(args)
-    found = [facts for _, facts in _hubs(args.source, {"status": True})]
+    found = statuses(args.source)
     if args.json:
         print(json.dumps(found, indent=2))
         return ExitCode.OK
@@ -43,6 +43,11 @@ def hub(args: argparse.Namespace) -> int:
     if not found:
         print(NOTHING)
     return ExitCode.OK
+
+
+def statuses(source: str | None) -> list[Status]:
+    """Return what each hub says of itself; only that of one SOURCE, if there is one."""
+    return [facts for _, facts in _hubs(source, {"status": True})]
 
 
 def _serve(args: argparse.Namespace, report: daemon.Report) -> int:

@@ -23,7 +23,7 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from tests.mount.conftest import Field
 from tests.support.flown import PARAMETERS
-from tests.support.mounts import Mount, mavftpfs, wait_until
+from tests.support.mounts import Mount, hub_of, mavftpfs, wait_until
 from tests.support.vehicles import HOST, PROJECT, Process, free_udp_port
 
 CONTENT = random.Random(1).randbytes(30_000)
@@ -366,11 +366,6 @@ class Listener:
                     self._sock.sendto(framer.encode_heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID), hub)
 
 
-def hub_facts(source: str) -> dict[str, Any] | None:
-    found: list[dict[str, Any]] = json.loads(mavftpfs("hub", "--json", source)[0])
-    return found[0] if found else None
-
-
 @pytest.mark.parametrize("way", ["umount", "kill"])
 def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) -> None:
     root, port = flown_card(field), free_udp_port()
@@ -386,7 +381,7 @@ def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) 
                 mavftpfs("umount", mount.path)
             until = len(listener.beats) + 4
             wait_until("the station hears it on", lambda: len(listener.beats) >= until)
-            facts = hub_facts(flown.source)
+            facts = hub_of(flown.source)
             assert facts is not None
             assert facts["armed"] == [1]
             said, _ = mavftpfs("hub", "--stop", flown.source, code=1)
@@ -399,7 +394,7 @@ def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) 
             assert len(gaps) >= 6
             assert sorted(gaps)[len(gaps) // 2] < 2, gaps
             mavftpfs("hub", "--stop", "--force", flown.source)
-        wait_until("the hub is gone", lambda: hub_facts(flown.source) is None)
+        wait_until("the hub is gone", lambda: hub_of(flown.source) is None)
 
 
 def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
@@ -409,7 +404,7 @@ def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
         mount = field.mount(flown.source, forwarded(port))
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
         assert mount.unmount() == 0
-        wait_until("the hub ended", lambda: hub_facts(flown.source) is None)
+        wait_until("the hub ended", lambda: hub_of(flown.source) is None)
 
 
 def test_a_killed_hub_comes_back_with_its_endpoints(field: Field) -> None:
@@ -419,7 +414,7 @@ def test_a_killed_hub_comes_back_with_its_endpoints(field: Field) -> None:
         mount = field.mount(flown.source, forwarded(port))
         mount.allowed_log = (r"the hub of .* is gone",)
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
-        facts = hub_facts(flown.source)
+        facts = hub_of(flown.source)
         assert facts is not None
         os.kill(facts["pid"], signal.SIGKILL)
         until = len(listener.beats) + 3

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from mavftpfs.client.status import status_of, with_vehicles
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
@@ -59,8 +60,7 @@ class Mounts(Mount):
 
     def facts(self) -> dict[str, Any]:
         """Return what `status` says of all."""
-        facts: dict[str, Any] = json.loads(mavftpfs("status", "--json", self.path)[0])
-        return facts
+        return dict(with_vehicles(status_of(str(self.path)))[0])
 
     def states(self) -> dict[str, str]:
         """Return what state each vehicle's mount is in."""
@@ -78,7 +78,7 @@ class Mounts(Mount):
 
     def pids(self) -> dict[str, int]:
         """Return the process of each vehicle's mount."""
-        return {Path(one["mountpoint"]).name: one["pid"] for one in self.facts()["vehicles"]}
+        return {Path(one["mountpoint"]).name: one.get("pid", 0) for one in self.facts()["vehicles"]}
 
     def unmount(self) -> int:
         """Unmount all, by our own command."""
@@ -195,7 +195,7 @@ def test_a_killed_mount_of_one_comes_back_and_the_others_go_on(fleet: Fleet) -> 
     fleet.vehicles[2].left_alone = True
     os.kill(before["2"], signal.SIGKILL)
     assert mounts.read_bytes(mounts.path / "1/log/1.bin") == (fleet.cards[1] / "log/1.bin").read_bytes()
-    wait_until("it comes back", lambda: mounts.pids().get("2") not in (None, before["2"]))
+    wait_until("it comes back", lambda: mounts.pids().get("2", 0) not in (0, before["2"]))
     mounts.await_up("2")
     assert mounts.read_bytes(mounts.path / "2/log/1.bin") == (fleet.cards[2] / "log/1.bin").read_bytes()
     assert mounts.pids()["1"] == before["1"]
@@ -264,7 +264,7 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
     for source in (mounts.path, fleet.source):
         found = json.loads(mavftpfs("scan", "--json", source)[0])
         assert [entry["system"] for entry in found if entry["answers"]] == [1, 2]
-    assert len(mounts.facts()["vehicles"]) == 2
+    assert len(json.loads(mavftpfs("status", "--json", mounts.path)[0])["vehicles"]) == 2
     lines = mavftpfs("status", mounts.path)[0].splitlines()
     assert lines[0] == f"{mounts.path}: 2 vehicles of {fleet.source}"
 
@@ -306,7 +306,8 @@ def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
     thread = threading.Thread(target=be_another)
     thread.start()
     try:
-        wait_until("status says it", lambda: "a second vehicle" in mavftpfs("status", mounts.path)[0])
+        wait_until("it is known", lambda: bool(mounts.facts()["vehicles"][0]["link"]["second"]))
+        assert "a second vehicle" in mavftpfs("status", mounts.path)[0]
         assert "a second vehicle" in mavftpfs("scan", fleet.source)[0]
         assert "a second vehicle" in mavftpfs("hub", fleet.source)[0]
         assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()

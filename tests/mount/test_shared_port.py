@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +17,7 @@ from mavftpfs.link.hublink import PROTOCOL, pack_facts
 from mavftpfs.link.rendezvous import HUB, hubs, knock, port_name
 from mavftpfs.link.uri import parse_source
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, wait_until
+from tests.support.mounts import Mount, hub_of, wait_until
 from tests.support.vehicles import HOST, free_udp_port
 
 CONTENT = bytes(range(256)) * 400
@@ -47,12 +46,6 @@ def command(mount: Mount, *words: str, code: int | None = 0) -> str:
     return mount.run(sys.executable, "-m", "mavftpfs", *words, code=code).stdout
 
 
-def hub_of(mount: Mount, source: str) -> dict[str, Any] | None:
-    """Return what the hub of a port says, None if there is none."""
-    found: list[dict[str, Any]] = json.loads(command(mount, "hub", "--json", source))
-    return found[0] if found else None
-
-
 def reads_right(mount: Mount, root: Path) -> bool:
     """Return whether a file is read anew, and right."""
     command(mount, "ls", str(mount.path))
@@ -62,12 +55,11 @@ def reads_right(mount: Mount, root: Path) -> bool:
 def test_two_mounts_and_a_command_share_a_port_that_nobody_configured(field: Field) -> None:
     cards, source = two_vehicles(field)
     one = field.mount(source, "target_system=1")
-    assert hub_of(one, source) is None, "a mount alone has its port itself"
+    assert hub_of(source) is None, "a mount alone has its port itself"
     two = field.mount(source, "target_system=2")
     listed = command(one, "ls", source, "/", "-o", "target_system=2")
     assert "log.bin" in listed
-    facts = hub_of(one, source)
-    assert facts is not None
+    (facts,) = json.loads(command(one, "hub", "--json", source))
     assert len({tuple(client["address"]) for client in facts["clients"]}) == 2
     for mount, root in ((one, cards[0]), (two, cards[1])):
         assert reads_right(mount, root)
@@ -76,7 +68,7 @@ def test_two_mounts_and_a_command_share_a_port_that_nobody_configured(field: Fie
     assert one.unmount() == 0
     assert reads_right(two, cards[1]), "the hub goes on for the other one"
     assert two.unmount() == 0
-    wait_until("the hub ended with its last client", lambda: hub_of(one, source) is None)
+    wait_until("the hub ended with its last client", lambda: hub_of(source) is None)
 
 
 def test_the_hub_is_the_users_alone(field: Field) -> None:
@@ -106,7 +98,7 @@ def test_two_that_begin_at_once_share_the_port(field: Field) -> None:
 def kill_hub(source: str, mounts: list[Mount]) -> None:
     for mount in mounts:
         mount.allowed_log += BEGINNING
-    facts = hub_of(mounts[0], source)
+    facts = hub_of(source)
     assert facts is not None
     os.kill(facts["pid"], signal.SIGKILL)
 
@@ -155,7 +147,7 @@ def test_streams_are_handed_over_too(field: Field, link: str) -> None:
     for mount in (one, two):
         mount.run("cp", root / "log.bin", mount.path / f"{mount.folder.name}.bin")
         assert (root / f"{mount.folder.name}.bin").read_bytes() == (root / "log.bin").read_bytes()
-    assert hub_of(one, source) is not None
+    assert hub_of(source) is not None
     kill_hub(source, [one, two])
     for mount in (one, two):
         wait_until("it reads again", reading_again(mount, root))
@@ -183,4 +175,4 @@ def test_a_client_that_is_gone_before_it_is_let_in_keeps_no_hub_up(field: Field)
         sock.send(pack_facts(hello))
         sock.close()
     assert [one.unmount(), two.unmount()] == [0, 0]
-    wait_until("the hub ended", lambda: hub_of(one, source) is None)
+    wait_until("the hub ended", lambda: hub_of(source) is None)

@@ -280,9 +280,7 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
     part = tmp_path / "a.ulg.part"
 
     def reads() -> int:
-        return sum(
-            transfer["done"] for transfer in json.loads(run("status", "--json", mount.path)[0])["transfers"]
-        )
+        return sum(transfer["done"] for transfer in mount.status()["transfers"])
 
     with started("get", mount.path, "/log/a.ulg", "--to", f"{tmp_path}/"):
         wait_until("some of it is read", lambda: reads() > 50_000)

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mavftpfs.cli import ports
 from mavftpfs.client.control import ControlError, ask, find_socket, own_directories
 from tests.support.logs import assert_clean, suspects
 from tests.support.vehicles import PROJECT, Process
@@ -31,12 +32,17 @@ PATIENCE = 90.0
 def wait_until(what: str, condition: Callable[[], bool], timeout: float = PATIENCE) -> None:
     """Poll until `condition` holds; else fail, saying `what` was awaited.
 
-    A file that the condition looks at and that is not there yet is one more thing to wait for.
+    A file that the condition looks at and that is not there yet is one more thing to wait for. A look that
+    takes long is followed by a pause as long: what is waited for needs the machine, too.
     """
     deadline = time.monotonic() + timeout
-    while not _holds(condition):
-        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
-        time.sleep(0.02)
+    while True:
+        began = time.monotonic()
+        if _holds(condition):
+            return
+        now = time.monotonic()
+        assert now < deadline, f"not within {timeout} s: {what}"
+        time.sleep(max(0.02, now - began))
 
 
 def _holds(condition: Callable[[], bool]) -> bool:
@@ -53,6 +59,12 @@ def mavftpfs(*words: object, code: int = 0, timeout: float = COMMAND_TIMEOUT) ->
     assert done.returncode == code, f"{words}: exit {done.returncode}\n{done.stdout}{done.stderr}"
     assert suspects(done.stderr) == []
     return done.stdout, done.stderr
+
+
+def hub_of(source: str) -> dict[str, Any] | None:
+    """Return what the hub of a port says, None if there is none."""
+    found = ports.statuses(source)
+    return dict(found[0]) if found else None
 
 
 def mounted_at(path: Path) -> bool:
@@ -134,10 +146,10 @@ class Mount:
             return False
         return True
 
-    def status(self) -> dict[str, dict[str, Any]]:
+    def status(self) -> dict[str, Any]:
         """Return what it says of itself."""
         socket = find_socket(os.path.realpath(self.path), own_directories())
-        facts: dict[str, dict[str, Any]] = ask(socket, {"command": "status"}, timeout=20)["status"]
+        facts: dict[str, Any] = ask(socket, {"command": "status"}, timeout=20)["status"]
         return facts
 
     def alive_or_ended(self) -> Process:
