@@ -53,7 +53,7 @@ async def timed() -> AsyncIterator[Rig]:
 
 
 async def test_a_read_larger_than_the_cache_is_served_in_pieces(here: Rig) -> None:
-    big = content(2 * MIB)
+    big = content(MIB + 256 * KIB)
     here.put(b"/big", big)
     tree = here.mount(cache_size=MIB)
     handle = await tree.open(b"/big")
@@ -79,8 +79,8 @@ async def test_a_second_reader_of_the_file_shares_blocks_and_session(here: Rig) 
     assert tree._files.open_versions == {}
 
 
-@pytest.mark.parametrize("end", ["release", "seek"])
-async def test_sequential_reads_fetch_ahead_until_that_is_of_no_use(end: str) -> None:
+async def test_sequential_reads_fetch_ahead_until_somebody_seeks() -> None:
+    """Until the file is closed: tests/sim/test_open_files.py."""
     async with rig(link=LinkSettings(rate=30_000.0, delay=0.02)) as here:
         here.put(b"/big", content(2 * MIB))
         handle = await here.mount().open(b"/big")
@@ -90,7 +90,7 @@ async def test_sequential_reads_fetch_ahead_until_that_is_of_no_use(end: str) ->
         await trio.sleep(2.0)
         assert here.count(READ) > asked + 50
         asked = here.count(READ)
-        await handle.release() if end == "release" else await handle.read(1 * MIB, 239)
+        await handle.read(1 * MIB, 239)
         await trio.sleep(10.0)
         assert here.count(READ) < asked + 50
         await handle.release()
@@ -212,6 +212,18 @@ async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(h
     assert here.count(OPEN) == 1
     await handle.read(512 * KIB, 4 * KIB)
     assert here.count(OPEN) == 2
+
+
+async def test_a_file_that_shrank_before_it_was_opened_again(here: Rig) -> None:
+    tree = here.mount()
+    handle = await open_partly_cached(here, tree)
+    here.put(b"/big", b"short")
+    for at in (512 * KIB, 0):
+        with pytest.raises(FileChanged):
+            await handle.read(at, 4)
+    assert b"/big" in here.invalidated
+    handle.close()
+    assert await read_file(tree, b"/big") == b"short"
 
 
 async def test_closed_files_are_bounded(here: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,9 @@
-"""Who wants the session, who goes first, and when a turn ends."""
+"""Who wants the session, who goes first and when a turn ends, as tables; and what a reader wants of a file."""
 
 from __future__ import annotations
 
 import random
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -10,7 +11,9 @@ import pytest
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import (
     LONG_WAIT,
     MAX_TURN,
@@ -21,6 +24,8 @@ from mavftpfs.session.scheduler import (
     SessionUser,
 )
 from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.extents import ExtentSet
+from tests.support.transfers import MemorySink
 
 
 class NoLink:
@@ -88,3 +93,22 @@ def test_when_a_turn_ends(
     slice_: float, use: float, rival: float, rtt: float | None, gives_way: bool
 ) -> None:
     assert heavy(use).gives_way(rival, 100.0, 100.0 + slice_, rtt) is gives_way
+
+
+# --- a reader
+
+
+def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> None:
+    sink = MemorySink(1000)
+    stream = FileStream(b"/f", sink, 1000, scheduler())
+    stream.want(0, 600, demand=True)
+    stream.want(600, 900, demand=False)
+    for offset, size in ((0, 600), (600, 300)):
+        assert not stream.idle
+        sink.on_data(offset, bytes(size))
+        transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
+        stream._transfer = cast(ReadTransfer, transfer)
+        stream._on_batch(0.0)
+        sink.have = ExtentSet()  # evicted
+        assert stream._demand.empty
+    assert stream.idle
