@@ -228,19 +228,16 @@ def test_a_name_twice_with_one_value_is_one_line() -> None:
     assert parse("A,nan\nA,nan\n")[1] == []
 
 
-# --- which ones the vehicle sets by itself
-
-
 @pytest.mark.parametrize(
-    "name", ["STAT_RUNTIME", "BARO1_GND_PRESS", "CAL_BARO0_OFF", "MIS_TOTAL", "FORMAT_VERSION"]
+    ("names", "own"),
+    [
+        (("STAT_RUNTIME", "BARO1_GND_PRESS", "CAL_BARO0_OFF", "MIS_TOTAL", "FORMAT_VERSION"), True),
+        (("RTL_ALT", "BARO_ALT_OFFSET", "COMPASS_DEC", "MIS_TAKEOFF_ALT", "X_TOTAL"), False),
+    ],
+    ids=["the vehicle's", "the user's"],
 )
-def test_the_vehicle_s_own(name: str) -> None:
-    assert is_own(name)
-
-
-@pytest.mark.parametrize("name", ["RTL_ALT", "BARO_ALT_OFFSET", "COMPASS_DEC", "MIS_TAKEOFF_ALT", "X_TOTAL"])
-def test_not_the_vehicle_s_own(name: str) -> None:
-    assert not is_own(name)
+def test_which_ones_the_vehicle_sets_by_itself(names: tuple[str, ...], own: bool) -> None:
+    assert {name: is_own(name) for name in names} == dict.fromkeys(names, own)
 
 
 # --- how an upload is cut
