@@ -122,6 +122,7 @@ def _parsed(source: str) -> ast.Module:
 Modules = Mapping[str, Module]
 
 
+@cache
 def load_package() -> dict[str, Module]:
     """Read every module of mavftpfs."""
     modules = {}
@@ -247,14 +248,9 @@ def test_each_module_says_its_layer_and_whether_it_is_pure() -> None:
     modules = [
         module for module in load_package().values() if module.name not in {*LAYERS, "__init__", "__main__"}
     ]
-    lost = [module.name for module in modules if f"Layer: {layer_name(module)}" not in headline(module)]
+    lost = [module.name for module in modules if f"Layer: {module.layer}" not in headline(module)]
     assert lost == []
     assert [module.name for module in modules if "; pure" in headline(module) and not is_pure(module)] == []
-
-
-def layer_name(module: Module) -> str:
-    """Return how a docstring names a module's layer."""
-    return module.layer
 
 
 def test_each_dependency_is_known_in_one_place() -> None:

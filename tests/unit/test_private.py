@@ -11,7 +11,6 @@ from random import Random
 import pytest
 from trio.testing import MockClock
 
-from mavftpfs.cache.kept_disk import FileKey, KeptDisk
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.client.trace import JsonTrace, TlogWriter
@@ -71,12 +70,6 @@ def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     assert again.rescue(state / "recovered" / "now")
     assert exposed(state) == []
     again.close()
-
-
-def test_what_is_kept_of_files_is_private(tmp_path: Path) -> None:
-    disk = KeptDisk(tmp_path / "cache", 1 << 20)
-    disk.write(FileKey(b"vehicle", b"/log", 8, "mtime 1").block(0, 8), b"precious")
-    assert exposed(tmp_path / "cache") == []
 
 
 async def test_what_could_not_be_delivered_is_private(autojump_clock: MockClock, tmp_path: Path) -> None:

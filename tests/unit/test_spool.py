@@ -100,44 +100,10 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
     assert content.get(0, len(data) + 4) == data + b"more"
 
 
-def test_no_directory_means_one_that_does_not_stay(tmp_path: Path) -> None:
-    spool = Spool(memory_max=lambda: 0, spool_max=1000)
-    content = SpoolContent(spool)
-    content.put(0, b"abc")
-    place = spool.new_file().parent
-    assert os.stat(place).st_mode & 0o777 == 0o700
-    content.close()
-    assert not place.exists()
-    content = SpoolContent(spool)
-    content.put(0, b"abc")
-    assert content.get(0, 3) == b"abc", "a directory of its own is made anew"
-    content.close()
-
-
 def test_a_directory_that_cannot_be_used_is_no_space(tmp_path: Path) -> None:
     spool = Spool(memory_max=lambda: 0, spool_max=1000, directory=tmp_path / "none")
     with pytest.raises(NoSpace):
         SpoolContent(spool).put(0, b"abc")
-
-
-def test_what_a_killed_mount_left_is_moved_to_recovery(tmp_path: Path) -> None:
-    claimed = SpoolDirectory(tmp_path / "spool", Random(1))
-    assert os.stat(claimed.path).st_mode & 0o777 == 0o700
-    content = SpoolContent(Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=claimed.path))
-    content.put(0, b"precious")
-    facts = {"path": "/card/a/b.txt", "size": 8}
-    content.persist(facts)
-    claimed.close()  # as the kernel does for a killed process
-
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
-    assert again.owner not in again.dead_owners
-    assert claimed.owner in again.dead_owners
-    saved = again.rescue(tmp_path / "recovered")
-    assert [path.name for path in saved] == ["card__a__b.txt"]
-    assert saved[0].read_bytes() == b"precious"
-    assert json.loads((tmp_path / "recovered" / "card__a__b.txt.json").read_text()) == facts
-    assert again.rescue(tmp_path / "recovered") == []
-    again.close()
 
 
 def test_names_in_recovery_do_not_collide_and_unknown_ones_are_kept(tmp_path: Path) -> None:
