@@ -1,4 +1,4 @@
-"""Who wants the session, who goes first and when a turn ends, as tables; and what a reader wants of a file."""
+"""Who wants the session, who goes first and when a turn ends, as tables; what a reader wants of a file."""
 
 from __future__ import annotations
 
