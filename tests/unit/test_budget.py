@@ -40,6 +40,20 @@ def test_nothing_is_saved_up() -> None:
     assert len(spend_all(budget, 100.0, 100.5)) <= 0.5 * 10_000 / COST + 2
 
 
+def test_small_answers_go_ahead_and_bulk_pays() -> None:
+    budget = Budget(5760.0)
+    spend_all(budget, 0.0, 1.0)
+    budget.begin()
+    assert budget.room(1.0, urgent=False) == 0
+    assert budget.exhausted
+    assert budget.room(1.0, urgent=True) >= 1
+    ahead = spend_all(budget, 1.0, 1.001, urgent=True)
+    assert 1 <= len(ahead) <= 4
+    budget.begin()
+    assert budget.room(1.05, urgent=False) == 0
+    assert budget.next_room_at() > 1.05 + 0.05
+
+
 def test_who_has_nothing_to_send_is_not_woken() -> None:
     budget = Budget(1e6)
     budget.begin()
