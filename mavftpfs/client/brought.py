@@ -1,4 +1,4 @@
-"""What was brought into a local directory of logs, and is not to be forgotten: a file in it. Layer: client.
+"""Remembers which logs were brought into a local directory, in a file there. Layer: client.
 
 Each line is a log as JSON; a later line of the same log counts. Lines are only added, so that a power cut
 loses at most the last one.
@@ -16,10 +16,10 @@ NAME = ".mavftpfs-logs"
 """Of the file."""
 
 HEAD = 4096
-"""Bytes by which logs of one name and size are told apart where no time tells them."""
+"""First bytes by which logs of the same name and size are told apart if they have no time."""
 
 _SPARE = 100
-"""Lines that no longer count, beyond which the file is written anew."""
+"""The file is written again when it has more lines than so many that no longer count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Brought:
     file: below the local directory; size: bytes; mtime: seconds UTC, None if unknown.
 
     head: the CRC32 of its first HEAD bytes, None if that was not noted. proven: its checksum was compared, or
-    did not need to be. handed_on: nothing more is to be done with it.
+    did not need to be. handed_on: `--exec` is done with it.
     """
 
     path: str
@@ -68,7 +68,7 @@ class Memory:
         return list(self._logs.values())
 
     def begin(self) -> None:
-        """Have the file be there, by which the directory is known again.
+        """Make the file, which marks the directory.
 
         Raises:
             OSError: the local disk does not take it.
@@ -109,12 +109,12 @@ class Memory:
 
 
 def _line(log: Brought) -> bytes:
-    """Return a log as a line; it begins with an end of line, for the case that the last one was cut."""
+    """Return a log as a line. It begins with a line end, in case the last line was cut."""
     return b"\n" + json.dumps(asdict(log)).encode() + b"\n"
 
 
 def _parsed(line: bytes) -> Brought | None:
-    """Return the log of a line, None where that is not what we write."""
+    """Return the log of a line, None if the line is damaged."""
     try:
         facts: dict[str, Any] = json.loads(line)
         log = Brought(**facts)

@@ -73,7 +73,8 @@ class Space:
 class Attached:
     """A vehicle whose root was listed.
 
-    watcher: to be run by a program that stays. notice: moves what earlier mounts left; gives a line, or "".
+    watcher: to be run by a program that keeps running. notice: moves what earlier mounts left, and returns a
+    line, or "".
     """
 
     connection: Connection
@@ -96,8 +97,8 @@ class Attached:
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """Where what goes over the link is recorded: FTP payloads, and whole frames. tell: says to a person, in a
-    line, what is waited for."""
+    """Where the traffic of the link is recorded: FTP payloads, and whole frames. tell: gets lines for people
+    about what is waited for."""
 
     payload: PayloadTrace | None = None
     frame: Callable[[bytes], None] | None = None
@@ -146,7 +147,7 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other programs of ours.
 
-    beats: only to hear what is there; then it is shared from the beginning.
+    beats: only to hear heartbeats; then the link is shared from the beginning.
 
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
@@ -200,10 +201,10 @@ async def attached(
 ) -> AsyncIterator[Attached]:
     """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
 
-    writing: the tree may be changed, if the options do not forbid it; what it holds then lies in a spool that
-    survives the process. rescue_for: what earlier mounts left there is moved to a recovery directory that is
-    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told.
-    Without it nothing is left there by this one either: what was not delivered is still where it came from.
+    writing: the tree may be changed, if the options do not forbid it. Its held bytes then lie in a spool that
+    survives the process. rescue_for: `Attached.notice` moves what earlier mounts left there to a recovery
+    directory named after this SOURCE. It is called when its line can be shown to a person. Without rescue_for
+    this program leaves nothing in the spool either: its undelivered files are still where they came from.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
@@ -266,7 +267,8 @@ async def with_tree(
 
 
 def others_heard(connection: Connection, options: Options) -> str:
-    """Return a line on vehicles that are heard beside the one that was taken because it came first, or ""."""
+    """Return a line on other vehicles that are heard, if the first one was taken because it came first; else
+    ""."""
     vehicle = connection.vehicle
     if options.target_system or vehicle.address is None:
         return ""
@@ -284,8 +286,8 @@ def others_heard(connection: Connection, options: Options) -> str:
 
 
 def process_name() -> str:
-    """Return what a hub shows people of this program: its name, or the words of a command of ours; and its
-    number."""
+    """Return how a hub names this program to people: its name, or the words of a command of ours; and its
+    process id."""
     path = Path(sys.argv[0] if sys.argv else "")
     name = path.parent.name if path.name == "__main__.py" else path.name
     if name == "mavftpfs":
@@ -314,9 +316,9 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
             await tree.list(ROOT)
             return
     except ListingIncomplete:
-        return  # the program that lists it is told
+        return  # the program that lists it gets the error
     except (RequestTimeout, VehicleLost):
-        pass  # the same to the user: no answer
+        pass  # for the user the same: no answer
     except SessionBusy:
         pass  # as when connect_timeout ends the same wait
     except (NotFound, NotADirectory, FtpNak) as exc:
@@ -329,7 +331,7 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
 
 
 def no_answer(connection: Connection, options: Options) -> NoFtp:
-    """Return what is said when no FTP request was answered within connect_timeout."""
+    """Return the error for no answer to an FTP request within connect_timeout."""
     if connection.scheduler.server.kept_out:
         return NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
     return NoFtp(
@@ -351,7 +353,7 @@ def _flag(connection: Connection) -> str:
 
 
 def subscribe(connection: Connection, tree: Tree) -> None:
-    """Have a tree told what happens to the vehicle and the link."""
+    """Tell a tree what happens to the vehicle and the link, from now on."""
     reactions: dict[str, Callable[[], None]] = {
         "reboot": tree.rebooted,
         "back": tree.link_back,
@@ -422,7 +424,7 @@ def read_key(path: str) -> bytes:
 # -- cache_dir= -----------------------------------------------------------------------------------
 
 DISK_PART = 16
-"""The directory may hold about so many times cache_size: 1 GB, if that is not changed."""
+"""The directory may have about so many times cache_size: 1 GB by default."""
 
 IDENTITY_PATIENCE = 5.0
 """Seconds to wait for AUTOPILOT_VERSION before files are opened: what is read without it is not kept."""
@@ -455,8 +457,8 @@ async def kept_in(place: str, options: CacheOptions, connection: Connection) -> 
 
 
 def identity(connection: Connection) -> bytes | None:
-    """Return what tells the vehicle from others; None before it said so, and after it restarted: then it may
-    be another one, or its firmware."""
+    """Return what tells the vehicle from others; None before the vehicle told it, and after a restart,
+    because vehicle or firmware may be another one."""
     vehicle = connection.vehicle
     if vehicle.version is None or vehicle.reboots:
         return None

@@ -1,4 +1,4 @@
-"""Ways to vehicles that come and go: which are heard, and the files of one of them. Layer: client."""
+"""Ways to vehicles that come and go: which ones are heard, and the files of one of them. Layer: client."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mavftpfs.session.vehicle import Standing
 from mavftpfs.shared.errors import LinkError
 
 TICK = 1.0
-"""Seconds between two looks at what was heard. That the one whose files we have is armed is told at once."""
+"""Seconds between two looks at what was heard. Arming of the vehicle whose files we have is told at once."""
 _POLL = 0.1
 MOUNT_TICK = 0.25
 """Seconds between two questions to a mount: it is to be left within a second of arming."""
@@ -45,7 +45,7 @@ class Hearing(Protocol):
         """The contact is of no use any more."""
 
     def time_passed(self) -> None:
-        """Called every now and then, whatever is heard."""
+        """Called at intervals, whatever is heard."""
 
 
 class Contact(Protocol):
@@ -56,7 +56,7 @@ class Contact(Protocol):
         """The vehicle whose files can be had, None before one was heard."""
 
     async def listen(self, hearing: Hearing) -> None:
-        """Tell what is heard, until cancelled."""
+        """Call `hearing` for all that is heard, until cancelled."""
 
     async def identity(self) -> str | None:
         """Return the unique id of the vehicle whose files can be had, None if it does not tell it."""
@@ -126,14 +126,14 @@ class LinkContact:
 
     async def enter(self, stack: AsyncExitStack) -> Session:
         """See Contact."""
-        options = replace(self.options, cache_dir=None)  # which is filled when it ends: nothing is asked then
+        options = replace(self.options, cache_dir=None)  # it is filled at the end, when nothing may be asked
         vehicle = await stack.enter_async_context(with_tree(self.connection, self.spec, options))
         return session_of(vehicle, self.options)
 
 
 @dataclass(slots=True)
 class MountContact:
-    """A mount that is up. It closes the server's session itself, once nobody uses it."""
+    """A mount that is up. It closes the server's session itself when it is not used."""
 
     session: Session
     system: int | None = None

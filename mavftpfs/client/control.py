@@ -4,8 +4,9 @@ One Unix socket (0600, in a 0700 directory) for each mount, named after a hash o
 request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and
 the session is closed. The server runs under trio; the client is plain blocking code for short-lived commands.
 
-File descriptors are few where a limit is low, and the mount needs them for itself. So at most MAX_CLIENTS
-connections are taken at once, and those that ask nothing are ended when there is no room.
+If the limit is low there are few file descriptors, and the mount needs them for itself. So at most
+MAX_CLIENTS connections are taken at once. When there is no room, connections that have asked nothing are
+ended.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ QUEUE = 128
 MAX_CLIENTS = 16
 """Connections that are taken at once; others wait in the kernel's queue."""
 MAX_IDLE = 4
-"""How many of these may have asked nothing yet before others are taken. A command of ours asks right after
-it has connected."""
+"""So many of these may have asked nothing yet while others are still taken. A command of ours asks right
+after it has connected."""
 IDLE = 0.1
-"""Seconds after which a connection that asked nothing yet is ended where there is no room."""
+"""Seconds after which a connection that has asked nothing is ended if there is no room."""
 _NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
@@ -72,7 +73,7 @@ def socket_name(mountpoint: str) -> str:
 
 
 def usable_directory(directories: list[Path]) -> Path:
-    """Return the first directory that is, or can be made, ours alone.
+    """Return the first directory that is, or can be made, this user's alone.
 
     Raises:
         ControlError: none can.
@@ -154,7 +155,7 @@ class ControlServer:
         return sum(client.idle for client in self._clients)
 
     async def _make_room(self, why: str) -> None:
-        """Wait a moment, and end the connections that ask nothing. Said once in a mount."""
+        """Wait a moment, and end the connections that have asked nothing. The log says so once in a mount."""
         if not self._crowded:
             self._crowded = True
             log.warning("the control socket is crowded (%s): connections that ask nothing are ended", why)
@@ -281,7 +282,7 @@ def all_sockets(directories: list[Path]) -> Iterator[Path]:
 
 
 def _is_socket(path: Path) -> bool:
-    """Return whether there is a socket, and we may look: another user's directories are as good as none."""
+    """Return whether there is a socket that we may see; False in another user's directories."""
     try:
         return path.is_socket()
     except OSError:

@@ -1,4 +1,4 @@
-"""Brings many files: what is named, or the logs, the newest first; compares logs. Layer: client; silent."""
+"""Brings many files: named ones, or the logs, newest first; compares logs. Layer: client; silent."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/var/APM/lo
 the standard's alias, which shows one of the others again and so comes last."""
 
 NO_LOG = b"LASTLOG.TXT"
-"""ArduPilot keeps the number of its last log beside the logs. It is not to be counted as one."""
+"""ArduPilot keeps the number of its last log in this file. It is no log."""
 
 MAX_TIMEOUTS = 2
-"""Requests of so many files in a row that nobody answered end a run: the others would fare no better."""
+"""A run ends after so many files in a row whose requests timed out: the others would time out, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,9 @@ class Wish:
 class Outcome:
     """How far a run came. place: the directory of logs; here: files that were here already.
 
-    proofs: how those that were looked at were verified. failed: why a file, or what is in a directory, is not
-    here. grown: (bytes that were here, bytes that are) of each that is still growing. differing: what `check`
-    found. checked: it was `check`.
+    proofs: how the compared files were verified. failed: why a file, or the files of a directory, are not
+    here. grown: (bytes that were here, bytes that are here) for each file that is still growing. differing:
+    what `check` found. checked: this was a run of `check`.
     """
 
     place: bytes = b""
@@ -85,13 +85,13 @@ class Outcome:
 
     @property
     def complete(self) -> bool:
-        """Whether everything that was wished for is here, and for `check`, is proven to be the same."""
+        """Whether all wanted files are here; for `check`, whether all are proven to be the same."""
         unproven = self.checked and bool(self.lacking)
         return self.finished and not (self.failed or self.differing or unproven)
 
     @property
     def lacking(self) -> Counter[str]:
-        """Why checksums were not compared though they were to be, and of how many files."""
+        """Why checksums were not compared although they should have been, and for how many files."""
         return Counter(proof.lacking for proof in self.proofs.values() if proof.lacking)
 
     def facts(self) -> dict[str, Any]:
@@ -133,8 +133,8 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Downloads:
-    """Brings files one after the other, and fills `outcome` meanwhile, so that it tells of a run that was
-    ended, too. tell: hears of each that came; complain: in a line of each that did not."""
+    """Brings files one after the other, and fills `outcome` meanwhile, so it is right even for a run that was
+    ended. tell: called for each file that came; complain: called with a line for each that did not."""
 
     fetcher: Fetcher
     outcome: Outcome
@@ -142,11 +142,11 @@ class Downloads:
     complain: Callable[[str], None]
 
     async def sync(self, wish: Wish) -> None:
-        """Bring the logs, and prove those that are here if that is wished for, or was not possible before.
+        """Bring the logs. Also prove the logs that are here, if that is wanted, or was not possible before.
 
         Raises:
             NotFound: no directory of logs. LinkError: the vehicle, or the mount, is gone; UsageError: the
-            local disk is full. RequestTimeout: for MAX_TIMEOUTS files. Of what else fails `complain` hears.
+            local disk is full. RequestTimeout: for MAX_TIMEOUTS files. Other failures go to `complain`.
         """
         logs = await self._logs(wish)
         if wish.dry_run:
@@ -201,7 +201,7 @@ class Downloads:
             self.outcome.differing[log.remote] = f"CRC32 {ours:08x} here, {answer.crc:08x} on the vehicle"
 
     async def _logs(self, wish: Wish) -> list[Wanted]:
-        """Look what logs there are; return those that are wished for, the newest first."""
+        """Find the logs; return the wanted ones, newest first."""
         session = self.fetcher.session
         place, logs, unlisted = await wanted_logs(session, wish, wish.local)
         self.outcome.place = session.on_vehicle(place)
@@ -210,7 +210,8 @@ class Downloads:
         return logs
 
     def _to_be_proven(self, log: Wanted, memory: Memory) -> bool:
-        """Return whether a log that is here is compared: all are to be, or its checksum could not be had."""
+        """Return whether a log that is here is compared: all logs are, or its checksum could not be had
+        before."""
         verify: Verify = self.fetcher.verify
         known = memory.of(None, self._path(log))
         unproven = known is not None and not known.proven and known.size == log.size
@@ -230,9 +231,8 @@ class Downloads:
     async def get(self, paths: Sequence[bytes], local: Path, *, into: bool, recursive: bool) -> None:
         """Fetch files, and with `recursive` directories; names may be patterns.
 
-        Where things go depends on what is asked for only, but for one file: it goes into `local` if that is a
-        directory, else under that name. All else goes into `local`, which is made. What a pattern matches
-        goes there with its directories, from the first wildcard on.
+        One file goes into `local` if that is a directory, else it gets that name. All else goes into `local`,
+        which is made. Files that match a pattern go there with their directories, from the first wildcard on.
 
         Raises:
             UsageError: two files would get one local name; nothing was fetched. Else as Fetcher.fetch where
@@ -257,7 +257,8 @@ class Downloads:
     async def _found(
         self, path: bytes, top: bytes, local: Path, *, into: bool, recursive: bool
     ) -> list[Wanted]:
-        """Return the files of a path, for which there are directories then; `local` stands for `top`."""
+        """Make the local directories for the files of a path, and return the files; `local` stands for
+        `top`."""
         session = self.fetcher.session
         stat = await session.files.stat(path)
         name = os.fsdecode(path.removeprefix(top).lstrip(b"/"))
@@ -314,7 +315,7 @@ class Downloads:
         self.tell(fetched)
 
     def fail(self, path: bytes, error: MavftpfsError, name: str = "", *, alone: bool = False) -> None:
-        """Say it and go on, or end where the others would fare no better, or where there are none."""
+        """Complain and go on; or raise the error, if the other files would fail, too, or there are none."""
         self.outcome.failed[path] = error
         if alone or isinstance(error, LinkError | LocalDiskFull):
             raise error
@@ -356,7 +357,7 @@ def _made(session: Session, path: bytes, place: Path, found: Found) -> list[Want
 
 
 def named(name: bytes | str, error: MavftpfsError) -> str:
-    """Return an error with the name of what it is about, which some have already."""
+    """Return an error's text with the name of its file; some texts have it already."""
     shown, text = name if isinstance(name, str) else name_text(name), str(error)
     return text if shown in text else f"{shown}: {text}"
 
@@ -381,7 +382,7 @@ def _require_no_file(local: Path) -> None:
 
 
 async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes, list[Wanted], Unlisted]:
-    """Return where the logs are, those that are wished for, the newest first, and what could not be listed.
+    """Return where the logs are, the wanted ones, newest first, and the directories that could not be listed.
 
     local: the directory into which they are to go.
 
@@ -432,7 +433,7 @@ async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:
 
 
 def _below(root: bytes, place: bytes) -> bytes | None:
-    """Return how a directory of the vehicle is called below the root that is used, None if it is not."""
+    """Return the path of a vehicle's directory below the root that is used, None if it is not below it."""
     if root == place or root.startswith(place + b"/"):
         return b"/"
     if root == b"/":
@@ -441,7 +442,8 @@ def _below(root: bytes, place: bytes) -> bytes | None:
 
 
 def newest_first(logs: Iterable[Wanted]) -> list[Wanted]:
-    """Order logs: by time, then by their numbers. Those without a time come last, then what is no log."""
+    """Order logs by time, then by their numbers. Logs without a time come last, and files that are no logs
+    behind them."""
 
     def age(log: Wanted) -> tuple[bool, int, object]:
         return not log.remote.endswith(NO_LOG), log.mtime or 0, natural(log.remote)

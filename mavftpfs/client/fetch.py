@@ -1,7 +1,7 @@
 """Fetching one file so that it can go on after an interruption, and is proven. Layer: client.
 
-What came lies beside the final name as NAME.part; the final name is given only to a whole file. A .part that
-an earlier run left is gone on with, and then the vehicle's CRC32 of the whole file must agree.
+A file is kept as NAME.part until it is whole; only then it gets its name. If an earlier run left a .part, the
+fetch goes on with it, and then the vehicle's CRC32 of the whole file must agree.
 """
 
 from __future__ import annotations
@@ -53,14 +53,15 @@ EARLIEST = 946_684_800
 
 
 def known_time(mtime: int) -> int | None:
-    """Return a listed time, None where it tells nothing."""
+    """Return a listed time, None if it tells nothing."""
     return mtime if mtime >= EARLIEST else None
 
 
 def next_read_size(size: int, took: float) -> int:
     """Return how much to read next, after `size` bytes took so many seconds.
 
-    What was read is safe in the .part, and counts on the screen: on a radio that is to be every second or so.
+    After each read the bytes are safe in the .part, and the screen shows them. On a radio that should be
+    about every second.
     """
     if took < QUICK:
         return min(size * 2, LARGEST_READ)
@@ -77,7 +78,7 @@ class LocalDiskFull(UsageError):
 
 
 class StillGrowing(MavftpfsError):
-    """The vehicle writes the file; what came so far is kept as its .part.
+    """The vehicle is writing the file; the bytes that came so far are kept as its .part.
 
     Attributes:
         came: the bytes that are here.
@@ -97,7 +98,7 @@ class Wanted:
     """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
     part: where it lies until it is whole. keep_old: a local file of that name may be the beginning of this
-    one; where it is not, it is renamed to NAME.~1~.
+    one; if it is not, it is renamed to NAME.~1~.
     """
 
     remote: bytes
@@ -115,7 +116,8 @@ class Wanted:
 
     @property
     def begun(self) -> int:
-        """Bytes that can be gone on with: of the .part, or of a local file that may be the beginning."""
+        """Bytes from which the fetch can go on: of the .part, or of a local file that may be the
+        beginning."""
         part = _size(self.part)
         if 0 < part <= self.size:
             return part
@@ -133,8 +135,8 @@ def _size(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file that is here. resumed: bytes that were here before; was_here: it was, whole, under its name;
-    kept: what another file that had its name is called now.
+    """A file that is here. resumed: bytes that were here before; was_here: the whole file was here under its
+    name; kept: the new name of another file that had its name.
     """
 
     wanted: Wanted
@@ -146,7 +148,7 @@ class Fetched:
 
     @property
     def kept_words(self) -> str:
-        """What is said of the other file, if there was one."""
+        """The words about the other file, if there was one."""
         return "" if self.kept is None else f"; another one of that name is kept as {self.kept.name}"
 
 
@@ -158,7 +160,7 @@ def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
 
 @contextmanager
 def local_disk(place: Path) -> Iterator[None]:
-    """Turn what the local disk refuses into an error that says so in a line."""
+    """Turn an error of the local disk into one of ours, which says so in a line."""
     try:
         yield
     except OSError as exc:
@@ -167,7 +169,7 @@ def local_disk(place: Path) -> Iterator[None]:
 
 
 class Part:
-    """A .part, locked against a second program that fetches the same."""
+    """A .part, locked against another program that fetches the same file."""
 
     def __init__(self, path: Path, local: Path) -> None:
         """Raises: UsageError: it is no file, or is in use. OSError."""
@@ -202,8 +204,8 @@ class Part:
         self._file.flush()
 
     def commit(self, mtime: int | None, *, keep_old: bool) -> Path | None:
-        """Give the file its name, once it is on the disk; return what another file that had it is called now.
-        mtime: None leaves the present."""
+        """Give the file its name, once it is on the disk; return the new name of another file that had it.
+        mtime: None for the present time."""
         kept: Path | None = None
         os.fsync(self._file.fileno())
         if mtime is not None:
@@ -227,7 +229,7 @@ class Part:
         self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Leave it for the next run, unless it is empty or has its name."""
+        """Leave it for the next run, unless it is empty or got its name."""
         if self.size == 0:
             self.drop()
         self._file.close()
@@ -255,7 +257,7 @@ class Fetcher:
     resume: bool = True
 
     async def fetch(self, wanted: Wanted) -> Fetched:
-        """Fetch a file, and go on when the vehicle is heard again after it was lost for a while.
+        """Fetch a file. If the vehicle is lost for a while, go on when it is heard again.
 
         Raises:
             DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
@@ -274,7 +276,7 @@ class Fetcher:
         raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")
 
     async def write_to(self, remote: bytes, take: Take) -> None:
-        """Hand a file's bytes on, and prove what was handed on.
+        """Hand a file's bytes on, and prove them.
 
         Raises:
             IsADirectory. DataUnproven, StillGrowing: it is not what the vehicle has. Else as `fetch`.
@@ -310,7 +312,7 @@ class Fetcher:
 
     async def _prove_here(self, wanted: Wanted) -> Proof | None:
         """Return how a local file of the same size was proven to be this one; None if it is another one, or
-        nothing tells. A log is taken for the same by its size, another file by its time, too."""
+        that is not known. A log counts as the same by its size; any other file needs the same time, too."""
         if is_snapshot(self.session.on_vehicle(wanted.remote)):
             return None
         answer = NOT_ASKED
@@ -352,7 +354,7 @@ class Fetcher:
         return size, await self._prove(wanted.remote, wanted.name, size, crc, resumed=here > 0)
 
     async def _copy(self, remote: bytes, take: Take, offset: int, crc: int) -> tuple[int, int]:
-        """Hand on a file from `offset` on, before which it has this CRC32; returns its size and CRC32."""
+        """Hand on a file from `offset` on. crc: that of the bytes before. Returns its size and CRC32."""
         amount = LEAST_READ
         async with reading(self.session.files, remote) as file:
             if offset > file.size:
@@ -370,10 +372,10 @@ class Fetcher:
             return file.size, crc
 
     async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> Proof:
-        """Compare with the vehicle's checksum where that is wanted and can be had; returns what was proven.
+        """Compare with the vehicle's checksum if that is wanted and can be had; return what was proven.
 
         Raises:
-            DataUnproven: they differ, or what was resumed can only be had by fetching all of it again.
+            DataUnproven: they differ, or a file that was resumed has to be fetched again from the beginning.
             StillGrowing, NotProvenYet.
         """
         if is_snapshot(self.session.on_vehicle(remote)):
@@ -397,7 +399,7 @@ class Fetcher:
         raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not proven: {answer.lacking}")
 
     async def _require_size(self, remote: bytes, name: str, size: int) -> None:
-        """Ask for the size again: no checksum says that the file was whole.
+        """Ask for the size again, because no checksum proves that the file is whole.
 
         Raises:
             StillGrowing: it has become larger. DataUnproven: it has become smaller.

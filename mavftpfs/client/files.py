@@ -1,7 +1,7 @@
 """The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
-Two programs cannot share a serial port, and not well the vehicle's only FTP session, so while a mount of the
-vehicle is up its files (client/mounted.py) are used in place of a second connection. `Files` and `File` say
+Two programs should not share the vehicle's only FTP session. So while a mount of the vehicle is up, its files
+(client/mounted.py) are used in place of a second connection. `Files` and `File` say
 what both offer. Paths are normalised (shared.model.normalise).
 """
 
@@ -35,7 +35,7 @@ READ_SIZE = 128 * 1024
 class File(Protocol):
     """An open file: cache.openfile.OpenFile, or MountedFile. All calls raise only MavftpfsError.
 
-    Its writer ends by `written`, which delivers it or takes it back.
+    A write ends by `written`, which delivers it or takes it back.
     """
 
     @property
@@ -55,12 +55,12 @@ class File(Protocol):
         """Return when everything written is on the card, checked."""
 
     async def release(self) -> None:
-        """Deliver what was written, and close, whatever came of it."""
+        """Deliver what was written, and close in any case."""
 
     async def give_up(self) -> bool | None:
         """Close, and take back what is not on the card: nothing of it is sent from now on.
 
-        Returns whether the card has what was written, None if nobody can tell.
+        Returns whether the card has what was written, None if that is not known.
         """
 
 
@@ -76,7 +76,8 @@ class Files(Protocol):
     async def open(
         self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
     ) -> File:
-        """Open a file that is there; `truncate` empties it. append: of cache.texts, to write an end."""
+        """Open a file that is there; `truncate` empties it. append: for cache.texts: what is written goes to
+        the end."""
 
     async def create(self, path: bytes, *, exclusive: bool) -> File:
         """Make a file, or open the one that is there, for reading and writing."""
@@ -97,10 +98,10 @@ class Files(Protocol):
         """Remove a file."""
 
     async def rename(self, old: bytes, new: bytes) -> None:
-        """Rename, over what is there as far as rename(2) allows."""
+        """Rename, over an existing file or directory as far as rename(2) allows."""
 
     def forget_caches(self) -> None:
-        """Have the vehicle asked again for what is known of it."""
+        """Forget what is known of the vehicle, so that it is asked again."""
 
 
 @asynccontextmanager
@@ -122,9 +123,10 @@ async def reading(files: Files, path: bytes) -> AsyncIterator[File]:
 async def written(
     file: File, tell: Callable[[bool | None], None] = lambda there: None
 ) -> AsyncIterator[None]:
-    """Write a file in the body: then it is delivered, else taken back, and closed in any case.
+    """Write a file in the body. After it the file is delivered; after an error it is taken back. It is closed
+    in any case.
 
-    tell: hears what `File.give_up` returned, also where an interruption ends the body.
+    tell: gets what `File.give_up` returned, also if an interruption ends the body.
 
     Raises:
         NotDelivered: it is not delivered; its cause says why, and `there` what is on the card instead.
@@ -150,7 +152,7 @@ async def written(
 
 
 Acknowledged = Mapping[str, int]
-"""Files of which the vehicle lacks bytes -> the bytes that it acknowledged."""
+"""Files of which the vehicle lacks bytes, and how many bytes of each it acknowledged."""
 
 
 async def _none() -> Acknowledged:
@@ -165,8 +167,8 @@ async def _no_return() -> bool:
 class Session:
     """A vehicle's files for the length of one command.
 
-    root: where `/` of `files` lies on the vehicle. acknowledged: asks what is not on the vehicle yet; counts:
-    how many files were verified in which way, as `status` has it.
+    root: where `/` of `files` lies on the vehicle. acknowledged: asks for the files that are not on the
+    vehicle yet. counts: how many files were verified in which way, as `status` has it.
     mountpoint: of the mount whose files these are, None for a connection of our own. silent: whether the
     vehicle is not heard; returned: waits for it, and returns whether it is heard again in time.
     """
@@ -184,16 +186,16 @@ class Session:
         return self.root.rstrip(b"/") + path if path != b"/" else self.root
 
     async def size_now(self, path: bytes) -> int:
-        """Ask the vehicle for a file's size, whatever is known of it."""
+        """Ask the vehicle for a file's size, even if one is known."""
         self.files.forget_caches()
-        if self.mountpoint is not None:  # the kernel believes what it was told a second ago, but for an open
+        if self.mountpoint is not None:  # only an open makes the kernel ask again
             async with reading(self.files, path):
                 pass
         return (await self.files.stat(path)).size
 
 
 async def is_directory(files: Files, path: bytes) -> bool:
-    """Return whether a path is a directory; False also where nothing is."""
+    """Return whether a path is a directory; False if it does not exist."""
     try:
         return (await files.stat(path)).kind is EntryKind.DIRECTORY
     except NotFound:
@@ -201,7 +203,7 @@ async def is_directory(files: Files, path: bytes) -> bool:
 
 
 Found = list[tuple[bytes, Stat]]
-"""What is below a directory: (path from there, what it is)."""
+"""What is below a directory: (path from there, attributes)."""
 Unlisted = list[tuple[bytes, errors.MavftpfsError]]
 """Directories that cannot be listed, and why."""
 
@@ -235,7 +237,7 @@ async def walk(files: Files, top: bytes) -> tuple[Found, Unlisted]:
 
 
 def mountpoint_of(source: str) -> tuple[str, bytes] | None:
-    """Return (mountpoint, subtree) where SOURCE is a mountpoint of ours or lies below one, else None."""
+    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None."""
     place, _, subtree = source.partition("#")
     if not place or (":" in place and not place.startswith("/")):
         return None
@@ -247,8 +249,8 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
 
 
 async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
-    """Return the files of the mount that has this link now, if it is up, of the vehicle that is wanted, and
-    we may read it."""
+    """Return the files of the mount that has this link now, if it is of the wanted vehicle and we may read
+    it."""
     for status in await mounts_on(spec):
         with suppress(KeyError, TypeError):
             if is_wanted(status, options):
@@ -271,7 +273,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     """Return the files below `subtree` of a mount.
 
     Raises:
-        LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is none.
+        LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is no directory.
         UsageError: the options ask for another vehicle or component.
     """
     status = await mount_status(mountpoint)
@@ -294,7 +296,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
 
 
 def session_on(status: Mapping[str, Any], root: bytes) -> Session:
-    """Return the files below `root` of a vehicle, as the mount that told its status has them."""
+    """Return the files below `root` of a vehicle, by the mount with this status."""
     mountpoint = status["mountpoint"]
 
     async def acknowledged() -> Acknowledged:
@@ -309,7 +311,7 @@ def session_on(status: Mapping[str, Any], root: bytes) -> Session:
 
 
 async def mount_status(mountpoint: str) -> Mapping[str, Any]:
-    """Return the status of a mount, as it tells it to users that may read its files.
+    """Return the status that a mount tells to users that may read its files.
 
     Raises:
         LinkClosed: it does not answer.
@@ -334,7 +336,7 @@ class Target:
     mount: tuple[str, bytes] | None = None
 
     async def mounted(self) -> Session | None:
-        """Return the files of the mount that is to be used, None where there is none."""
+        """Return the files of the mount that is to be used, None if there is none."""
         if self.mount is not None:
             return await open_mount(*self.mount, self.options)
         assert self.spec is not None
@@ -345,7 +347,7 @@ class Target:
         """Give the vehicle's files for the length of the body.
 
         Raises:
-            LinkClosed, VehicleLost, NoFtp: nobody answers within connect_timeout, with the reason.
+            LinkClosed, VehicleLost, NoFtp: no answer within connect_timeout, with the reason.
         """
         mounted = await self.mounted()
         if mounted is not None:

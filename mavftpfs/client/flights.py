@@ -1,9 +1,9 @@
 """What a watch does next: wait, look which logs there are, fetch one, or let go. Layer: client; pure.
 
-A flight ends when a vehicle is disarmed. Then its logs are looked at: one that has not grown for QUIET is
-fetched; one that still grows PATIENCE after the end of the flight is fetched as far as it is, and looked at
-again more and more seldom. While a vehicle is armed, is lost, or just refused to be armed, nothing is asked
-of it. All times are of one clock, in seconds.
+A flight ends when a vehicle is disarmed. Then its logs are looked at. A log that has not grown for QUIET is
+fetched. A log that still grows PATIENCE after the end of the flight is fetched up to its present size, and
+looked at again with growing pauses. While a vehicle is armed, is lost, or just refused to be armed, nothing
+is asked of it. All times are of one clock, in seconds.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ from math import inf
 from typing import NamedTuple, TypeAlias
 
 QUIET = 10.0
-"""Seconds without growth after which a log is taken for whole."""
+"""Seconds without growth after which a log counts as whole."""
 PATIENCE = 60.0
 """Seconds after the end of a flight in which a log may grow. ArduPilot logs on for 15 s."""
 REFUSED = 60.0
-"""Seconds without a transfer after a refusal to arm: its load may be the reason (MAVSDK issue 1636)."""
+"""Seconds without a transfer after a vehicle refused to arm: the load of a transfer may be the reason (MAVSDK
+issue 1636)."""
 LOST = 10.0
 """Seconds without a heartbeat after which a vehicle is lost."""
 RETRY, MOST_RETRY = 30.0, 600.0
-"""Seconds until what failed is tried again: the first time, and at most."""
+"""Seconds until a failed step is tried again: the first time, and at most."""
 GROWN, MOST_GROWN = 60.0, 3600.0
-"""Seconds until a log is looked at again that grew all the time: the first time, and at most."""
+"""Seconds until a log that grew all the time is looked at again: the first time, and at most."""
 STILL_THERE = 3600.0
-"""Seconds without news after which it is said that there is none."""
+"""Seconds without news after which a line says so."""
 
 
 class Log(NamedTuple):
@@ -38,7 +39,7 @@ class Log(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Nothing is to be done before that time, unless something is heard."""
+    """Do nothing before that time, unless something is heard."""
 
     until: float
 
@@ -63,8 +64,8 @@ Step: TypeAlias = Wait | Look | Fetch
 
 @dataclass(slots=True)
 class _Sighting:
-    """A log that is not here yet. since: when it was seen first with that size; grown: how often it was
-    fetched as far as it was."""
+    """A log that is not here yet. since: when it was first seen with that size; grown: how often it was
+    fetched while it grew."""
 
     size: int
     since: float
@@ -73,8 +74,8 @@ class _Sighting:
 
 @dataclass(slots=True)
 class _Vehicle:
-    """armed: None before that is known. ended_at: when its last flight ended, or it came. look_at: when its
-    logs are looked at, infinite if nothing is to be looked for."""
+    """armed: None before that is known. ended_at: when its last flight ended, or when it came. look_at: when
+    its logs are looked at next, infinite for never."""
 
     armed: bool | None = None
     heard_at: float = -inf
@@ -126,7 +127,7 @@ class Policy:
         vehicle = self._vehicles.get(system)
         if vehicle is not None:
             vehicle.paused_until = now + REFUSED
-            if vehicle.ready:  # what is there is looked at again: it may be another vehicle then
+            if vehicle.ready:  # its logs are listed again: it may be another vehicle then
                 vehicle.ready.clear()
                 vehicle.look_at = now
 
@@ -144,7 +145,7 @@ class Policy:
                 yield system
 
     def nothing_new(self, now: float) -> bool:
-        """Return whether it is time to say that there is no news; then it was said."""
+        """Return whether it is time to say that there is no news, and count it as said."""
         if now - self._news_at < STILL_THERE:
             return False
         self._news_at = now
@@ -153,7 +154,7 @@ class Policy:
     # --- what is done
 
     def may_transfer(self, system: int, now: float) -> bool:
-        """Return whether something may be asked of a vehicle; where not, a transfer under way lets go."""
+        """Return whether a vehicle may be asked for something; if not, a transfer under way lets go."""
         vehicle = self._vehicles.get(system)
         if vehicle is None or vehicle.lost or vehicle.armed is not False:
             return False
@@ -196,14 +197,14 @@ class Policy:
                 vehicle.look_at = min(vehicle.look_at, sighting.since + QUIET)
 
     def fetched(self, system: int, log: Log) -> None:
-        """A log is here, or is there no more."""
+        """Note that a log is here, or is not on the vehicle any more."""
         vehicle = self._taken(system, log)
         if vehicle is not None:
             vehicle.failures = 0
             vehicle.seen.pop(log.path, None)
 
     def grows(self, system: int, log: Log, now: float) -> bool:
-        """A log grew while it was fetched; return whether it grows for so long that this is to be said."""
+        """Note that a log grew while it was fetched; return whether to say so, because it grows for long."""
         vehicle = self._taken(system, log)
         if vehicle is None:
             return False
@@ -215,7 +216,7 @@ class Policy:
         return first
 
     def failed(self, system: int, log: Log | None, now: float) -> None:
-        """A log could not be fetched, or the logs could not be looked at."""
+        """Note that a log could not be fetched, or that the logs could not be listed."""
         vehicle = self._taken(system, log)
         if vehicle is not None:
             again = now + min(RETRY * 2 ** min(vehicle.failures, 10), MOST_RETRY)
@@ -223,13 +224,13 @@ class Policy:
             vehicle.look_at = again if log is None else min(vehicle.look_at, again)
 
     def local_trouble(self, now: float) -> None:
-        """The local disk does not take anything now."""
+        """Note that the local disk takes nothing now."""
         self._trouble_until = now + RETRY
 
     # --- inside
 
     def _begin(self, vehicle: _Vehicle, now: float) -> None:
-        """All that is new counts, from now on."""
+        """Count all as new from now on."""
         vehicle.ended_at = vehicle.look_at = now
         vehicle.failures = 0
         vehicle.seen.clear()
@@ -242,7 +243,7 @@ class Policy:
         return vehicle
 
     def _deadlines(self) -> Iterator[float]:
-        """Yield when something is to be done that nothing heard tells of."""
+        """Yield the times at which there is something to do even if nothing is heard."""
         for vehicle in self._vehicles.values():
             if not vehicle.lost and vehicle.armed is False:
                 yield max(vehicle.look_at, vehicle.paused_until)

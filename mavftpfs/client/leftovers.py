@@ -1,4 +1,4 @@
-"""Where what no vehicle has lies on this machine: spools, and recovery directories. Layer: client."""
+"""Where undelivered files lie on this computer: spools, and recovery directories. Layer: client."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ log = logging.getLogger("mavftpfs.mount")
 
 
 def state_directory() -> Path:
-    """Return where this user's mounts keep what must survive them (XDG base directories)."""
+    """Return where this user's mounts keep files that must survive them (XDG base directories)."""
     given = os.environ.get("XDG_STATE_HOME", "")
     base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
     return base / "mavftpfs"
 
 
 def recovered_directory() -> Path:
-    """Return where all mounts of this user leave what did not reach a vehicle."""
+    """Return where all mounts of this user leave files that did not reach a vehicle."""
     return state_directory() / "recovered"
 
 
@@ -37,21 +37,22 @@ def recovery_directory(source: str) -> Path:
 
 
 def put_back_by(source: str, directory: Path) -> str:
-    """Return what people are told to do with a recovery directory."""
+    """Return the words that tell people what to do with a recovery directory."""
     return f"put them back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
 
 
 def spool_base(vehicle: Address | None) -> Path:
-    """Return where the mounts of one vehicle keep what they hold: by its address, whatever the link."""
+    """Return where the mounts of one vehicle have their spools: by its address, whatever the link."""
     name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
     return state_directory() / "spool" / name
 
 
 def left_by_killed_mounts() -> list[Path]:
-    """Return what killed mounts of this user hold that no vehicle has; the next mount of each offers it."""
+    """Return the undelivered files that killed mounts of this user left. The next mount of each vehicle
+    offers them."""
     try:
         slots = sorted((state_directory() / "spool").glob("*/slot*"))
-    except OSError:  # another user's: we run in his environment
+    except OSError:  # another user's: we run in that user's environment
         return []
     return [data for slot in slots for data in left_in(slot)]
 
@@ -73,7 +74,8 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
 
 
 def rescue(spool: SpoolDirectory, source: str) -> str:
-    """Move what a killed mount of this vehicle left to a recovery directory; return a line on it, or ""."""
+    """Move the files that a killed mount of this vehicle left to a recovery directory; return a line on them,
+    or ""."""
     directory = recovery_directory(source)
     try:
         found = spool.rescue(directory)

@@ -26,13 +26,13 @@ from mavftpfs.shared.model import ROOT, EntryKind, normalise, split
 from mavftpfs.shared.readable import name_text
 
 WITHDRAWAL_TIME = 45.0
-"""Seconds to take back what was written: a request or two that nobody answers."""
+"""Seconds to take back what was written: a request or two without an answer."""
 
 CLOSING_TIME = 5.0
-"""Seconds to close what nothing more is to be delivered of."""
+"""Seconds to close a file of which nothing more is delivered."""
 
 STATUS_PATIENCE = 3.0
-"""Seconds for a mount to say what it is of; one that does not is not used."""
+"""Seconds for a mount to tell its status; a mount that does not is not used."""
 
 ResultT = TypeVar("ResultT")
 
@@ -48,7 +48,7 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
     errno.ENOTCONN: errors.LinkClosed,  # the mount's process is gone
     errno.ECONNABORTED: errors.LinkClosed,
     errno.ENODEV: errors.LinkClosed,
-    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum says it, also while armed
+    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum has it, also while armed
 }
 
 
@@ -59,11 +59,11 @@ _SENTENCES = {
     errors.AlreadyExists: "exists",
     errors.DirectoryNotEmpty: "is not empty",
 }
-"""What the caches say of the same."""
+"""The caches' sentences for the same errors."""
 _ABOUT_TARGET = (
     *(errors.NotADirectory, errors.IsADirectory, errors.AlreadyExists, errors.DirectoryNotEmpty),
 )
-"""What rename(2) refuses because of the new name."""
+"""Errnos by which rename(2) refuses the new name."""
 
 
 _HINTS = {
@@ -87,7 +87,7 @@ def _sentence(kind: type[errors.MavftpfsError], path: bytes) -> str:
 
 @contextmanager
 def _about_parent(path: bytes) -> Iterator[None]:
-    """Where the body makes a path, what is missing is its directory."""
+    """Name the directory in the error, if the body makes a path and its directory is missing."""
     try:
         yield
     except NotFound as exc:
@@ -104,7 +104,8 @@ async def _call(path: bytes, function: Callable[..., ResultT], *args: object) ->
 
 @dataclass(slots=True)
 class MountedFile:
-    """An open file of a mount; see File. withdraw: asks the mount to, and blocks; None if it cannot."""
+    """An open file of a mount; see File. withdraw: asks the mount to take it back, and blocks; None if it
+    cannot."""
 
     path: bytes
     fd: int
@@ -138,7 +139,7 @@ class MountedFile:
                 await _call(self.path, os.close, fd)
 
     async def give_up(self) -> bool | None:
-        """Have the mount take back what it has not delivered, before closing it would have it try again."""
+        """Make the mount take back what it has not delivered, before a close makes it try again."""
         there: bool | None = None
         try:
             if self.writable:
@@ -153,7 +154,8 @@ class MountedFiles:
     """Implements Files by the kernel's calls."""
 
     def __init__(self, mountpoint: str, mounted: bytes, root: bytes) -> None:
-        """`mounted`: what of the vehicle is on the mountpoint; `root`: what of it is our `/`."""
+        """`mounted`: the vehicle's directory on the mountpoint; `root`: the vehicle's directory that is our
+        `/`."""
         self._mountpoint = os.fsencode(mountpoint)
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
@@ -194,7 +196,8 @@ class MountedFiles:
     async def _open(self, path: bytes, flags: int) -> MountedFile:
         def opened(place: bytes) -> tuple[int, int]:
             fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
-            # Else the kernel asks for 128 KiB at once, 22 s on a radio. The mount reads ahead itself.
+            # Else the kernel asks for 128 KiB at once, which takes 22 s on a radio. The mount itself reads
+            # ahead.
             os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
             return fd, os.fstat(fd).st_size
 
@@ -238,7 +241,7 @@ class MountedFiles:
             raise type(exc)(_sentence(type(exc), new)) from exc
 
     def forget_caches(self) -> None:
-        """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
+        """Make the mount ask the vehicle again. Another user's mount may go on with what it knows."""
         with suppress(errors.MavftpfsError):
             self._ask({"command": "forget"}, timeout=STATUS_PATIENCE)
 

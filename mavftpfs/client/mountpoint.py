@@ -48,7 +48,7 @@ class DeadMount(MountFailed):
 def canonical(path: str) -> str:
     """Return the absolute path without symbolic links on the way; a trailing link is followed too.
 
-    Only the parents of the mountpoint are looked at, for the mountpoint itself may be a mount that hangs.
+    Only the parents of the mountpoint are looked at: the mountpoint itself may be a mount that hangs.
     """
     absolute = os.path.abspath(path)
     if absolute in mounts():
@@ -59,9 +59,9 @@ def canonical(path: str) -> str:
 
 
 def enclosing_mount(path: str) -> tuple[str, str] | None:
-    """Return (mountpoint of ours, path below it or "") for a mountpoint or what lies below one, else None.
+    """Return (mountpoint of ours, path below it or "") for a mountpoint, or a path below one; else None.
 
-    Symbolic links are followed only where the path as it is spelled does not lead there already.
+    Symbolic links are followed only if the path as it is spelled does not lead there.
     """
     return _enclosing(os.path.abspath(path)) or _enclosing(canonical(path))
 
@@ -162,7 +162,7 @@ def unmount(path: str, *, lazy: bool = False) -> None:
 
 
 def unmount_what_is_left(path: str) -> None:
-    """Unmount lazily what somebody else may be unmounting, or has unmounted, just now.
+    """Unmount lazily a mount that another program may be unmounting, or has just unmounted.
 
     Raises:
         MountFailed: it is still mounted; with what fusermount3 said.
@@ -175,7 +175,7 @@ def unmount_what_is_left(path: str) -> None:
 
 
 def _said_by(words: list[str], path: str) -> str | None:
-    """Return what a program that mounts or unmounts complained of, None if it succeeded.
+    """Return the complaint of a program that mounts or unmounts, None if it succeeded.
 
     Raises:
         CannotStart: it is missing, or this process has no descriptors left.

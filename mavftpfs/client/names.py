@@ -52,12 +52,12 @@ def _plain_path(text: str) -> bytes:
 
 
 def is_pattern(name: bytes) -> bool:
-    """Return whether it has what stands for other characters."""
+    """Return whether a name has wildcards."""
     return re.search(rb"[*?[]", name) is not None
 
 
 def fixed_part(pattern: bytes) -> bytes:
-    """Return the directory above the first part of a pattern that has what stands for other characters."""
+    """Return the directory above the first part of a pattern that has wildcards."""
     fixed = ROOT
     for part in pattern.strip(b"/").split(b"/"):
         if is_pattern(part):
@@ -67,7 +67,8 @@ def fixed_part(pattern: bytes) -> bytes:
 
 
 async def matching(files: Files, path: bytes) -> list[bytes]:
-    """Return the paths that match a pattern as in a shell, sorted; a path that is there, or is none, itself.
+    """Return the paths that match a pattern as in a shell, sorted; or the path itself, if it exists or is no
+    pattern.
 
     Raises:
         NotFound: nothing matches. Else as Files.list.
@@ -113,8 +114,8 @@ _LOGS = (".ulg", ".bin", ".tlog", ".log")
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How names are printed. detailed: with size and time; units: sizes as 1.2 MB; terminal: without what a
-    terminal would obey; colours: directories and logs stand out."""
+    """How names are printed. detailed: with size and time; units: sizes as 1.2 MB; terminal: without
+    characters that a terminal would obey; colours: directories and logs stand out."""
 
     detailed: bool = False
     units: bool = False
@@ -127,7 +128,7 @@ async def list_paths(
 ) -> list[Listing]:
     """Return the entries of directories, and files themselves, as JSON-able facts.
 
-    by_time: the newest first, what has no time last; else by name.
+    by_time: the newest first, entries without a time last; else by name.
     """
     return [
         listing for path in paths for listing in await _list_path(session.files, path, recursive, by_time)
@@ -191,7 +192,7 @@ def _line(entry: Entry, look: Look) -> str:
 
 
 def when(mtime: int) -> str:
-    """Return a time in UTC, or a dash where nothing tells it."""
+    """Return a time in UTC, or a dash if it is not known."""
     if known_time(mtime) is None:
         return f"{'-':<16}"
     return datetime.fromtimestamp(mtime, UTC).strftime("%Y-%m-%d %H:%M")
@@ -222,7 +223,7 @@ async def checksum_paths(
 
 
 async def emptied(files: Files, path: bytes) -> File:
-    """Open a file for writing from its start; what is on the vehicle stays until the new one is complete."""
+    """Open a file for writing from its start. The file on the vehicle stays until the new one is complete."""
     try:
         return await files.open(path, write=True, truncate=True)
     except NotFound:
@@ -274,7 +275,7 @@ async def remove_directories(session: Session, paths: Sequence[bytes]) -> None:
 
 
 def refuse_root(paths: Sequence[bytes]) -> None:
-    """Check that nobody wants to remove everything.
+    """Check that not everything is to be removed.
 
     Raises:
         UsageError: the root is named.
@@ -343,7 +344,7 @@ async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, int
 
 
 async def move(files: Files, old: bytes, new: bytes) -> None:
-    """Rename; where the server cannot, copy (which is verified) and delete, as mv does between disks."""
+    """Rename. If the server cannot, copy (which is verified) and delete, as mv does between disks."""
     try:
         await files.rename(old, new)
         return
@@ -360,7 +361,7 @@ async def move(files: Files, old: bytes, new: bytes) -> None:
 
 
 async def copy(files: Files, old: bytes, new: bytes) -> None:
-    """Copy a file by way of us, so that it is verified.
+    """Copy a file by way of this computer, which verifies it.
 
     Raises:
         NotDelivered. Else as Files.open.

@@ -1,8 +1,8 @@
-"""What a program may say about a vehicle's files: one table, one frozen record. Layer: client; pure.
+"""The options for a vehicle's files: one table, one frozen record. Layer: client; pure.
 
-A mount, the commands and the library share it. `-o` text is parsed by it, and so are the library's keywords,
-so that both take the same names and values and refuse the same ones. What concerns only the kernel's side of
-a mount is in `mount.options`.
+A mount, the commands and the library share it. Both `-o` text and the library's keywords are parsed by it, so
+both take and refuse the same names and values. Options of the kernel's side of a mount are in
+`mount.options`.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Choice:
 
 
 def text_value(text: str) -> str:
-    """Take any text but none."""
+    """Take any text that is not empty."""
     if not text:
         raise ValueError("must not be empty")
     return text
@@ -157,8 +157,8 @@ _SIZE_MAX = 1 << 40
 
 
 class Value(NamedTuple):
-    """An option with a value: how it is parsed, and what help says of it, with the default. many: it may be
-    given several times, and all count."""
+    """An option with a value: its parser, and its help with the default. many: it may be given several times,
+    and all count."""
 
     parse: Parser
     help: str
@@ -203,7 +203,7 @@ VALUES: Values = {
 
 
 class Flag(NamedTuple):
-    """A word without a value: the field that it sets, to what, and what help says of it."""
+    """A word without a value: the field that it sets, the field's value, and its help."""
 
     field: str
     becomes: bool
@@ -260,7 +260,7 @@ def with_root(options: Options, subtree: bytes) -> Options:
     """Return the options with the `#subtree` of SOURCE as root.
 
     Raises:
-        UsageError: root= says it too.
+        UsageError: root= is given, too.
     """
     if subtree == ROOT:
         return options
@@ -273,7 +273,7 @@ def parse_value(values: Values, name: str, text: str) -> Any:
     """Return the value of an option of a table.
 
     Raises:
-        UsageError: a bad one; the message names the option.
+        UsageError: a bad value; the message names the option.
     """
     try:
         return values[name].parse(text)
@@ -282,7 +282,7 @@ def parse_value(values: Values, name: str, text: str) -> Any:
 
 
 def collected(table: Values, values: Mapping[str, Any], name: str, text: str) -> Any:
-    """Return the value of an option, behind those that it was given already if all of them count.
+    """Return the value of an option, appended to its earlier values if all of them count.
 
     Raises:
         UsageError: as parse_value.

@@ -1,6 +1,6 @@
 """A vehicle's parameters for commands: read, compared, set. Layer: client.
 
-They go through the texts in `@PARAM`, of a mount that is up or of a connection, so that one place sets them
+They go through the texts in `@PARAM`, of a mount that is up or of a connection. So only one place sets them
 and reads them back (`cache.parameters`).
 """
 
@@ -41,7 +41,7 @@ _DEFAULT = re.compile(r"^(\w+),\S+ # default (\S+)$", re.MULTILINE)
 
 
 def at_root(target: Target) -> Target:
-    """Return a target whose `/` is the vehicle's, where `@PARAM` lies, as far as a mount shows that."""
+    """Return a target whose `/` is the vehicle's, where `@PARAM` lies; or the mount's, if that shows less."""
     mount = None if target.mount is None else (target.mount[0], ROOT)
     return replace(target, options=replace(target.options, root=ROOT), mount=mount)
 
@@ -98,7 +98,7 @@ async def _read(session: Session, name: bytes) -> bytes:
 async def split_by_component(
     session: Session, lines: Sequence[Line]
 ) -> tuple[Sequence[Line], Sequence[Line]]:
-    """Return the lines that are of this vehicle's component, and those of others: QGroundControl saves all in
+    """Return the lines of this vehicle's component, and those of others: QGroundControl saves all of them in
     one file, and names may be the same.
 
     Raises:
@@ -113,7 +113,7 @@ async def split_by_component(
 
 
 def matching(parameters: Sequence[Parameter], patterns: Sequence[str]) -> list[Parameter]:
-    """Return those whose names match a pattern, in whichever case; all if there is no pattern.
+    """Return the parameters whose names match a pattern, ignoring case; all if there is no pattern.
 
     Raises:
         UsageError: a pattern matches none.
@@ -181,7 +181,7 @@ def load(path: Path) -> list[Line]:
     """Return the lines of a parameter file in any spelling.
 
     Raises:
-        UsageError: it cannot be read. InvalidText: lines of it cannot be; names each.
+        UsageError: it cannot be read. InvalidText: lines of it are invalid; the text names each.
     """
     try:
         with path.open("rb") as file:
@@ -201,13 +201,13 @@ def load(path: Path) -> list[Line]:
 
 
 def invalid(name: str, problems: Sequence[Problem]) -> InvalidText:
-    """Return an error that names each line that cannot be, by its file if there is one."""
+    """Return an error that names each invalid line, with its file if there is one."""
     where = [f"{name}:{problem.number}: " if name else "" for problem in problems]
     return InvalidText("\n".join(place + one.reason for place, one in zip(where, problems, strict=True)))
 
 
 def wish(lines: Sequence[Line], current: Sequence[Parameter], name: str, *, meant: bool) -> Wish:
-    """Compare lines with what the vehicle has. meant: each was written by itself (see make_plan).
+    """Compare lines with what the vehicle has. meant: each line was written by itself (see make_plan).
 
     Raises:
         InvalidText: values do not fit; `name` is of the file.
@@ -222,7 +222,8 @@ def wish(lines: Sequence[Line], current: Sequence[Parameter], name: str, *, mean
 
 
 def enabling(changes: Sequence[Change]) -> list[Change]:
-    """Return those that may make more parameters appear: integers that were 0 (docs/servers.md 17)."""
+    """Return the changes that may make more parameters appear: of integers that were 0 (docs/servers.md
+    17)."""
     return [change for change in changes if change.before.kind is not Kind.FLOAT and not change.before.value]
 
 
@@ -230,7 +231,8 @@ async def set_values(session: Session, changes: Sequence[Change], progress: Prog
     """Set values; all of them were read back. Progress counts what the vehicle acknowledged of the upload.
 
     Raises:
-        ReadOnly, Armed: nothing is set in flight. NotTaken: some do not hold; `last_error` says which.
+        ReadOnly, Armed: nothing is set in flight. NotTaken: the vehicle did not take some; `last_error` tells
+            which.
     """
     text = "".join(f"{change.after.name},{value_text(change.after)}\n" for change in changes)
     file = await session.files.open(DIRECTORY + ALL, write=True, append=True)
@@ -249,7 +251,7 @@ async def set_values(session: Session, changes: Sequence[Change], progress: Prog
 
 
 async def last_error(session: Session) -> list[str]:
-    """Return what the last save said, without its head; nothing if it cannot be read."""
+    """Return the lines of last_error.txt without its head; [] if it cannot be read."""
     try:
         return (await read_text(session, LAST_ERROR)).splitlines()[1:]
     except MavftpfsError:
@@ -269,7 +271,7 @@ class Difference:
 
 
 def compare(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Difference]:
-    """Return where a file differs from a vehicle, but for what the vehicle sets by itself."""
+    """Return where a file differs from a vehicle, except in parameters that the vehicle sets by itself."""
     values = {one.name: one for one in current}
     found = []
     for line in {line.name: line for line in lines}.values():

@@ -1,6 +1,6 @@
 """The progress of transfers, as numbers. Layer: client.
 
-Only bytes that are safe are counted: those that came, or those that the vehicle acknowledged.
+Only safe bytes are counted: bytes that came, or bytes that the vehicle acknowledged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Progress:
         self.lost = False
 
     def plan(self, files: int, total: int) -> None:
-        """Say how much there is to do in all, from now on; no files: nothing."""
+        """Note how much there is to do in all, from now on; no files: nothing."""
         self.files, self.total = files, total
         self.files_done = self._ended = 0
 
@@ -46,28 +46,28 @@ class Progress:
         self._sample()
 
     def at(self, here: int) -> None:
-        """So many bytes of the file are safe."""
+        """Note how many bytes of the file are safe."""
         self._moved += max(0, here - self.here)
         self.here = here
         self.size = max(self.size, here)
         self._sample()
 
     def check(self) -> None:
-        """All bytes moved; what came is compared."""
+        """Note that all bytes moved, and are being compared."""
         self.state = "checking"
 
     def wait(self) -> None:
-        """The vehicle is lost."""
+        """Note that the vehicle is lost."""
         self.state = WAITING
 
     def note_lost(self, lost: bool) -> None:
-        """The vehicle is lost, or is heard again: how fast bytes moved before tells nothing any more."""
+        """Note that the vehicle is lost, or heard again: the rate so far tells nothing any more."""
         if lost or self.lost:
             self._samples.clear()
         self.lost = lost
 
     def end(self, planned: int) -> None:
-        """The file is through, well or not; `planned`: its bytes in the plan."""
+        """Note that the file is done, or failed; `planned`: its bytes in the plan."""
         self._ended += planned
         self.files_done += 1
         self.size = self.here = 0
@@ -100,7 +100,7 @@ class Progress:
 
 
 LOOK_PERIOD = 0.5
-"""Seconds between two looks whether the vehicle is heard."""
+"""Seconds between two checks whether the vehicle is heard."""
 
 
 @asynccontextmanager
@@ -114,7 +114,7 @@ async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[N
 
     async def watch() -> None:
         while True:
-            with suppress(LinkError):  # of a mount that is gone the body hears
+            with suppress(LinkError):  # if the mount is gone, the body gets the error
                 progress.note_lost(await lost())
             await trio.sleep(LOOK_PERIOD)
 

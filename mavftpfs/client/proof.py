@@ -1,4 +1,4 @@
-"""Whether what is here is what the vehicle has: when its checksum is asked for. Layer: client."""
+"""Whether a local file is what the vehicle has, and when its checksum is asked for. Layer: client."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from mavftpfs.shared.errors import (
 Verify = Literal["auto", "all", "none"]
 
 PROVEN_BY_DEFAULT = 16_000_000
-"""Bytes up to which a file is proven that came in one piece. A vehicle computes about a megabyte of checksum
-a second, and most answer nobody meanwhile."""
+"""A file of up to so many bytes is proven even if it came in one piece. A vehicle computes the checksum of
+about a megabyte a second, and most vehicles answer nothing else meanwhile."""
 
 NOT_NOW = (Armed, NotDeliveredYet, RequestTimeout, SessionBusy, FileBusy)
 """Errors that say that there is no checksum now, though there may be one later."""
@@ -35,8 +35,8 @@ NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*NOT_NOW, FtpNak, NotSupported)
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """How a file was verified, in words. lacking: why its checksum was not compared though it was to be, or
-    ""; later: it may be had another time."""
+    """How a file was verified, in words. lacking: why its checksum was not compared although it should have
+    been, or ""; later: the checksum may be had another time."""
 
     words: str
     lacking: str = ""
@@ -50,8 +50,8 @@ GENERATED = Proof("size (generated at each opening, so a checksum proves nothing
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What came of the question for a checksum. crc: None if there is none; then `lacking` and `later` as of
-    Proof."""
+    """The answer to a request for a checksum. crc: None if there is none; then `lacking` and `later` are as
+    in Proof."""
 
     crc: int | None = None
     lacking: str = ""
@@ -83,8 +83,8 @@ async def ask_crc32(session: Session, remote: bytes) -> Answer:
 
 
 async def _why_not(session: Session, error: MavftpfsError) -> str:
-    """Return in a few words why there is no checksum. A mount's answer does not tell what a vehicle that is
-    armed from one that has not got the file yet."""
+    """Return in a few words why there is no checksum. A mount's answer is the same for an armed vehicle and
+    for one that does not have the file yet."""
     match error:
         case Armed():
             return "armed"

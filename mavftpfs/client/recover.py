@@ -1,8 +1,8 @@
-"""What did not reach a vehicle: listing it, and putting it where it belonged. Layer: client; prints nothing.
+"""Files that did not reach a vehicle: lists them, and puts them back. Layer: client; prints nothing.
 
 A mount that ends with undelivered files moves them below `recovered`, with a `NAME.json` beside each file
-(cache.recovery). What a killed mount held is moved there by the next mount. Nothing is put back by itself:
-nobody knows what happened to the file since.
+(cache.recovery). The next mount moves there what a killed mount held. Nothing is put back by itself, because
+the file on the vehicle may have changed since.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Kept:
 
     @property
     def hindrance(self) -> str:
-        """Why it cannot be put back by us, or ""."""
+        """Why we cannot put it back, or ""."""
         if self.path is None:
             return "where it belongs was not written down"
         if self.facts.get("unfinished"):
@@ -96,7 +96,7 @@ def kept_in(directory: Path) -> list[Kept]:
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
-    """Return what was written down, nothing if that is not what we write."""
+    """Return what was written down; {} if that is damaged."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
@@ -133,10 +133,10 @@ async def put_back(
     *,
     force: bool,
 ) -> None:
-    """Put files where they belonged; a copy that the vehicle provably has is removed here.
+    """Put files where they belonged. Once it is proven that the vehicle has a file, the copy here is removed.
 
-    tell: hears of each file, and whether it was there already. force: also over a file that is not the one
-    they were to replace.
+    tell: called for each file, with whether it was there already. force: also replace a file that is not the
+    one they were to replace.
 
     Raises:
         UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
@@ -171,7 +171,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
     """Return whether the vehicle has the file with exactly these bytes.
 
     Raises:
-        UsageError: it has another one than that which was to be replaced.
+        UsageError: it has another file than the one that was to be replaced.
     """
     try:
         found = await session.files.stat(path)

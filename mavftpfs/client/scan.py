@@ -1,4 +1,4 @@
-"""What is on a link, and whose files can be had. Layer: client; prints nothing."""
+"""What is on a link, and which components serve files. Layer: client; prints nothing."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _TICK = 0.1
 
 
 async def scan(target: Target) -> list[Entry]:
-    """Return what sends heartbeats on a link, and what of that answers MAVLink FTP.
+    """Return the components that send heartbeats on a link, and which of them answer MAVLink FTP.
 
     It ends within connect_timeout, or LEAST_PROBE for each component if they are many; sooner if all answer.
 
     Raises:
-        VehicleLost: nobody at all within connect_timeout.
+        VehicleLost: no heartbeat at all within connect_timeout.
     """
     if target.mount is not None:
         status = await mount_status(target.mount[0])
@@ -63,7 +63,7 @@ async def scan(target: Target) -> list[Entry]:
 
 
 async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list[Entry]:
-    """Return what else is heard, and what of that answers MAVLink FTP."""
+    """Return the other components that are heard, and which of them answer MAVLink FTP."""
     assert target.spec is not None
     options = target.options
     deadline = trio.current_time() + options.connect_timeout
@@ -78,7 +78,7 @@ async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list
 
 
 async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
-    """Return what is heard in LISTEN_TIME after the first heartbeat of anything."""
+    """Return the heartbeats that are heard within LISTEN_TIME of the first one."""
     anybody = replace(connect_options(options), target_system=0, target_component=0)
     async with connected(link, anybody) as connection:
         for tick in range(round(options.connect_timeout / _TICK)):
@@ -145,7 +145,7 @@ async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: f
 
 
 def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
-    """Return what was learnt of its FTP beside that it answers."""
+    """Return what else was learnt of its FTP."""
     seen = []
     flag, rtt, times = facts["vehicle"]["says_ftp"], facts["link"]["rtt"], facts["connection"]["lists_times"]
     if flag is not None and flag is not answers:
@@ -184,7 +184,7 @@ def _second(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
-    """Return what a mount tells of its vehicle, and whom else it hears: the others are not asked."""
+    """Return what a mount tells of its vehicle, and of others that it hears; these are not asked."""
     own = _own_entry(status)
     heard = [
         Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])

@@ -15,7 +15,7 @@ def target_of(source: str, options: Options) -> Target:
     """Return what SOURCE names.
 
     Raises:
-        UsageError: it is none, or contradicts the options.
+        UsageError: it is no SOURCE, or contradicts the options.
     """
     mount = mountpoint_of(source)
     if mount is not None:

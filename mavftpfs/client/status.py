@@ -1,9 +1,9 @@
 """What mounts tell of themselves, and how they are asked for it. Layer: client.
 
 A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys
-are those of `status --json`, which docs/guide.md describes. It is asked over its control socket. Where that
-cannot be reached (it is another user's) the extended attribute of its root says the same to users that may
-read the mount; root may ask everybody's. Of a mount that cannot be asked only `mountpoint`, `source`,
+are those of `status --json`, which docs/guide.md describes. It is asked over its control socket. If that
+cannot be reached (it is another user's), the extended attribute of the mount's root says the same to users
+that may read the mount; root may ask all mounts. Of a mount that cannot be asked only `mountpoint`, `source`,
 `state` and `problem` are known.
 """
 
@@ -42,11 +42,11 @@ PERIOD = 0.25
 RATE_SPAN = 20
 """Looks over which the traffic on the link is averaged."""
 LEAST_SPAN = 2.0
-"""Seconds that were seen before an average is said."""
+"""Seconds of looks before an average is told."""
 MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
 _TOLD = {"transfers", "errors", "reads"}
-"""What the cache tells that stands in the snapshot's own lists."""
+"""Keys of the cache's status that are in the snapshot's own lists."""
 
 
 def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str, Any]:
@@ -73,9 +73,9 @@ def is_read_only(vehicle: Facts) -> bool:
 
 
 def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, Any]]:
-    """Return what is being read or written, what is sent before what waits.
+    """Return the files that are being read or written; those being sent come before those that wait.
 
-    moving: the vehicle is there; writing: and it may be written to.
+    moving: the vehicle is there; writing: it may also be written to.
     """
     found = []
     for read in cache.get("reads", []):
@@ -100,7 +100,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
 
 
 class Watcher:
-    """Looks at a connection: logs each change that a pilot cares for, measures the traffic."""
+    """Looks at a connection: logs each change that matters to a pilot, and measures the traffic."""
 
     def __init__(self, status: Callable[[], Facts], *, writing: bool) -> None:
         """`status`: Connection.status; `writing`: the mount is not a read-only one."""
@@ -177,7 +177,8 @@ def all_statuses() -> list[Status]:
     known = {control.socket_name(path) for path in found}
     for socket in control.all_sockets(control.own_directories()):
         if socket.name not in known:
-            # The kernel shows it no more, but it still delivers; or it is in another mount namespace.
+            # The kernel does not show it any more, but it still delivers; or it is in another mount
+            # namespace.
             status = _ask_or_remove(socket)
             if status is not None:
                 found.setdefault(status["mountpoint"], status)
@@ -202,9 +203,10 @@ def status_of(mountpoint: str) -> Status:
 
 
 def told_by(mountpoint: str) -> Status | None:
-    """Return what a mount says through itself, None if it cannot be looked into.
+    """Return a mount's status from the attribute of its root, None if that cannot be read.
 
-    Its control socket is found by the mountpoint's name, which in another mount namespace is another mount.
+    The control socket is found by the mountpoint's name, which may be another mount in another mount
+    namespace.
     """
     answer = _read_xattr(mountpoint)
     if not isinstance(answer, bytes):
@@ -214,13 +216,13 @@ def told_by(mountpoint: str) -> Status | None:
 
 
 def second_vehicle(status: Status) -> str:
-    """Return what is said of a second vehicle with the system id of the one that counts."""
+    """Return the words about a second vehicle with the same system id."""
     system, address = status["vehicle"]["system"], status["link"]["second"]
     return said_of_double(system, address)
 
 
 def said_of_double(system: int, address: str) -> str:
-    """Return what is said of an address that speaks with a system id that is another one's."""
+    """Return the words about an address that uses another vehicle's system id."""
     return (
         f"a second vehicle has the system id {system}, or a router sends frames back: ignored at {address}; "
         "give each vehicle its own id"
@@ -228,10 +230,10 @@ def said_of_double(system: int, address: str) -> str:
 
 
 def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -> str:
-    """Return the mountpoint of the vehicle that is meant, where several are mounted below one.
+    """Return the mountpoint of the vehicle that the options ask for, below a mount of several vehicles.
 
     Raises:
-        UsageError: it is not said which. NotFound: it is not there.
+        UsageError: the options do not say which one. NotFound: it is not there.
     """
     place, names = status["mountpoint"], [member["name"] for member in status["members"]]
     first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
@@ -250,8 +252,8 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
 
 
 def with_vehicles(status: Status) -> list[Status]:
-    """Return the statuses that belong to one mountpoint: its own, and of several vehicles theirs, which stand
-    under `vehicles` of the first, too."""
+    """Return the statuses that belong to one mountpoint: its own, and those of its vehicles if it has
+    several, which are also under `vehicles` of the first."""
     if "members" not in status:
         return [status]
     vehicles: list[Status] = []
@@ -298,7 +300,8 @@ def _unasked(path: str, mount: Mounted, state: str, problem: str) -> Status:
 
 
 def _read_xattr(path: str) -> bytes | int:
-    """Return the attribute, or the errno; from a thread, because a program that was stopped answers never."""
+    """Return the attribute, or the errno; read in a thread, because a mount that was stopped never
+    answers."""
     answer: list[bytes | int] = []
 
     def read() -> None:
@@ -324,7 +327,7 @@ def _ask_or_remove(socket: Path) -> Status | None:
     except NobodyThere:
         socket.unlink(missing_ok=True)
     except ControlError:
-        pass  # which mount it is, only it could say
+        pass  # only the mount itself could say which one it is
     return None
 
 
@@ -338,7 +341,7 @@ def network_namespace() -> str:
 
 
 def has_link(status: Status, spec: LinkSpec) -> bool:
-    """Return whether the mount that told this status has that link: a port is one in its namespace only."""
+    """Return whether the mount with this status has that link. A port belongs to a network namespace."""
     with suppress(MavftpfsError, KeyError):  # it cannot be asked, or is of an older version
         return status["network_namespace"] == network_namespace() and same_link(
             parse_source(status["source"]), spec
@@ -352,7 +355,8 @@ def holder_of(spec: LinkSpec) -> Status | None:
 
 
 def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
-    """Return whether a mount is of the vehicle that the options ask for, and that one still answers there."""
+    """Return whether a mount is of the vehicle that the options ask for, and that vehicle still answers
+    there."""
     vehicle, component = status["vehicle"], options.target_component
     autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
     return (

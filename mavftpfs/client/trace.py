@@ -1,8 +1,8 @@
 """Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: client.
 
-The session layer calls `payload` for each of the 251-byte payloads; without a trace nothing is computed. A
-file that cannot be written any more (disk full) is told of once and falls silent: a trace must never break
-what it watches.
+The session layer calls `payload` for each of the 251-byte payloads; without a trace nothing is computed. If a
+file cannot be written any more (disk full), that is reported once, and nothing more is written: a trace must
+never break what it watches.
 
 JSON lines: {"t", "time", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also
 "req_opcode" and "burst_complete"; opcodes by name, data in hex (the part that counts). "t" is in seconds of a

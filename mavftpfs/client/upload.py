@@ -1,7 +1,7 @@
 """Putting local files and directories on the vehicle. Layer: client; prints nothing.
 
-A file counts as put when fsync says that it is on the card, checked; until then progress is what the vehicle
-has acknowledged.
+A file counts as put when fsync says that it is on the card, checked. Until then progress counts the bytes
+that the vehicle has acknowledged.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from mavftpfs.shared.model import join, normalise, split
 from mavftpfs.shared.readable import name_text
 
 BESIDE = ".put-"
-"""Begins the name of a file that a mount has until it is whole."""
+"""Begins the name that a file has in a mount until it is whole."""
 _BESIDE = re.compile(re.escape(BESIDE) + "[0-9a-f]+")
 
 Tell = Callable[[bytes, int, str], None]
-"""Hears the path of a file that was put, its size, and how it was verified."""
+"""Called with the path of a file that was put, its size, and how it was verified."""
 
 _WAYS = {
     "verified_by_size": BY_SIZE.words,
@@ -92,13 +92,13 @@ async def put_paths(
 ) -> None:
     """Put what `collect` found to `path`: an existing directory, or a new name for one thing.
 
-    `tell` hears of each file that is there. into: `path` was written with a
-    `/` at its end: a file goes into that directory only.
+    `tell`: called for each file that is there. into: `path` was written with a `/` at its end: a file goes
+    into that directory only.
 
     Raises:
         NotADirectory: several things, or a file is to go into it, and `path` is no directory; NotFound: it is
         not there. UsageError: of what is local, or two files would get one name. All that before anything is
-        sent. NotDelivered: a file did not get to the vehicle; what was told before is there.
+        sent. NotDelivered: a file did not get to the vehicle; the files that were told before are there.
     """
     inside = await is_directory(session.files, path)
     if not inside and len(batches) > 1:
@@ -118,7 +118,7 @@ async def put_paths(
 def _placed(
     batches: Sequence[tuple[Path, Sequence[Path]]], path: bytes, *, inside: bool
 ) -> dict[bytes, Path]:
-    """Return what becomes what on the vehicle, parents first; directories of one name become one.
+    """Return the path on the vehicle for each local file, parents first; directories of one name become one.
 
     Raises:
         UsageError: two would get one name.
@@ -143,7 +143,7 @@ async def put_alone(
     *,
     into: bool = False,
 ) -> None:
-    """Put one file under a name that its own does not tell, as of what came from stdin; else as `put_paths`.
+    """Put one file under another name than its own, such as stdin; else as `put_paths`.
 
     Raises:
         IsADirectory: the path is a directory, or is written as one.
@@ -160,14 +160,14 @@ async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: 
     before = await session.counts()
     size = await put_file(session, local, remote, progress)
     after: Mapping[str, Any] = {}
-    with suppress(LinkError):  # a mount that is gone: the file is on the vehicle all the same
+    with suppress(LinkError):  # the mount is gone, but the file is on the vehicle
         after = await session.counts()
     tell(remote, size, how_verified(before, after))
 
 
 def how_verified(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """Return how a file was verified, from the counts of a status; "" where they do not tell. Where a mount
-    verified another file meanwhile it is the weaker of both."""
+    """Return how a file was verified, from the counts of a status; "" if they do not tell. If a mount
+    verified another file meanwhile, return the weaker of both ways."""
     for way, words in _WAYS.items():
         if after.get(way, 0) > before.get(way, 0):
             return words
@@ -189,7 +189,7 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
         name = name_text(session.on_vehicle(remote))
-        # What is written beside has a name that only we know.
+        # The temporary name beside the file means nothing to people.
         reason = re.sub(_BESIDE, lambda _: name_text(split(remote)[1]), str(exc)).removeprefix(
             f"{name_text(remote)}: "
         )
@@ -215,8 +215,8 @@ async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Pro
 
 
 async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
-    """Write a new file beside and rename it: else a mount would deliver half a file of an interrupted put.
-    What a killed put leaves is a file like any other."""
+    """Write a new file beside the old one, and rename it. Else a mount would deliver half a file of an
+    interrupted put. After a killed put the new file stays."""
     files = session.files
     beside = join(split(remote)[0], f"{BESIDE}{secrets.token_hex(4)}".encode())
     file = await files.create(beside, exclusive=True)

@@ -1,7 +1,7 @@
-"""Bringing logs home by themselves: connects, looks, fetches and lets go as `flights` decides. Layer: client.
+"""Brings logs automatically: connects, looks, fetches and lets go as `flights` decides. Layer: client.
 
-One task hears of the vehicles, another does what is to be done, one thing at a time, and a third hands on
-what came. A transfer lets go by leaving the connection, which closes the server's session.
+One task listens for vehicles. Another one takes the steps, one at a time. A third hands on the logs that
+came. A transfer lets go by leaving the connection, which closes the server's session.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ SPARE = 1 << 20
 """Bytes that are left free on the local disk."""
 
 HandOn = Callable[[Path], Awaitable[str]]
-"""Does something with a log that came; returns why that did not work, or ""."""
+"""Does something with a log that came; returns why it failed, or ""."""
 
 
 @dataclass(frozen=True, slots=True)
 class WatchWish:
     """What is to be brought. logs: as `sync` has it; by_system: directories are named by system ids; again:
-    also what was brought before and is here no more."""
+    also bring logs that were brought before and are not here any more."""
 
     logs: Wish
     verify: Verify = "auto"
@@ -137,7 +137,7 @@ class Watch:
         self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
 
     def _wake(self) -> None:
-        """Look at what is to be done anew; end what must not go on."""
+        """Choose the next step again, and end a step that must not go on."""
         self._changed.set()
         if self._working_on is not None:
             system, scope = self._working_on
@@ -183,8 +183,8 @@ class Watch:
                 await self.serve(LinkContact(connection, spec, options))
 
     async def serve(self, contact: Contact) -> None:
-        """Do what is to be done with a vehicle; return when the contact has to be left: its session is to be
-        closed, or another vehicle is to be served.
+        """Take the steps for a vehicle. Return when the contact has to be left, to close its session or to
+        serve another vehicle.
 
         Raises:
             LinkError: the contact broke.
@@ -213,7 +213,7 @@ class Watch:
             raise self._leave
 
     async def _is_mounted(self) -> bool:
-        """Return whether a mount of that vehicle came up, with which we would share its only session."""
+        """Return whether a mount of that vehicle came up: we would share its only session."""
         return self._target is not None and await self._target.mounted() is not None
 
     async def _wait(self, step: Wait) -> None:
@@ -224,7 +224,7 @@ class Watch:
             self._say(f"nothing new; {self._came} logs came so far")
 
     async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> bool:
-        """Do it; return whether the vehicle may be asked for more."""
+        """Take a step; return whether the vehicle may be asked for more."""
         with trio.CancelScope() as scope:
             self._working_on = step.system, scope
             try:
@@ -269,8 +269,8 @@ class Watch:
             self._policy.failed(system, None, trio.current_time())
 
     async def _is_known(self, name: str, log: Wanted, session: Session) -> bool:
-        """Return whether a log was brought before. What has no time is told apart by how it begins, which is
-        asked for once until the vehicle was away."""
+        """Return whether a log was brought before. Logs without a time are told apart by their first bytes,
+        which are asked for once, until the vehicle was away."""
         key = name, os.fsdecode(session.on_vehicle(log.remote))
         known = self._memory.of(*key)
         if known is None or known.size != log.size or not known.proven:
@@ -341,7 +341,7 @@ class Watch:
     # --- the local directory
 
     def _local_is_ready(self, step: Look | Fetch) -> bool:
-        """Return whether the directory is there and has room; where not, it is said once."""
+        """Return whether the directory is there and has room; if not, complain once."""
         if not self._memory.is_there():
             self._complain("local", f"{self._local} is not there any more; waiting for it")
             return False
@@ -359,7 +359,8 @@ class Watch:
     # --- what is handed on
 
     async def _hand_on_all(self) -> None:
-        """Hand on what came, one after the other; first what was not in an earlier run."""
+        """Hand on the logs that came, one after the other; first those that an earlier run did not hand
+        on."""
         if self._hand_on is None:
             return
         for log in self._memory.logs():
@@ -370,7 +371,7 @@ class Watch:
 
     async def _hand_on_one(self, log: Brought, hand_on: HandOn) -> None:
         path = self._local / log.file
-        if not is_file(path):  # it was taken away
+        if not is_file(path):  # a user took it away
             return
         problem = await hand_on(path)
         if problem:
@@ -385,13 +386,13 @@ class Watch:
     # --- what is said once
 
     def _complain(self, about: str, line: str) -> None:
-        """Say it, unless that was the last that was said of it."""
+        """Print a line, unless it was the last one about the same thing."""
         if self._complaints.get(about) != line:
             self._complaints[about] = line
             self._say(line)
 
     def _settled(self, about: str) -> None:
-        """What was said of it is over."""
+        """Forget the last line about something, because it is over."""
         self._complaints.pop(about, None)
 
 
