@@ -27,7 +27,7 @@ from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
-"""Seconds for `umount`: what is held has to travel first, perhaps over a radio."""
+"""Seconds for `umount`: held bytes have to be sent first, perhaps over a radio."""
 END_PATIENCE = 5.0
 """Seconds for a mount's process to end after its last word."""
 SAY_AGAIN = 10.0
@@ -104,9 +104,9 @@ def _serve(
 
 
 def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], list[str]]:
-    """Return what gives the command that mounts one vehicle of several.
+    """Return a function that returns the command for mounting one vehicle of several.
 
-    Endpoints are the hub's, and it has them already. A trace and a raw log are written by each vehicle's own.
+    The hub has the endpoints already. Each vehicle's mount writes a trace and a raw log of its own.
     """
     own: list[tuple[str, bool]] = []
     for word in split_words(args.options):
@@ -165,7 +165,7 @@ def _control_path(place: str) -> Path | None:
 
 
 def umount(args: argparse.Namespace) -> int:
-    """Have a mount's process deliver and unmount; a mount whose process is gone is just taken away."""
+    """Make a mount's process deliver and unmount. A mount whose process is gone is only removed."""
     place = canonical(args.mountpoint)
     try:
         socket = find_socket(place)
@@ -204,12 +204,12 @@ class _Delivery:
         self._in_place = sys.stderr.isatty()
 
     def show(self) -> None:
-        """Ask the mount, and say what it delivers; called about each second."""
+        """Ask the mount what it delivers, and say so; called about each second."""
         try:
             status = control.ask(self._socket, {"command": "status"}, timeout=PATIENCE)["status"]
         except control.ControlError:
             return  # it ends just now
-        # One that is still in use holds bytes, too, but does not end.
+        # A mount that is still in use has held bytes, too, but does not end.
         line = report.delivery_line(status) if status["state"] == "unmounting" else ""
         now = time.monotonic()
         if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
@@ -242,7 +242,7 @@ class _Delivery:
 
 
 def _after_a_killed_mount() -> int:
-    """Nobody delivers what it held: say so."""
+    """Say that what a killed mount held is not delivered."""
     line = left_by_killed_mounts_line()
     if not line:
         return ExitCode.OK
@@ -271,7 +271,7 @@ def _wait_for_end(pid: int) -> None:
     except ProcessLookupError:
         return
     try:
-        # Readable when it ended, also while nobody has reaped it.
+        # Readable when it ended, even before it was reaped.
         select.select([process], [], [], END_PATIENCE)
     finally:
         os.close(process)

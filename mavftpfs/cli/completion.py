@@ -33,7 +33,7 @@ _PLACES = {
     "directory": _DIRECTORY,
     "options": _LIST,
 }
-"""What an argument of that name is completed with, where that is not a path on the vehicle."""
+"""How arguments are completed by name, if they are not paths on the vehicle."""
 
 _LOCAL_PATHS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 """Options whose values are local paths."""
@@ -93,7 +93,7 @@ def _choices() -> dict[str, tuple[str, ...]]:
 
 
 def _zsh_specs() -> Iterator[str]:
-    """Yield what zsh's _values is told of each option."""
+    """Yield the words of each option for zsh's _values."""
     choices = _choices()
     for word, text in _words().items():
         name, value, _ = word.partition("=")

@@ -198,7 +198,7 @@ def mount(tour: Tour, stack: ExitStack) -> None:
 
 
 def release(path: Path) -> None:
-    """End a mount that was not unmounted. What is not delivered is given up: the drone is none."""
+    """End a mount that was not unmounted. Undelivered bytes are given up: the drone is only simulated."""
     if str(path) not in mounts():
         return
     with suppress(control.ControlError, ProcessLookupError):
@@ -300,7 +300,7 @@ def take_tour(tour: Tour, stack: ExitStack) -> None:
         tour.say("Done. Unmounting:")
         tour.command("mavftpfs", "umount", "drone")
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # no further Ctrl-C stops the cleaning up half-way
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must not stop the cleaning up
 
 
 def run() -> int:

@@ -18,7 +18,7 @@ from mavftpfs.shared.readable import printable, readable_size
 
 _REFRESH = 5
 _ROOM = 4
-"""Columns that stay free: the terminal's ^C would else begin a line of which rich does not know."""
+"""Columns that stay free: else the terminal's ^C would begin a line that rich does not know of."""
 _BAR = 40
 _LINE = len("999.9 MB of 999.9 MB, 999.9 kB/s, 59 min 59 s left")
 """Columns of the longest total, for which there is room from the start: the bar keeps its width."""
@@ -80,14 +80,14 @@ class _Screen:
 def shown(progress: Progress, idle: str = "looking at what is there") -> Iterator[Progress]:
     """Show progress on stderr during the body, if that is a terminal; nothing of it stays at the end.
 
-    idle: what is shown where nothing is planned.
+    idle: what is shown while nothing is planned.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
         yield progress
         return
     screen = _Screen(progress, console, idle)
-    # What goes to stdout would come out on stderr if rich took it; only on one terminal are they the same.
+    # If rich takes stdout, its output goes to stderr; only on one terminal are they the same.
     to_terminal = sys.stdout.isatty()
     live = Live(
         screen, console=console, refresh_per_second=_REFRESH, transient=True, redirect_stdout=to_terminal

@@ -1,7 +1,7 @@
 """`mavftpfs install`: puts man pages, completions, the systemd unit and the udev rule into place. Layer: cli.
 
-For one user, or as root for everybody. Nothing else is touched: `--print` shows what would be written, and
-`--remove` takes the same files away. The man page and the completions are made of the command line's own
+For one user, or as root for all users. Nothing else is touched: `--print` shows what would be written, and
+`--remove` removes the same files. The man page and the completions are made from the command line's own
 parsers.
 """
 
@@ -63,13 +63,13 @@ SYSTEMD_RUNS = Path("/run/systemd/system")
 
 
 MARK = "# Made by mavftpfs install."
-"""In a program that is to be told from those of others by the same name."""
+"""In our programs, which tells them from those of others with the same name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One file to install. text: its content; link: what it points to, for a symbolic link. program: it is to
-    be run, and something that others put there stays."""
+    """One file to install. text: its content; link: what it points to, for a symbolic link. program: it is a
+    program, and one that others put there stays."""
 
     path: Path
     text: str = ""
@@ -98,7 +98,7 @@ class Piece:
         return os.path.lexists(self.path)
 
     def is_others(self) -> bool:
-        """Return whether what has its path was put there by somebody else, as pipx or a package."""
+        """Return whether others, such as pipx or a package, put a file at its path."""
         if self.link is not None:
             return self.is_there() and not self.path.is_symlink()
         return self.program and self.is_there() and (self.path.is_symlink() or MARK not in _text(self.path))
@@ -112,7 +112,8 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     """Install, show or remove, for this user or, as root, for everybody.
 
     Raises:
-        UsageError: a file cannot be written or removed, or others than root could change what all are to run.
+        UsageError: a file cannot be written or removed, or other users than root could change the program
+            that all run.
     """
     program = own_program()
     everybody = os.geteuid() == 0
@@ -141,7 +142,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
 
 def own_program() -> Path:
-    """Return this program itself, not a link to it: that may be one of ours, which is taken away again."""
+    """Return this program itself, not a link to it: the link may be one of ours, which is removed again."""
     name = sys.argv[0]
     found = name if os.sep in name else shutil.which(name)
     if found is None or not os.access(found, os.X_OK):
@@ -150,10 +151,10 @@ def own_program() -> Path:
 
 
 def check_program(program: Path) -> None:
-    """Check that only root can change what root and everybody are to run.
+    """Check that only root can change the program that root and all users run.
 
     Raises:
-        UsageError: somebody else can, or there is no mount.mavftpfs beside the program.
+        UsageError: another user can, or there is no mount.mavftpfs beside the program.
     """
     if not program.with_name(HELPER).exists():
         raise UsageError(f"there is no {HELPER} beside {program}; run the mavftpfs of an installation")
@@ -216,7 +217,7 @@ def _unit(program: Path, name: str) -> str:
 
 
 def _tell_systemd(everybody: bool) -> None:
-    """Have systemd and udev read what changed; without them there is nothing to tell."""
+    """Make systemd and udev read what changed, if they are there."""
     if not SYSTEMD_RUNS.is_dir():
         return
     manager = () if everybody else ("--user",)

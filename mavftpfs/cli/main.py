@@ -1,7 +1,7 @@
 """The command line: arguments, exit codes, one-line errors. Layer: cli.
 
-What only one command needs is imported when it runs: a mount in the background should not hold rich or
-the simulator in memory.
+Modules that only one command needs are imported when it runs: a mount in the background should not have rich
+or the simulator in memory.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
-        # `mavftpfs ls ... | head`: nobody reads on, and the interpreter must not try to flush again
+        # `mavftpfs ls ... | head`: the reader is gone, and the interpreter must not try to flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
     except Exception as exc:
@@ -192,7 +192,7 @@ def _scan_parser(name: str) -> Parser:
 
 
 def _ls_parser(name: str) -> Parser:
-    # -h is what it is in ls.
+    # -h means the same as in ls.
     parser = _paths_parser(name, "List directories of the vehicle.", least="*", short_help=False)
     parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times (UTC)")
     parser.add_argument("-h", dest="units", action="store_true", help="with -l: sizes as 1.2 MB")

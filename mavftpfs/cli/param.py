@@ -29,10 +29,10 @@ Args = argparse.Namespace
 
 
 def param(args: Args) -> int:
-    """Print parameters, or do with them what the words say."""
+    """Print parameters, or set, load, save or compare them."""
     try:
         return _param(args)
-    except InvalidText as exc:  # of a file, each line that cannot be
+    except InvalidText as exc:  # one line of text for each invalid line of a file
         *others, last = str(exc).split("\n")
         for line in others:
             verbs.say(line)
@@ -110,7 +110,7 @@ def _facts(one: Parameter) -> dict[str, Any]:
 
 
 def _number(one: Parameter) -> int | float | str:
-    """Return what JSON has a number for, else its text; floats as the shortest decimal."""
+    """Return a value as a number if JSON has it, else its text; floats as the shortest decimal."""
     text = client.value_text(one)
     if one.kind is not Kind.FLOAT:
         return int(text)
@@ -194,8 +194,8 @@ def _change(args: Args, read: Callable[[], Sequence[Line]], name: str, *, meant:
 
 @dataclass(slots=True)
 class _Setting:
-    """One run that sets parameters. name: of the file that the lines are from. meant: see make_plan. done:
-    what was set and read back.
+    """One run that sets parameters. name: the file of the lines. meant: see make_plan. done: the parameters
+    that were set and read back.
     """
 
     args: Args
@@ -207,7 +207,7 @@ class _Setting:
     announced: bool = False
 
     async def run(self, session: Session) -> int:
-        """Set what does not hold; in two steps where some may only appear when others are set."""
+        """Set the values that differ; in two steps if some parameters may only appear when others are set."""
         wish = await self._compare(session)
         first = client.enabling(wish.changes) if wish.unknown else []
         if wish.unknown and not first:
@@ -238,7 +238,7 @@ class _Setting:
         """Say which names the vehicle does not have.
 
         Raises:
-            InvalidText: and they may not be left out.
+            InvalidText: there are such names, and they may not be left out.
         """
         names = ", ".join(line.name for line in wish.unknown)
         if wish.unknown and not self.args.skip_unknown:
@@ -248,7 +248,7 @@ class _Setting:
             verbs.say(f"left out, because the vehicle does not have them: {names}")
 
     async def _ask(self, wish: Wish) -> None:
-        """Before more than one is set: say what will change, and ask on a terminal.
+        """Before more than one parameter is set, say what will change, and ask on a terminal.
 
         Raises:
             UsageError: the user said no.

@@ -46,7 +46,7 @@ def hub(args: argparse.Namespace) -> int:
 
 
 def statuses(source: str | None) -> list[Status]:
-    """Return what each hub says of itself; only that of one SOURCE, if there is one."""
+    """Return the status of each hub; only that of SOURCE, if it is given."""
     return [facts for _, facts in _hubs(source, {"status": True})]
 
 
@@ -60,7 +60,7 @@ def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    """Stop hubs, after it was said what that cuts."""
+    """Stop hubs, after saying what that cuts off."""
     found = list(_hubs(args.source, {"status": True}))
     cut = [facts for _, facts in found if facts["clients"] or _live(facts)]
     for facts in cut:
@@ -111,7 +111,7 @@ def _hubs(source: str | None, request: Facts) -> Iterator[tuple[Path, Status]]:
 
 
 def _ask(path: Path, request: Facts) -> Status | None:
-    """Return what the hub behind a door says; None if there is none, but perhaps a program alone."""
+    """Return the reply of the hub behind a door; None if there is no hub, but perhaps a program alone."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock, suppress(OSError):
         sock.settimeout(PATIENCE)
         sock.connect(os.fspath(path))

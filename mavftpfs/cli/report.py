@@ -66,7 +66,7 @@ def _member_lines(status: Status) -> Iterator[Line]:
 
 
 def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
-    """Yield nested facts as `--json` has them, a line each, but for those that say nothing."""
+    """Yield nested facts as `--json` has them, a line for each that says something."""
     for key, value in facts.items():
         name = before + key.replace("_", " ")
         if isinstance(value, Mapping):
@@ -76,7 +76,7 @@ def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
 
 
 def _fact(value: object) -> str:
-    """Return a value as people write it: yes and no, and no more digits than tell something."""
+    """Return a value as people write it: yes and no, and only the digits that matter."""
     match value:
         case bool():
             return "yes" if value else "no"
@@ -158,7 +158,7 @@ def _waits_for(status: Status) -> str:
 
 
 def time_left(seconds: float) -> str:
-    """Return how much longer it takes; nobody can tell less than a second."""
+    """Return how much longer it takes, at least a second."""
     return f"{readable_time(max(1.0, seconds))} left"
 
 
@@ -168,7 +168,7 @@ def count_files(count: int) -> str:
 
 
 def delivery_line(status: Status) -> str:
-    """Return what a mount that is being unmounted waits for, in a line; "" if for nothing."""
+    """Return a line on what a mount that is being unmounted waits for; "" for nothing."""
     held = status.get("held")
     if held is None or not held["files"]:
         return ""
@@ -195,7 +195,7 @@ def print_status(statuses: Sequence[Status], *, verbose: bool) -> None:
 
 
 def panel(statuses: Sequence[Status], width: int, height: int, *, verbose: bool = False) -> list[str]:
-    """Return lines that fit a terminal: the first of each mount, and of its others what there is room for."""
+    """Return lines that fit a terminal: the first of each mount, and as many others as there is room for."""
     if not statuses:
         return [NOTHING]
     blocks = [status_lines(status, verbose=verbose) for status in statuses]
@@ -216,9 +216,9 @@ def _cut(block: list[Line], room: int) -> list[Line]:
 
 
 def screen(lines: Sequence[str]) -> str:
-    """Return what draws the lines from the top of a terminal, the first line of each mount in bold.
+    """Return the text that draws the lines from the top of a terminal, the first line of each mount in bold.
 
-    All is erased before: behind a line as wide as the terminal an erasure takes its last character.
+    Everything is erased first: an erasure behind a line as wide as the terminal removes its last character.
     """
     shown = (line if line.startswith(" ") else f"\x1b[1m{line}\x1b[m" for line in lines)
     return "\x1b[H\x1b[J" + "\n".join(shown)
@@ -227,7 +227,7 @@ def screen(lines: Sequence[str]) -> str:
 def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
     """Show the status again each second until interrupted; on a terminal in place, on a screen of its own.
 
-    What was shown last stays.
+    The last picture stays.
     """
     if not sys.stdout.isatty():
         while True:

@@ -56,7 +56,7 @@ def run(
     """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
     target = _target(args, component)
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
-    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
+    if not args.debug:  # the caches' warnings are raised as errors, too, in one line
         logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
     with open_sinks(target.options, debug=args.debug, tell=say) as sinks:
         return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
@@ -109,7 +109,7 @@ def say(line: str) -> None:
 
 @contextmanager
 def _on_interrupt(line: Callable[[], str]) -> Iterator[None]:
-    """Say in a line what is there and what is not, when Ctrl-C ends the body."""
+    """Say in one line what was done, when Ctrl-C ends the body."""
     try:
         yield
     except KeyboardInterrupt:
@@ -198,7 +198,7 @@ def cat(args: Args) -> int:
         sys.stdout.buffer.flush()
 
     async def take(data: bytes | memoryview) -> None:
-        # In a thread: the reader may take its time, and the vehicle is to hear of us meanwhile.
+        # In a thread: the reader may be slow, and the vehicle has to hear of us meanwhile.
         await trio.to_thread.run_sync(write, bytes(data), abandon_on_cancel=True)
 
     async def work(session: Session) -> None:
@@ -210,7 +210,8 @@ def cat(args: Args) -> int:
 
 
 def _exit_code(outcome: download.Outcome) -> int:
-    """Return the code for what failed; that of a missing path is the same, however many were asked for."""
+    """Return the exit code for what failed. A missing path has the same code, however many paths were
+    given."""
     return max(map(exit_code_for, outcome.failed.values()), default=ExitCode.OK)
 
 
@@ -328,10 +329,10 @@ def put(args: Args) -> int:
 
 @contextmanager
 def _spooled_stdin() -> Iterator[Path]:
-    """Keep what stdin has in a file: how much it is has to be known before, and it may be sent twice.
+    """Copy stdin to a file: its size has to be known before, and it may be sent twice.
 
     Raises:
-        NotDelivered: the body did. Nobody else has the bytes, so they are kept, and the text says where.
+        NotDelivered: the body did. The bytes are nowhere else, so they are kept, and the text says where.
     """
     with NamedTemporaryFile(prefix="mavftpfs-") as file:
         shutil.copyfileobj(sys.stdin.buffer, file)

@@ -27,7 +27,7 @@ from mavftpfs.shared.readable import readable, readable_time
 EXEC_LIMIT = 600.0
 """Seconds for the command of --exec."""
 _LAST_WORDS = 1.0
-"""Seconds to read what it said, after it ended."""
+"""Seconds to read its last output, after it ended."""
 _KILL_AFTER = 5.0
 """Seconds between SIGTERM and SIGKILL."""
 
@@ -60,7 +60,7 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
 
 
 def say(line: str) -> None:
-    """Print a line; with the time where nobody else adds it."""
+    """Print a line; with the time, unless the journal adds it."""
     when = f"{time.strftime('%H:%M:%S')} " if sys.stdout.isatty() else ""
     print(f"{when}{readable(line)}", flush=True)
 

@@ -1,7 +1,7 @@
 """Going to the background, and logging there. Layer: mount; imports no trio.
 
-The fork happens before trio and threads start. The parent stays until the child says over a pipe how it
-went, so that `mavftpfs SOURCE DIR && ls DIR` works and a failure has an exit code and a reason.
+The fork happens before trio and threads start. The parent stays until the child reports success or failure
+over a pipe. So `mavftpfs SOURCE DIR && ls DIR` works, and a failure has an exit code and a reason.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
-"""Tells the command that waits for a mount (exit code, one line): 0 and perhaps a notice once it is up,
-else why there will be none. Only the first call counts."""
+"""Called with (exit code, one line) for the command that waits for a mount: 0 and perhaps a notice once it is
+up, else why it failed. Only the first call counts."""
 
 SYSLOG_SOCKET = "/dev/log"
 MAX_REPORT = 64 * 1024
 _LOG_SIZE = 1 << 20
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""What ends a parent that still waits, and the child with it."""
+"""Signals that end a parent that still waits, and its child."""
 
 
 class _Ended(BaseException):
@@ -134,7 +134,7 @@ def _ending_raises() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let the signals that end us wait for the end of the body: nobody else would know what it starts."""
+    """Delay the signals that end us until after the body: else what it starts would be left behind."""
     came: list[int] = []
     try:
         with _handled_by(lambda number, _: came.append(number)):
@@ -146,7 +146,7 @@ def signals_held() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Give the signals that end us to a handler, but for those that our caller has us ignore (nohup)."""
+    """Give the signals that end us to a handler, except those that our caller made us ignore (nohup)."""
     taken = [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, handler) for number in taken}
     try:
@@ -171,7 +171,7 @@ def log_to_stderr(level: int) -> None:
 
 
 class _PrivateFile(logging.handlers.RotatingFileHandler):
-    """Adds to a file that is made 0600. Without maxBytes it is never turned."""
+    """Appends to a file that is made 0600. Without maxBytes it is never rotated."""
 
     def _open(self) -> TextIOWrapper:
         return open(open_private(self.baseFilename, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8")
@@ -187,7 +187,7 @@ def log_to_file(path: str, level: int) -> None:
 
 
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
-    """Log to syslog, or where there is none to a small file that is kept in turns."""
+    """Log to syslog; if there is none, to a small file that is rotated."""
     form = f"mavftpfs[{os.getpid()}]: %(levelname)s %(name)s: %(message)s"
     handler: logging.Handler
     if Path(socket).is_socket():  # the handler itself says nothing about a missing one
@@ -200,7 +200,7 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
 
 
 class _Readable(logging.Formatter):
-    """Shows names as a person reads them; local ones may be no text."""
+    """Shows names as a person reads them; local names may be no valid text."""
 
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""

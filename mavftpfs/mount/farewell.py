@@ -13,7 +13,7 @@ from mavftpfs.shared.errors import MavftpfsError
 log = logging.getLogger("mavftpfs.mount")
 
 DRAIN_LIMIT = 300.0
-"""Seconds to go on delivering after the kernel let go; a second signal ends it sooner."""
+"""Seconds to go on delivering after the kernel mount is gone; a second signal ends it sooner."""
 
 
 def keep_the_rest(tree: Tree, directory: Path) -> str:
@@ -37,7 +37,8 @@ def keep_the_rest(tree: Tree, directory: Path) -> str:
 
 
 async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> None:
-    """Deliver or keep; `tell` gets the line that goes with exit code 4. Keeps also when cancelled."""
+    """Deliver, or keep what is left; `tell` gets the line that goes with exit code 4. When cancelled,
+    keep."""
     try:
         waiting = tree.undelivered()
         if waiting:

@@ -2,10 +2,10 @@
 
 Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
-The kernel knows a file by number and says with forget how many of our answers it dropped. A number
-is a hash of the path at the time it was given out, so it is the same after the kernel forgot it, and in
-the next mount too: git's index and incremental backups compare st_ino, and every doubt costs them a
-re-read over a radio. A number that is taken (a hash collision, or a file that was renamed or unlinked
+The kernel knows a file by number, and tells with forget how many of our answers it dropped. A number is a
+hash of the path at the time when it was given out. So it is the same after the kernel forgot it, and in the
+next mount: git's index and incremental backups compare st_ino, and read the file again over a radio if that
+changed. A number that is taken (a hash collision, or a file that was renamed or unlinked
 while the kernel knows it) is stepped over. `generation` is a counter, so that a (number, generation)
 pair never names two files.
 
@@ -34,7 +34,8 @@ from mavftpfs.shared.model import ROOT, EntryKind
 
 @dataclass(frozen=True, slots=True)
 class Presentation:
-    """How entries look, and how long requests may take. Modes are permission bits; deadline in seconds."""
+    """How entries are shown, and how long requests may take. Modes are permission bits; deadline in
+    seconds."""
 
     uid: int
     gid: int
@@ -54,7 +55,7 @@ def closed_on_failure(close: Callable[[], None]) -> Iterator[None]:
 
 
 def is_mapped_page(start: int, stop: int, told: int) -> bool:
-    """Return whether a write brings a page of a mapping instead of what a program appended.
+    """Return whether a write is a page of a mapping, not bytes that a program appended.
 
     The kernel brings pages by any handle that may write, also one with O_APPEND. They lie on page borders and
     within the size it knows (`told`, bytes), where nothing can be appended.
@@ -66,7 +67,7 @@ def is_mapped_page(start: int, stop: int, told: int) -> bool:
 class FileHandle:
     """One open() of a file. flags: as given to open(2).
 
-    ahead: ends each of the reads under way by which the kernel reads ahead. let_go: these were ended once.
+    ahead: the scopes of the kernel's readahead that is under way. let_go: these reads were ended once.
     """
 
     ino: int
@@ -80,7 +81,7 @@ class FileHandle:
 class DirectoryHandle:
     """One opendir(). `entries` is the snapshot that its offsets count in: entry i has offset i + 1.
 
-    cut_short: they are not all that the directory has.
+    cut_short: the directory has more.
     """
 
     ino: int
@@ -159,7 +160,7 @@ class InodeTable:
         self._by_path: dict[bytes, Inode] = {ROOT: root}
         self._absent: dict[tuple[int, bytes], float] = {}
         self.excess_forgets = 0
-        """Forgets beyond the count: a bug here or in the kernel, never a crash."""
+        """Forgets beyond the count. They are a bug here or in the kernel, but no crash."""
 
     def __len__(self) -> int:
         """Return how many inodes are alive, the root included."""
@@ -189,7 +190,7 @@ class InodeTable:
         inode.lookups += 1
 
     def discard(self, inode: Inode) -> None:
-        """Drop a reserved inode that the kernel was not told about after all."""
+        """Drop a reserved inode of which the kernel was not told."""
         if inode.lookups == 0:
             self._free(inode)
 
@@ -200,7 +201,8 @@ class InodeTable:
         return inode
 
     def forget(self, ino: int, lookups: int) -> None:
-        """Take back `lookups` answers; at zero the inode is freed. Never raises: nobody could be told."""
+        """Take back `lookups` answers; at zero the inode is freed. Never raises, because forget has no
+        reply."""
         inode = self._by_ino.get(ino)
         if inode is None:
             self.excess_forgets += 0 if ino == ROOT_INO else 1
@@ -274,7 +276,7 @@ class InodeTable:
 
 
 MAX_KEPT = 100_000
-"""Paths of which something that was set is remembered."""
+"""Paths for which attributes that were set are remembered."""
 NANO = 1_000_000_000
 
 
@@ -311,10 +313,10 @@ class UserAttributes:
 class UserAttributeTable:
     """What was set on a bounded number of paths; the least recently changed are forgotten first.
 
-    Kept by path for the life of the mount: the kernel forgets inodes at will. A directory's time is the one
-    that was set, until entries are made, removed or renamed in it. From then on it is the time of that, or
-    the vehicle's where that is later: a memory card keeps none, and the programs that look for changes by it
-    (make, mail readers, git's untracked cache) would see none.
+    Kept by path for the life of the mount: the kernel forgets inodes at will. A directory has the time that
+    was set, until entries are made, removed or renamed in it. From then on it has the time of the last such
+    change, or the vehicle's time if that is later. A memory card keeps no time for it, and programs that look
+    for changes by it (make, mail readers, git's untracked cache) would see none.
     """
 
     def __init__(self, limit: int = MAX_KEPT) -> None:
@@ -341,7 +343,7 @@ class UserAttributeTable:
         kept.mtime_ns, kept.changed_ns = None, now_ns
 
     def drop(self, path: bytes) -> None:
-        """The path is gone."""
+        """Forget a path, because it is gone."""
         self._kept.pop(path, None)
 
     def move(self, old: bytes, new: bytes) -> None:

@@ -1,8 +1,8 @@
 """The kernel mount: composition root, and a mount's life from first heartbeat to unmount. Layer: mount.
 
-Order matters. The vehicle must have answered before the kernel mount appears; at the end the kernel lets go
-first and the server session is closed after it, each within a bound. While mounted, nothing in the event loop
-may make a system call on the mountpoint: it would wait for itself.
+Order matters. The vehicle must have answered before the kernel mount appears. At the end the kernel mount
+goes first, and then the server's session is closed, each within a time limit. While mounted, nothing in the
+event loop may make a system call on the mountpoint: it would wait for itself.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ log = logging.getLogger("mavftpfs.mount")
 
 MIN_TASKS = 10
 MAX_TASKS = 2000
-"""Requests in the works at once. At pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
+"""Requests under way at once. With pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
 
 GRACE = 2.0
-"""Seconds that requests in the works get to finish after a signal."""
+"""Seconds that requests under way get to finish after a signal."""
 
 FORGETTING_TIME = 2.0
 """Seconds for the kernel to forget what it cached, for a command that waits for that."""
@@ -69,7 +69,7 @@ class MountRequest:
 
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
-"""Brings the vehicle up; is given the callback for paths whose bytes changed."""
+"""Connects to the vehicle. Its argument is called for paths whose bytes changed."""
 
 
 def run_mount(request: MountRequest, report: Report) -> int:
@@ -114,8 +114,8 @@ class Invalidator:
     """Tells the kernel that what it cached is old, by its calls `notify(ino, attr_only)` and
     `notify_name(parent ino, name)`.
 
-    These run in a worker thread: the kernel waits in them for pages that are being read and for names that
-    are looked up, and the event loop answers those.
+    These run in a worker thread. In them the kernel waits for pages that are being read and for names that
+    are being looked up, and the event loop has to answer those.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Invalidator:
         return bool(self._calls)
 
     def on_changed(self, path: bytes) -> None:
-        """The bytes at `path` are others now: have the kernel drop its pages and attributes."""
+        """Make the kernel drop its pages and attributes of a path, because its bytes changed."""
         ino = self._inodes.known(path)
         if ino is not None:
             self._pending.add(ino)
@@ -155,18 +155,19 @@ class Invalidator:
                 await self._tell(ino, attr_only=False)
 
     async def forget_attributes(self, ino: int) -> None:
-        """Have the kernel ask for attributes again; back when it has forgotten them."""
+        """Make the kernel ask for attributes again; return when it has forgotten them."""
         await self._tell(ino, attr_only=True)
 
     async def forget_name(self, path: bytes) -> None:
-        """Have the kernel look a name up again; back when it has forgotten it."""
+        """Make the kernel look a name up again; return when it has forgotten it."""
         directory, name = split(path)
         parent = self._inodes.known(directory)
         if parent is not None:
             await self._in_thread([partial(self._notify_name, parent, name)])
 
     async def forget_beliefs(self) -> None:
-        """Have the kernel ask again for all that it would answer by itself; back when it has forgotten it."""
+        """Make the kernel ask again for all that it would answer by itself; return when it has forgotten
+        it."""
         inodes, absent = self._inodes.believed(trio.current_time())
         calls = [partial(self._notify, ino, True) for ino in inodes]
         await self._in_thread(calls + [partial(self._notify_name, *name) for name in absent])
@@ -219,7 +220,7 @@ class _Life:
             self.report(self.code, str(error))
 
     async def attach_and_serve(self, attach: Attach, nursery: trio.Nursery) -> None:
-        """Run until the kernel mount is gone, and what programs wrote is delivered, or kept.
+        """Run until the kernel mount is gone, and everything that programs wrote is delivered or kept.
 
         A second signal ends the delivery, not the keeping.
         """
@@ -252,7 +253,7 @@ class _Life:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(invalidator.run)
             gc.collect()
-            gc.freeze()  # a full collection would look through all that was imported, in mid-transfer
+            gc.freeze()  # else a full collection would go through all imported modules during a transfer
             # Move old files only now. If mounting failed afterwards, nobody would hear where they are.
             self.report(0, notice())
             with trio.CancelScope() as self._loop_scope:
@@ -284,7 +285,7 @@ class _Life:
             path = os.fsencode(request["path"])
             there = await vehicle.tree.withdraw(path)
             if there is False:
-                operations.inodes.unlink(path)  # a reader keeps what was withdrawn, by a number of its own
+                operations.inodes.unlink(path)  # a reader keeps the withdrawn file, under a number of its own
             with trio.move_on_after(FORGETTING_TIME):
                 await invalidator.forget_name(path)
             return {"there": there}
@@ -309,9 +310,9 @@ class _Life:
             except MountFailed:
                 if await trio.to_thread.run_sync(is_ours, self.request.mountpoint):
                     raise
-                # Somebody else unmounted it meanwhile: wait for the end as they do.
+                # It was unmounted meanwhile: wait for the end, too.
         if lazy:
-            self._stop_gently()  # the kernel lets go only when the last user does, which may be never
+            self._stop_gently()  # the kernel ends it only with its last user, which may be never
         await self.finished.wait()
         return {"exit_code": int(self.code), "pid": os.getpid(), "message": self.farewell}
 
@@ -335,7 +336,7 @@ class _Life:
     # -- signals ----------------------------------------------------------------------------------
 
     async def watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Unmount on the first signal; stop waiting for anybody on the second, or once the mount is gone."""
+        """Unmount on the first signal; stop waiting on the second, or once the mount is gone."""
         with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
             task_status.started()
             async for number in signals:
@@ -391,7 +392,8 @@ def kernel_mount(
 
 @contextmanager
 def watcher_told_last() -> Iterator[None]:
-    """Mount in the body. With auto_unmount, have fusermount3 hear of our end after the kernel did.
+    """Mount in the body. With auto_unmount, make sure that the kernel notices our end before fusermount3
+    does.
 
     It waits for the end of a socket that libfuse opens for it, and never uses again. If the kernel has not
     given the mount up by then, fusermount3 takes the mount for a living one and leaves it. When a process is
@@ -444,10 +446,10 @@ def never_blocking() -> Iterator[None]:
     """Have pyfuse3.main read /dev/fuse without blocking for the length of the body.
 
     It waits until there is a request, and then reads it with a call that blocks, in the event loop's thread.
-    In between the request may be gone: the kernel takes it back when its caller is killed. Then nothing at
-    all would go on, the link included, until somebody asks for something else. So the descriptor is made
-    non-blocking, it is looked at once more right before each read, and a worker that found nothing begins
-    anew. (It loses its buffer then: 1 MiB of addresses, of which little was touched.)
+    In between the request may be gone: the kernel takes it back when its caller is killed. Then everything
+    would stand still, the link included, until the next request. So the descriptor is made non-blocking, it
+    is checked once more right before each read, and a worker that found nothing starts again. (It loses its
+    buffer then: 1 MiB of addresses, of which little was touched.)
 
     The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`.
     """
@@ -459,7 +461,7 @@ def never_blocking() -> Iterator[None]:
 
 
 class _Delegate:
-    """Has whatever a module has, but for what a subclass defines."""
+    """Has the attributes of a module, except those that a subclass defines."""
 
     def __init__(self, module: object) -> None:
         self._module = module
@@ -486,7 +488,7 @@ class _Trio(_Delegate):
 
     @asynccontextmanager
     async def open_nursery(self) -> AsyncIterator[_Workers]:
-        """Open the one of pyfuse3's workers."""
+        """Open the nursery of pyfuse3's workers."""
         async with trio.open_nursery() as nursery:
             yield _Workers(nursery)
 

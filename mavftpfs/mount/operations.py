@@ -6,10 +6,10 @@ killed; trio.Cancelled passes.
 
 Inodes are touched only between awaits: reserve, reply and count form one atomic step.
 
-flush is called for every closed descriptor, also of programs that wrote nothing, so it asks the handle:
-one that was opened for reading has nothing to say. fsync is asked for by name, and is about the file: any
-handle will do (`sync FILE` opens for reading). release cannot report; what it finds undelivered stays with
-the tree. A mount with `ro` is refused changes by the kernel, and by the tree.
+flush is called for every closed descriptor, also of programs that wrote nothing. So it asks the handle, and a
+handle for reading has nothing to deliver. A program asks for fsync, and means the file: any handle will do
+(`sync FILE` opens for reading). release cannot report errors; undelivered bytes stay with the tree. A mount
+with `ro` is refused changes by the kernel, and by the tree.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ CRC_BUDGET = 120.0
 """Seconds for a checksum: the drone reads the whole file for it (promise 2)."""
 
 DELIVERY_BUDGET = 4 * 3600.0
-"""Seconds for what moves bytes: the tree ends it by itself when there is no progress, so this only keeps
-a trickle from lasting for ever."""
+"""Seconds for calls that move bytes. The tree itself ends them when there is no progress, so this only ends a
+trickle."""
 
 NAMESPACE_BUDGET = 240.0
 """Seconds for a change of names: it may have to finish a delivery, and to look whether it was done."""
@@ -74,7 +74,7 @@ SLOWEST_RATE = 256
 only keeps a read that trickles from lasting for ever."""
 
 DOTS = (b".", b"..")
-"""Of these entries the kernel takes the number and the kind, and counts no lookup."""
+"""The kernel takes number and kind of these entries, and counts no lookup."""
 _ANY_DIRECTORY = Stat(EntryKind.DIRECTORY, 0, 0, 0.0)
 
 BLOCK_SIZE = 4096
@@ -89,7 +89,7 @@ Handler = Callable[Concatenate[S, P], Coroutine[Any, Any, T]]
 
 
 Refresh = Callable[[int], Awaitable[None]]
-"""Has the kernel forget an inode's attributes (not its pages)."""
+"""Makes the kernel forget an inode's attributes (not its pages)."""
 
 
 async def _no_refresh(ino: int) -> None:
@@ -160,7 +160,7 @@ class Operations(pyfuse3.Operations):
         return self._look.op_deadline + DEADLINE_MARGIN
 
     def counts(self) -> dict[str, int]:
-        """Return how much the kernel holds of ours; excess forgets are a bug, here or there."""
+        """Return how many inodes and handles the kernel has; excess forgets are a bug, here or there."""
         return {
             "inodes": len(self.inodes),
             "open_files": len(self.files),
@@ -188,7 +188,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def access(self, inode: int, mode: int, ctx: RequestContext) -> bool:
-        """Never asked while default_permissions is on, which is always."""
+        """Not called, because default_permissions is always on."""
         return True
 
     @handler
@@ -210,8 +210,8 @@ class Operations(pyfuse3.Operations):
         """Reply with entries and attributes, as many as the kernel takes.
 
         Offsets count in a snapshot, so a change of the directory in the meantime neither skips nor
-        repeats a name; rewinding takes a new one. What is known of a directory that could not be listed to
-        its end is shown, and then the program gets an error: `rsync --delete` believes what it sees.
+        repeats a name; rewinding takes a new one. If a directory could not be listed to its end, the known
+        part is shown, and then the program gets an error: `rsync --delete` believes what it sees.
         """
         handle = self._directory(fh)
         if start_id == 0:
@@ -304,7 +304,7 @@ class Operations(pyfuse3.Operations):
         handle = self._file(fh)
         file = handle.file
         with trio.CancelScope() as scope:
-            # More than a page at once is read ahead into the page cache.
+            # More than a page at once is the kernel's readahead into the page cache.
             if size > mmap.PAGESIZE and not (file.writable or file.direct_io or handle.let_go):
                 handle.ahead[scope.cancel] = None
             try:
@@ -320,7 +320,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def write(self, fh: int, off: int, buf: bytes) -> int:
-        """Take bytes; what is taken is kept until it is proven to be on the card."""
+        """Take bytes, and keep them until it is proven that the card has them."""
         handle = self._file(fh)
         file = handle.file
         if not file.writable:
@@ -329,7 +329,7 @@ class Operations(pyfuse3.Operations):
         told, stop = known.told_size or 0, off + len(buf)
         known.told_size = max(told, stop)  # the kernel counts on without asking
         if handle.flags & os.O_APPEND and not is_mapped_page(off, stop, told):
-            off = file.size  # the kernel's idea of the size may be older than ours
+            off = file.size  # the size that the kernel knows may be older than ours
         return await file.write(off, buf)
 
     @handler
@@ -351,12 +351,12 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:
-        """0 means that everything written is on the card, checked, by whichever handle."""
+        """0 means that everything written is on the card, checked, whichever handle wrote it."""
         await self._file(fh).file.fsync()
 
     @handler
     async def release(self, fh: int) -> None:
-        """The last descriptor was closed; nobody hears errors any more, but the tree keeps the bytes."""
+        """The last descriptor was closed. No program gets errors any more, but the tree keeps the bytes."""
         handle = self.files.remove(fh)
         if handle is None:
             return
@@ -506,7 +506,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def listxattr(self, inode: int, ctx: RequestContext) -> list[bytes]:
-        """List the root's status only: listed checksums would have `cp -a` ask for one of every log."""
+        """List the root's status only: if checksums were listed, `cp -a` would ask for that of every log."""
         return [XATTR_STATUS] if inode == ROOT_INO else []
 
     # -- helpers ----------------------------------------------------------------------------------

@@ -42,8 +42,8 @@ IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 @dataclass(frozen=True, slots=True)
 class MountOptions:
-    """What `-o` says. Octal bits; None = not given. client: what is no matter of the kernel. all: a mount for
-    each vehicle that is heard, below the mountpoint."""
+    """The options of `-o`. Octal bits; None = not given. client: options that do not concern the kernel. all:
+    a mount for each vehicle that is heard, below the mountpoint."""
 
     client: Options = field(default_factory=Options)
     allow_other: bool = False
@@ -102,7 +102,7 @@ FLAGS: Flags = {**client.FLAGS, **OWN_FLAGS}
 
 
 def parse_options(texts: Iterable[str]) -> MountOptions:
-    """Parse the values of all `-o`; what is said later wins.
+    """Parse the values of all `-o`; later words win.
 
     Raises:
         UsageError: an unknown option, a missing or bad value; the message names the option.

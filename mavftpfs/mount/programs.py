@@ -9,8 +9,8 @@ _GROUP, _STARTED = b"Tgid:", 19
 
 
 def program_of(thread: int) -> tuple[int, int] | None:
-    """Return what tells a thread's process from all others, also from a later one of that number; None if
-    it is not to be seen here (another container's).
+    """Return what tells a thread's process from all others, also from a later process with its number; None
+    if it cannot be seen here (another container's).
     """
     folder = Path(f"/proc/{thread}")
     try:

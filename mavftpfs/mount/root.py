@@ -1,7 +1,7 @@
 """The directory in which the mounts of several vehicles are: what the kernel sees of it. Layer: mount.
 
 It is local, and holds directories only, one for each vehicle. Each is covered by that vehicle's own mount.
-Neither the root before the first heartbeat nor a directory that is not covered can be listed: an empty
+The root cannot be listed before the first heartbeat, nor can a directory that is not covered: an empty
 directory would tell `rsync --delete` that all logs are gone.
 
 The kernel keeps names and attributes for ever. So the vehicles' mounts can be reached even if this process is
@@ -27,16 +27,16 @@ from mavftpfs.mount.roster import Member, Roster, is_component, parse_name
 FOREVER = 1e8
 """Seconds."""
 LOOK_PATIENCE = 4.0
-"""Seconds for a part of a vehicle to show that it is there."""
+"""Seconds for a part of a vehicle to answer."""
 ABSENT = 10.0
-"""Seconds for which the kernel believes that it is not."""
+"""Seconds for which the kernel believes that a part is not there."""
 
 Look = Callable[[int, int], Awaitable[bool]]
 """Asks a component of a system for its files; returns whether it answered."""
 
 
 class RootOperations(pyfuse3.Operations):
-    """Implements pyfuse3's handlers for the root. look: for components that nobody asked for yet."""
+    """Implements pyfuse3's handlers for the root. look: asks components that were not asked yet."""
 
     supports_dot_lookup = True
     enable_writeback_cache = False
@@ -77,7 +77,7 @@ class RootOperations(pyfuse3.Operations):
         return self._roster.add(*key) if answered else None
 
     async def forget(self, inode_list: Sequence[tuple[int, int]]) -> None:
-        """Nothing is counted: numbers stay."""
+        """Nothing to do: lookups are not counted, because numbers stay."""
 
     async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
         """Return a directory's attributes."""
@@ -98,7 +98,7 @@ class RootOperations(pyfuse3.Operations):
                 return
 
     async def releasedir(self, fh: int) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     async def statfs(self, ctx: RequestContext) -> StatvfsData:
         """Return that nothing can be stored here."""
@@ -118,7 +118,7 @@ class RootOperations(pyfuse3.Operations):
         return [XATTR_STATUS] if inode == ROOT_INO else []
 
     async def access(self, inode: int, mode: int, ctx: RequestContext) -> bool:
-        """Never asked while default_permissions is on, which is always."""
+        """Not called, because default_permissions is always on."""
         return True
 
     # -- nothing can be made, changed or removed here

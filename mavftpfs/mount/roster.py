@@ -1,7 +1,7 @@
 """Which vehicles a mount of all of them has, and in which state each is. Layer: mount; pure.
 
-A vehicle is told by its system id; a part of it other than the autopilot by both ids. What was heard once
-stays: a name never disappears, so that no program takes a lost vehicle for an empty directory.
+A vehicle is known by its system id; another part of it than the autopilot by both ids. A name never
+disappears, so that no program takes a lost vehicle for an empty directory.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
 """Seconds before a mount that failed is started again; doubled each time."""
 MOST = 64
-"""Vehicles of one mount: anybody can send heartbeats with any id."""
+"""Vehicles of one mount. A limit, because any program can send heartbeats with any id."""
 
 _NAME = re.compile(rb"([1-9][0-9]{0,2})(?:-([1-9][0-9]{0,2}))?")
 
@@ -43,7 +43,7 @@ NEXT = {
     State.FAILED: {State.STARTING},
     State.UNMOUNTED: set(),
 }
-"""State -> what may follow. A mount that the user ended stays so."""
+"""State -> the states that may follow. A mount that the user ended stays ended."""
 
 
 @dataclass(slots=True)
@@ -81,7 +81,7 @@ class Member:
         self.pause, self.problem = FIRST_PAUSE, ""
 
     def ended(self, code: int, problem: str, now: float) -> None:
-        """Its mount's process ended; code 0: because somebody unmounted it."""
+        """Its mount's process ended; code 0: it was unmounted."""
         if code == 0:
             self._go_to(State.UNMOUNTED)
             return
@@ -92,7 +92,7 @@ class Member:
 
 
 def parse_name(name: bytes) -> tuple[int, int] | None:
-    """Return system and component that the name of a directory stands for, None if for nothing."""
+    """Return the system and component of a directory's name, None if it names none."""
     found = _NAME.fullmatch(name)
     if found is None:
         return None
@@ -137,7 +137,7 @@ class Roster:
                 member.heard_at = now
 
     def add(self, system: int, component: int) -> Member | None:
-        """Return the vehicle, or the part of one, made known if it was not; None if there are too many."""
+        """Return the vehicle, or the part of one, added if it was not known; None if there are too many."""
         member = self._members.get((system, component))
         if member is None and len(self._members) < MOST:
             member = Member(system, component, FIRST_INO + len(self._members))

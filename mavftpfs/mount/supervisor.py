@@ -57,7 +57,7 @@ def run_all(request: MountRequest, command: Command, report: Report) -> int:
 
 class _Supervisor:
     def __init__(self, request: MountRequest, command: Command, report: Report) -> None:
-        # The root refuses by itself; fusermount3 mounts only where the user may write.
+        # The root itself refuses writes; fusermount3 mounts only where the user may write.
         client = replace(request.options.client, read_only=False)
         self._request = replace(request, options=replace(request.options, client=client))
         self._command = command
@@ -106,7 +106,7 @@ class _Supervisor:
                     tasks.start_soon(self._keep_members, tasks)
                     tasks.start_soon(self._tell_when_up)
                     await fuse_loop()
-                    await self._end_members()  # somebody unmounted the root alone, lazily
+                    await self._end_members()  # the root alone was unmounted, lazily
 
     async def _tell_when_up(self) -> None:
         with trio.move_on_after(FIRST_PATIENCE):
@@ -120,7 +120,8 @@ class _Supervisor:
     # -- vehicles
 
     async def _hear(self, link: Link) -> None:
-        """Note what is there. Our own heartbeats are for bridges that answer only a client that speaks."""
+        """Note which vehicles are heard. Some bridges answer only a client that speaks, so we send
+        heartbeats."""
         options = self._request.options.client
         own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
         key = connect_options(options).signing_key
@@ -171,7 +172,7 @@ class _Supervisor:
     async def _keep_mounted(self, member: Member) -> None:
         """Run a vehicle's mount until it ends."""
         place = self._place(member)
-        # Of a session of its own: Ctrl-C is for us, and we have it end in order.
+        # In a session of its own: Ctrl-C reaches only us, and we end it in order.
         process = await trio.lowlevel.open_process(
             self._command(member),
             stdin=subprocess.DEVNULL,
@@ -203,7 +204,7 @@ class _Supervisor:
     # -- the end
 
     async def _end_members(self, *, lazy: bool = True) -> list[str]:
-        """Have all mounts deliver and end, at once; return what those say that do not."""
+        """Make all mounts deliver and end, at the same time; return the words of those that do not."""
         self._ending = True
         problems: list[str] = []
         async with trio.open_nursery() as nursery:
@@ -225,7 +226,7 @@ class _Supervisor:
             if not isinstance(exc, control.NobodyThere):
                 problems.append(str(exc))
                 return
-            process.send_signal(signal.SIGTERM)  # it is just coming up
+            process.send_signal(signal.SIGTERM)  # it is still starting
         else:
             self._code = max(self._code, ExitCode(reply["exit_code"]))
             self._message = "; ".join(filter(None, (self._message, reply.get("message"))))
