@@ -178,9 +178,9 @@ class KeptCache:
         while self._takes_more:
             await trio.sleep(SETTLED)
             before, seen = seen, self._in_memory()
-            for version, held in seen.items():
+            for version, here in seen.items():
                 known = before.get(version, {})
-                await self._keep(version, {i: b for i, b in held.items() if known.get(i) is b})
+                await self._keep(version, {i: b for i, b in here.items() if known.get(i) is b})
 
     async def keep_whole_files(self) -> None:
         """Keep the files that were read whole, even those read lately, because the mount ends."""
@@ -190,14 +190,14 @@ class KeptCache:
 
     def _in_memory(self) -> dict[Version, dict[int, bytearray]]:
         """Return the blocks that are whole and not on the disk, of files that may be kept."""
-        held: dict[Version, dict[int, bytearray]] = {}
+        here: dict[Version, dict[int, bytearray]] = {}
         for version, index in self._blocks.used:
             block = version.block(index)
             if block is None or version.kept is None or index in version.kept.done:
                 continue
             if not version.missing(*_extent(version.size, index)):
-                held.setdefault(version, {})[index] = block
-        return held
+                here.setdefault(version, {})[index] = block
+        return here
 
     def _may_keep(self, version: Version, key: FileKey) -> bool:
         """Return whether a version is still, for all we know, what its key says."""

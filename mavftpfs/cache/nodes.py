@@ -3,7 +3,7 @@
 A node is one file of this mount, whatever its name: handles follow it when it is renamed, and keep it when
 it is unlinked. Nodes without handles and without anything to deliver are forgotten.
 
-Locks: see `pathlocks`. A node's lock is taken before its path is held.
+Locks: see `pathlocks`. A node's lock is taken before the path lock.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ find out whether the disk cuts names short."""
 class CacheOptions:
     """Times in seconds, sizes in bytes.
 
-    root: the vehicle's directory that is the mount's `/`. read_only: nothing there is changed or hidden.
+    root: the vehicle's directory that is the mount's `/`. read_only: nothing is changed, all names are shown.
     dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s, and
     longer for an expensive listing.
     attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.

@@ -185,7 +185,7 @@ class Version:
         *,
         on_dropped: Callable[[Version], None] = lambda version: None,
     ) -> None:
-        """`on_dropped` is called when its bytes are dropped in doubt: the kernel may hold copies."""
+        """`on_dropped` is called when its bytes are dropped in doubt: the kernel may have copies."""
         self.path = path
         self.size = size
         self.mtime = mtime
@@ -260,14 +260,14 @@ class Version:
         for at, stop in self._present.missing(offset, min(offset + len(data), self.size)):
             while at < stop:
                 index = at // BLOCK_SIZE
-                base = index * BLOCK_SIZE
+                first = index * BLOCK_SIZE
                 block = self._blocks.get(index)
                 if block is None:
-                    length = min(BLOCK_SIZE, self.size - base)
+                    length = min(BLOCK_SIZE, self.size - first)
                     self._cache.add(self, index, length)
                     block = self._blocks[index] = bytearray(length)
-                end = min(stop, base + BLOCK_SIZE)
-                block[at - base : end - base] = whole[at - offset : end - offset]
+                end = min(stop, first + BLOCK_SIZE)
+                block[at - first : end - first] = whole[at - offset : end - offset]
                 self._present.add(at, end)
                 at = end
 
@@ -408,9 +408,9 @@ class Version:
         while start < stop:
             index = start // BLOCK_SIZE
             self._cache.used.move_to_end((self, index))
-            base = index * BLOCK_SIZE
-            end = min(stop, base + BLOCK_SIZE)
-            parts.append(memoryview(self._blocks[index])[start - base : end - base].toreadonly())
+            first = index * BLOCK_SIZE
+            end = min(stop, first + BLOCK_SIZE)
+            parts.append(memoryview(self._blocks[index])[start - first : end - first].toreadonly())
             start = end
         return parts[0] if len(parts) == 1 else b"".join(parts)
 

@@ -328,15 +328,15 @@ class Hub:
             splitters[None] = Splitter(stream=True)
         while True:
             quiet = QUIET if stream and splitters[None].waiting else float("inf")
-            chunks: list[bytes] | None = None
+            pieces: list[bytes] | None = None
             with trio.move_on_after(quiet):
-                chunks = await link.receive()
+                pieces = await link.receive()
             frames: list[tuple[Place, Frame]] = []
-            if chunks is None:
+            if pieces is None:
                 frames = [(Place(side, link.sender(-1)), frame) for frame in splitters[None].give_up()]
-            elif not chunks:
+            elif not pieces:
                 self._on_reopened(side, splitters)
-            for index, chunk in enumerate(chunks or ()):
+            for index, piece in enumerate(pieces or ()):
                 address = link.sender(index)
                 key = None if stream else address
                 splitter = splitters.get(key)
@@ -345,7 +345,7 @@ class Hub:
                         splitters.clear()
                     splitter = splitters[key] = Splitter(stream=False)
                 place = Place(side, address)
-                frames += [(place, frame) for frame in splitter.feed(chunk)]
+                frames += [(place, frame) for frame in splitter.feed(piece)]
             if any(frame.crc_fits for _, frame in frames):
                 link.keep_peer()
             self._pass_on(frames, forwarded=forwarded)

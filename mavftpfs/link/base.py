@@ -18,7 +18,7 @@ from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
 
 MAX_DATAGRAM = 1400
-"""Bytes: below any usual MTU, and far below PX4's receive chunk (31 frames in one datagram were cut)."""
+"""Bytes: below any usual MTU, and far below PX4's receive buffer (31 frames in one datagram were cut)."""
 
 
 @dataclass(slots=True)
@@ -27,7 +27,7 @@ class LinkStats:
 
     received_bytes: int = 0
     sent_bytes: int = 0
-    sent_chunks: int = 0
+    writes: int = 0
     dropped_sends: int = 0
     reopened: int = 0
 
@@ -58,7 +58,7 @@ class Link(Protocol):
 
     @property
     def is_stream(self) -> bool:
-        """True for TCP and serial: chunk boundaries mean nothing."""
+        """True for TCP and serial: where one piece ends means nothing."""
         ...
 
     @property
@@ -72,7 +72,7 @@ class Link(Protocol):
         ...
 
     async def receive(self) -> list[bytes]:
-        """Wait for input and return 1..256 chunks, draining what is there.
+        """Wait for input and return 1..256 pieces, draining what is there.
 
         Returns an empty list when the link was reopened (the caller resets its parser).
 
@@ -90,7 +90,7 @@ class Link(Protocol):
         ...
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a chunk that `receive` returned last; None where there is only one sender."""
+        """Return the sender of a piece that `receive` returned last; None where there is only one sender."""
         ...
 
     def answer(self, address: NetAddress) -> None:

@@ -213,7 +213,7 @@ class Framer:
     # ------------------------------------------------------------------ receiving
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take a chunk of the stream, or a datagram, and return the messages it completed."""
+        """Take a piece of the stream, or a datagram, and return the messages it completed."""
         if self._tail:
             if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
                 self.reset()

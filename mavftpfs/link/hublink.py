@@ -140,12 +140,12 @@ class HubLink:
         await trio.lowlevel.checkpoint_if_cancelled()
         waited = False
         while True:
-            chunks = self._drain()
-            if chunks or self._reopened:
-                self._reopened = self._reopened and bool(chunks)
+            pieces = self._drain()
+            if pieces or self._reopened:
+                self._reopened = self._reopened and bool(pieces)
                 if not waited:
                     await trio.lowlevel.cancel_shielded_checkpoint()
-                return chunks
+                return pieces
             if self._closed:
                 raise LinkClosed(f"{self.description}: the hub is gone")
             waited = True
@@ -164,7 +164,7 @@ class HubLink:
                 self._work.set()
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return the network address that a chunk of the last batch came from."""
+        """Return the network address that a piece of the last batch came from."""
         return self._senders[index]
 
     def answer(self, address: NetAddress) -> None:
@@ -216,7 +216,7 @@ class HubLink:
             self.gone.set()
 
     def _drain(self) -> list[bytes]:
-        chunks: list[bytes] = []
+        pieces: list[bytes] = []
         senders: list[NetAddress | None] = []
         for _ in range(_MAX_MESSAGES):
             if self._closed:
@@ -230,15 +230,15 @@ class HubLink:
             if not message:
                 self._end()
             elif message[:1] == _FRAMES:
-                tag, chunk = unpack_frames(message)
-                chunks.append(chunk)
+                tag, piece = unpack_frames(message)
+                pieces.append(piece)
                 senders.append(self._sender(tag))
             elif (unpack_facts(message) or {}).get("reopened"):
                 self._reopened = True
-        if chunks:
+        if pieces:
             self._senders = senders
-            self.stats.received_bytes += sum(map(len, chunks))
-        return chunks
+            self.stats.received_bytes += sum(map(len, pieces))
+        return pieces
 
     def _sender(self, tag: bytes) -> NetAddress | None:
         try:
@@ -258,7 +258,7 @@ class HubLink:
         except OSError:
             self._end()
             return True
-        self.stats.sent_chunks += 1
+        self.stats.writes += 1
         self.stats.sent_bytes += len(message)
         return True
 

@@ -213,13 +213,13 @@ class SharedLink:
                 await trio.lowlevel.cancel_shielded_checkpoint()
                 return []
             try:
-                chunks = await inner.receive()
+                pieces = await inner.receive()
             except LinkClosed:
                 if self._inner is inner:
                     await self._changed.wait()
             else:
                 self._heard_by = inner
-                return chunks
+                return pieces
         raise LinkClosed(f"{self.description} is closed")
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
@@ -230,7 +230,7 @@ class SharedLink:
             self._inner.send_nowait(frames)
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a chunk of the list that `receive` returned last."""
+        """Return the sender of a piece of the list that `receive` returned last."""
         return None if self._heard_by is None else self._heard_by.sender(index)
 
     def answer(self, address: NetAddress) -> None:

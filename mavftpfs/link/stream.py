@@ -102,12 +102,12 @@ class StreamLink:
         while True:
             if self._closed:
                 raise LinkClosed(f"{self.description} is closed")
-            chunks = None if self._reopened else self._drain()
-            if chunks is None or chunks:
+            pieces = None if self._reopened else self._drain()
+            if pieces is None or pieces:
                 self._reopened = False
                 if not waited:  # one checkpoint per batch, and none where data could be lost
                     await trio.lowlevel.cancel_shielded_checkpoint()
-                return chunks or []
+                return pieces or []
             waited = True
             if self._pipe is None:
                 await self._changed.wait()
@@ -197,8 +197,8 @@ class StreamLink:
         self._changed = trio.Event()
 
     def _drain(self) -> list[bytes]:
-        chunks: list[bytes] = []
-        while self._pipe is not None and len(chunks) < MAX_READS:
+        pieces: list[bytes] = []
+        while self._pipe is not None and len(pieces) < MAX_READS:
             try:
                 data = os.read(self._pipe.fileno(), _READ_SIZE)
             except BlockingIOError:
@@ -208,12 +208,12 @@ class StreamLink:
             if not data:
                 self._lose()
                 break
-            chunks.append(data)
+            pieces.append(data)
             if len(data) < _READ_SIZE:
                 break  # saves the read that would say "nothing more"
-        if chunks:
-            self.stats.received_bytes += sum(map(len, chunks))
-        return chunks
+        if pieces:
+            self.stats.received_bytes += sum(map(len, pieces))
+        return pieces
 
     def _write(self, data: bytes) -> int:
         """Return how much the kernel took; a broken pipe takes all."""
@@ -228,7 +228,7 @@ class StreamLink:
             self._lose()
             return len(data)
         self.stats.sent_bytes += sent
-        self.stats.sent_chunks += 1
+        self.stats.writes += 1
         return sent
 
     def _lose(self) -> None:

@@ -85,7 +85,7 @@ async def open_tcp_server(spec: LinkSpec, inherited: Sequence[int] = ()) -> Asyn
 
 
 async def _connect(spec: LinkSpec) -> socket.socket:
-    """Try the host's addresses in turn.
+    """Try the host's addresses one after the other.
 
     Raises:
         OSError: that of the last address.

@@ -23,7 +23,7 @@ from mavftpfs.link.base import LinkStats, Outbox, Seat, background, pack
 from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
-MAX_CHUNKS = 256
+MAX_DATAGRAMS = 256
 """Datagrams taken per wake-up: more would starve heartbeats and the kernel's requests."""
 
 _SOCKET_BUFFER = 1 << 20
@@ -84,11 +84,11 @@ class UdpLink:
         while True:
             if self._closed:
                 raise LinkClosed(f"{self.description} is closed")
-            chunks = self._drain()
-            if chunks:
+            pieces = self._drain()
+            if pieces:
                 if not waited:  # one checkpoint per batch, and none where data could be lost
                     await trio.lowlevel.cancel_shielded_checkpoint()
-                return chunks
+                return pieces
             waited = True
             try:
                 await trio.lowlevel.wait_readable(self._sock)
@@ -110,7 +110,7 @@ class UdpLink:
                     self.stats.dropped_sends += 1
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a chunk of the last batch."""
+        """Return the sender of a piece of the last batch."""
         return self._senders[index]
 
     def answer(self, address: NetAddress) -> None:
@@ -156,9 +156,9 @@ class UdpLink:
     def _drain(self) -> list[bytes]:
         """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
         receive, buffer = self._sock.recvfrom_into, self._buffer
-        chunks: list[bytes] = []
+        pieces: list[bytes] = []
         senders: list[NetAddress] = []
-        for _ in range(MAX_CHUNKS):
+        for _ in range(MAX_DATAGRAMS):
             try:
                 count, sender = receive(buffer)
             except BlockingIOError:
@@ -166,14 +166,14 @@ class UdpLink:
             except OSError:
                 continue
             if self._only_host is None or sender[0] == self._only_host:
-                chunks.append(bytes(buffer[:count]))
+                pieces.append(bytes(buffer[:count]))
                 senders.append(sender)
-        if chunks:
+        if pieces:
             self._senders = senders
-            self.stats.received_bytes += sum(map(len, chunks))
+            self.stats.received_bytes += sum(map(len, pieces))
             if self._only_host is None and not self._pinned:
                 self._peer = senders[-1]
-        return chunks
+        return pieces
 
     def _send_together(self, datagrams: Sequence[bytes]) -> Sequence[bytes]:
         """Hand runs of equal datagrams to the kernel in one call each; return what has to go one by one."""
@@ -188,7 +188,7 @@ class UdpLink:
                 # Not every way out can cut them (checksums, MTU); anything else is found out one by one.
                 self._segments = error.errno not in _NO_SEGMENTS
                 break
-            self.stats.sent_chunks += run
+            self.stats.writes += run
             self.stats.sent_bytes += sum(map(len, datagrams[:run]))
             datagrams = datagrams[run:]
         return datagrams
@@ -202,7 +202,7 @@ class UdpLink:
         except OSError:  # no route, no buffer: waiting would not help
             self.stats.dropped_sends += 1
             return True
-        self.stats.sent_chunks += 1
+        self.stats.writes += 1
         self.stats.sent_bytes += len(datagram)
         return True
 

@@ -1,7 +1,7 @@
 """How many bytes of a file one request carries. Layer: protocol; pure.
 
 A chunk is 239 bytes, the most that fits a payload. Some radios and modems pass short frames and drop all long
-ones. So when every full chunk is lost for a while, full and short chunks go out in turn. If only the short
+ones. So when every full chunk is lost for a while, full and short chunks alternate. If only the short
 ones are answered, chunks stay short for five minutes; then full ones get another chance."""
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ChunkSize:
         self.most = self.size = MAX_DATA if fixed is None else fixed
         self._least = SHORT if fixed is None else fixed
         self.trying = False
-        """Whether full and short chunks take turns, so that each request needs a size of its own."""
+        """Whether full and short chunks alternate, so that each request needs a size of its own."""
         self._short_until = inf
         self._lost = 0  # full chunks in a row; while trying: beside the short ones
         self._since = -inf  # older requests prove nothing: a later one passed, or the link was away

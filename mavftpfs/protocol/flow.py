@@ -159,7 +159,7 @@ class Flow:
         self._rates: deque[float] = deque(maxlen=ROUNDS)
         self._rate = 0.0
         self._shortest, self._shortest_seen = inf, 0.0
-        self._probing = 0  # rounds of the search for the base round trip that are left
+        self._probing = 0  # rounds that are left of the search for the shortest round trip
         self._spread = 0.0
         self._usual_loss, self._per_answer = 0.0, 1.0  # so many requests are to bring one answer
         self._bold = 1.0

@@ -247,7 +247,7 @@ class Pacer:
             self._raise = _BOLD
 
     def _watch(self, answers: float, loss: float) -> None:
-        """While the rate is held, begin again if too few answers come. Another sender may have come, the
+        """While the rate is kept, begin again if too few answers come. Another sender may have come, the
         server or the link may be slower, or the way longer. Only a start with few requests tells which."""
         expected = (self.rate or 0.0) * (1.0 - loss)
         if loss <= self._usual_loss + _ALARMING_LOSS and answers >= _SHORT * expected:

@@ -140,17 +140,17 @@ class Timers:
         """Return how long to wait for the reply to this transmission of a request, in seconds."""
         manner = request.manner
         timer = self.of[manner.family]
-        base, rto = max(timer.unfloored, timer.floor), timer.rto
+        plain, rto = max(timer.unfloored, timer.floor), timer.rto
         patient = request.sends >= manner.patient_after
         if patient and manner.family == _WORK:
             # The way and the work take their times one after the other.
             work = manner.patience
             if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
                 work = max(work * _USUAL_PACE, min(work, _NO_WORK))
-            base, rto = base + work, rto + work
+            plain, rto = plain + work, rto + work
         # Under the same seq a repetition does not tell the round trip. If that is not known yet, it may be
         # long.
         free = manner.free_sends if timer.samples or not manner.same_seq else 1
         doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
-        wait = max(rto, min(base * (1 << doublings), LONGEST_BACK_OFF))
+        wait = max(rto, min(plain * (1 << doublings), LONGEST_BACK_OFF))
         return max(wait, manner.patience) if patient and manner.family != _WORK else wait

@@ -82,7 +82,7 @@ async def test_frames_are_packed_below_the_limit() -> None:
         assert b"".join(datagrams) == b"".join(frames)
         assert [len(d) for d in datagrams] == [5 * 266, 5 * 266, 2 * 266]
         assert max(map(len, datagrams)) <= MAX_DATAGRAM
-        assert (link.stats.sent_chunks, link.stats.sent_bytes) == (3, 12 * 266)
+        assert (link.stats.writes, link.stats.sent_bytes) == (3, 12 * 266)
 
 
 class CountingSocket(socket.socket):
@@ -122,7 +122,7 @@ async def test_many_datagrams_go_in_one_call_where_the_kernel_can_cut_them(refus
             assert [peer.recv(65535) for _ in expected] == expected
         assert sock.together == calls
         assert sock.alone == (2 * len(expected) if refusal else 0)
-        assert link.stats.sent_chunks == 2 * len(expected)
+        assert link.stats.writes == 2 * len(expected)
         assert link.stats.sent_bytes == 2 * sum(SIZES)
 
 
@@ -397,7 +397,7 @@ async def test_frames_that_go_out_together_are_one_write(
     frames = [bytes([n]) * 266 for n in range(10)]
     async with opened_stream() as (link, other):
         link.send_nowait(frames)
-        assert (link.stats.sent_chunks, link.stats.sent_bytes) == (1, 10 * 266)
+        assert (link.stats.writes, link.stats.sent_bytes) == (1, 10 * 266)
         got = b""
         while len(got) < 10 * 266:
             await trio.lowlevel.wait_readable(other)

@@ -17,7 +17,7 @@ from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim.linkmodel import Direction, LinkModel
 from mavftpfs.sim.vehicle import SimVehicle
 
-MAX_CHUNKS = 256
+MAX_PIECES = 256
 _MAX_STEPS = 1_000_000
 """Instants in one catch-up: a deadline that never moves on must fail a test, not hang it."""
 
@@ -76,7 +76,7 @@ class MemoryLink:
         """See link.base.Link."""
         now = trio.current_time()
         self._catch_up()
-        self.stats.sent_chunks += len(frames)
+        self.stats.writes += len(frames)
         self.stats.sent_bytes += sum(map(len, frames))
         for frame in frames:
             self.model.push(Direction.TO_VEHICLE, frame, now)
@@ -110,7 +110,7 @@ class MemoryLink:
         self._notify()
 
     def _take(self) -> list[bytes]:
-        chunks, self._inbox = self._inbox[:MAX_CHUNKS], self._inbox[MAX_CHUNKS:]
+        chunks, self._inbox = self._inbox[:MAX_PIECES], self._inbox[MAX_PIECES:]
         self.stats.received_bytes += sum(map(len, chunks))
         return chunks
 
