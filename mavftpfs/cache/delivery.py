@@ -121,7 +121,7 @@ class Deliverer:
                                 context.retry_later()
 
     async def push(self, node: Node) -> None:
-        """The draft changed: begin to send it, or go on, while the program writes. The caller has the node's
+        """Begin to send a draft that changed, or go on, while the program writes. The caller has the node's
         lock."""
         context, attempt, draft = self._context, node.attempt, node.draft
         if draft is None or not node.undelivered:
@@ -309,7 +309,7 @@ class Deliverer:
         in_place = traits.rename_works is False
         begun_at = context.clock()
         try:
-            # Last time all of it was sent before its name proved to be taken: look first.
+            # Last time the whole file was sent before its name proved to be taken: look first.
             if in_place or isinstance(node.error, AlreadyExists):
                 await self._require_expected(node, draft)
             if not in_place:
@@ -382,7 +382,7 @@ class Deliverer:
         return crc32
 
     async def _require_expected(self, node: Node, draft: Draft) -> None:
-        """Check that a new file's name is free, or that the file of which a part stays is still the same.
+        """Check that a new file's name is free, or that a base of which a part stays is still the same.
 
         Raises:
             AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free and
@@ -425,7 +425,7 @@ class Deliverer:
                     await self._names.discard(attempt.path)
             raise
         finally:
-            own.in_use.discard(attempt.path)  # what is left there is for the next listing to clean up
+            own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         await self._confirm(node, draft, attempt)
 
     async def _confirm(self, node: Node, draft: Draft, attempt: Attempt) -> None:

@@ -141,7 +141,7 @@ class Draft:
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
         lacked: whether the vehicle lacked something of it when the base was replaced (STALE).
-        begun: the file may exist under its own name because of us (cards that cannot rename).
+        sent_in_place: the file may exist under its own name because of us (cards that cannot rename).
     """
 
     def __init__(self, content: Content, base: Base | None) -> None:
@@ -165,7 +165,7 @@ class Draft:
 
     @property
     def unacked(self) -> int:
-        """Bytes that programs wrote and that have still to travel."""
+        """Bytes that programs wrote and that are not ACKed yet."""
         sending = self.sending
         return self._changed.total if sending is None or sending.overtaken else sending.unacked
 
@@ -277,7 +277,7 @@ class Draft:
         return self.sending
 
     def give_up(self) -> None:
-        """The attempt ended without success."""
+        """Note that the attempt ended without success."""
         if self.state is State.SENDING:
             self.on(Event.GIVEN_UP)
 

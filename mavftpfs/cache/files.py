@@ -108,7 +108,7 @@ class Files:
     # --- opening
 
     async def open(self, path: bytes) -> VersionHandle:
-        """Open what the vehicle has there.
+        """Open the vehicle's file of a path.
 
         Raises:
             NotFound, NotADirectory, IsADirectory. DataUnproven: the size in the reply is smaller than listed.
@@ -130,7 +130,7 @@ class Files:
         return VersionHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
-        """Return the version to serve, and whether it is the one that was served before."""
+        """Return the version to serve, and whether it was served before."""
         entry, fresh = found.entry, self._clock() < found.directory.fresh_until
         version = self._current.get(path)
         if version is not None and self._still_right(version, found, fresh):
@@ -247,7 +247,7 @@ class Files:
     # --- is it the same file?
 
     async def compare(self, version: Version, *, now: bool) -> None:
-        """Compare a version with a listing, if the server opened its file anew and listings tell times.
+        """Compare a version with a listing, if the server opened its file again and listings tell times.
 
         now: even if a listing was asked for just before to compare it.
 
@@ -380,7 +380,7 @@ class Files:
             version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
-        """A file, or a directory with all below it, has another path now; open files follow."""
+        """Note that a file, or a directory with all below it, has another path now; open files follow."""
         self.on_changed(new)
         for version in self._at_or_below(old):
             current = self._current.get(version.path) is version

@@ -222,7 +222,7 @@ class Parameters(Texts[Values]):
                 await self.upload(self._store, name, PARAM_FILE, pieces)
         except MavftpfsError as error:
             failure = error
-        self._virtual.outdate(PARAM_FILE)  # somebody may have read it while the upload waited for its turn
+        self._virtual.outdate(PARAM_FILE)  # a program may have read it while the upload waited for its turn
         try:
             after = (await self._read(reread=True)).values
         except MavftpfsError as error:

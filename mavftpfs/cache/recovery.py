@@ -226,7 +226,7 @@ def _read_facts(data: Path) -> dict[str, object]:
 
 
 def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
-    """Return whether the vehicle lacks a spooled file and somebody may want it."""
+    """Return whether the vehicle lacks a spooled file that a user may want."""
     return facts.get("needed") is not False and not (facts.get("unfinished") and not data.stat().st_size)
 
 

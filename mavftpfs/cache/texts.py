@@ -127,7 +127,7 @@ class Texts(ABC, Generic[B]):
         self._wall = wall
         self._require_writable = require_writable
         self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
-        self._failed: Program | None = None  # its save was the last, and was refused
+        self._failed: Program | None = None  # the program whose save was refused, if that was the last save
         self._saving = trio.Lock()
         self._upload: TextUpload | None = None
 
@@ -298,9 +298,10 @@ class Texts(ABC, Generic[B]):
         return InvalidText(line)
 
     def _tell(self, name: bytes, lines: Sequence[str], *, more: bool = False) -> None:
-        """Make last_error.txt say what came of the last save; more: and leave there what it says.
+        """Make last_error.txt say what came of the last save. more: also keep what it says already.
 
-        An editor that could not save puts back what it had read (vim): why it could not is to be read then.
+        An editor that cannot save may put back the text that it had read (vim). The reason why the first save
+        failed has to stay readable then.
         """
         now = self._wall()
         when = datetime.fromtimestamp(now, UTC)
@@ -413,7 +414,7 @@ class TextHandle(OpenFile, Generic[B]):
         if size > MAX_TEXT:
             raise InvalidText(f"{self._name.decode()} may have {MAX_TEXT} bytes")
         if not size:
-            self._base = None  # vim opens, and empties then
+            self._base = None  # vim opens a text, and then empties it
         if self._append:
             self._before, size = self._before[:size], max(0, size - len(self._before))
         del self._content[size:]

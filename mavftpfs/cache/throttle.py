@@ -55,10 +55,10 @@ class WriteLimit:
 
 
 class Throttle:
-    """Has writers wait while too many bytes are not ACKed.
+    """Makes writers wait while too many bytes are not ACKed.
 
     Attributes:
-        waiting: the writers that wait for room. Whatever may give room unparks them all.
+        waiting: the writers that wait for room. Any event that may give room unparks all of them.
     """
 
     def __init__(self, context: Context, limit: WriteLimit) -> None:

@@ -331,7 +331,7 @@ class Version:
         return Known(self.size, self.mtime, given=self.given, restarted=restarted, ours=self.ours)
 
     def require_not_replaced(self) -> None:
-        """Raise FileChanged if the path became another file."""
+        """Raise FileChanged if another file has the path."""
         if self.replaced:
             raise FileChanged(self._why)
 
@@ -341,7 +341,7 @@ class Version:
         self._look()
 
     def on_restart(self, at: float) -> None:
-        """The vehicle restarted: nothing of it is proven any more."""
+        """Forget all proofs, because the vehicle restarted."""
         self.proven_at = self.compare_after = NEVER
         self.kept = None
         self.on_opened(at)

@@ -25,7 +25,7 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errors import FileBusy, FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
 
 TRIES = 3
-"""How often a read starts anew because the file was delivered meanwhile."""
+"""How often a read starts again because the file was delivered meanwhile."""
 
 MAX_FILE = 2**32 - 1
 """Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
@@ -166,7 +166,7 @@ class ReadFile(OpenFile):
         parts: list[bytes | memoryview] = []
         at = start
         while at < min(stop, draft.size):
-            # Asked anew after each await: the draft may have been written meanwhile.
+            # Asked again after each await: the draft may have been written meanwhile.
             where, a, b = draft.segments(at, stop)[0]
             if where is Where.BASE:
                 parts.append(await read_base(self._context, self._node, a, b))

@@ -276,7 +276,7 @@ async def join(
 
     Raises:
         Refused: and why.
-        LinkClosed: nobody answers.
+        LinkClosed: no answer.
     """
     hello = {
         "protocol": PROTOCOL,

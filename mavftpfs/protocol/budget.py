@@ -68,13 +68,13 @@ class Budget:
         return self._left
 
     def on_sent(self, count: int) -> None:
-        """So many of these requests go out."""
+        """Note that so many of these requests go out."""
         self._left -= count
         if self._left == 0:
             self._want()
 
     def _want(self) -> None:
-        """There may be more to send than there is room for."""
+        """Note that there may be more to send than there is room for."""
         self._wanted = self._lent if self._wanted is None else max(self._wanted, self._lent)
 
     def next_room_at(self) -> float:
@@ -92,18 +92,18 @@ class Budget:
     # --- what it cost
 
     def spend(self, count: int, now: float) -> None:
-        """Bytes go over the link."""
+        """Pay for bytes on the link."""
         self._refill(now)
         self._balance -= count
 
     def on_request(self, wire: bytes, now: float) -> None:
-        """A request of 251 bytes goes out."""
+        """Pay for a request of 251 bytes that goes out."""
         cost = self._overhead + len(wire.rstrip(b"\0"))
         if wire[_OPCODE] == _READ:
             cost += self._overhead + HEADER_SIZE + wire[_SIZE]
         self.spend(cost, now)
 
     def on_reply(self, wire: bytes, now: float) -> None:
-        """A reply of 251 bytes came."""
+        """Pay for a reply of 251 bytes that came."""
         if wire[_REQ_OPCODE] != _READ or wire[_OPCODE] != _ACK:
             self.spend(self._overhead + len(wire.rstrip(b"\0")), now)

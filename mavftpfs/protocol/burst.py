@@ -83,7 +83,7 @@ class Burst:
         if reply.opcode == Opcode.NAK:
             self.nak = reply.data[0] if reply.data else int(NakCode.NONE)
             self.over = self.nak == NakCode.EOF or not self.packets
-            # ArduPilot stops after another one, MAVSDK never does: quiet, or the next one, will tell.
+            # ArduPilot stops after one more packet, MAVSDK never: quiet, or the next packet, will tell.
             self.complete_seen = self.complete_seen or not self.over
         self._touch(now)
         return b""
@@ -112,7 +112,7 @@ class Burst:
             steps, odd = divmod(ahead, packet)
             return not odd and ahead >= 0 and steps & 0xFFFF == index and count <= packet
         if index == 0:
-            if ahead == 0 and not at_end:  # a last packet may be short and tells no size
+            if ahead == 0 and not at_end:  # a last packet may be short, so it tells no size
                 self.packet = count
             return ahead == 0
         packet, odd = divmod(ahead, index)

@@ -115,7 +115,8 @@ class Engine:
     # --- traits
 
     def learn_session_echo(self, echoed: bool) -> None:
-        """An Open ACK carried the id asked for (servers.md 14.6; then the queue is shared), or another."""
+        """Note that an Open ACK had the id asked for (servers.md 14.6; then the queue is shared), or
+        another."""
         self.traits.ack_carries_own_session = echoed
         if echoed:
             self.traits.queue_limit = SHARED_QUEUE_WINDOW
@@ -203,7 +204,7 @@ class Engine:
         return malformed
 
     def _on_answers(self, newest: Request, count: int, now: float) -> None:
-        """Requests of one operation that went out together were answered; newest: the last of them."""
+        """Note answers to requests of one operation that went out together; newest: the last of them."""
         ledger, flow = self._ledger, self.flow
         self.stats.replies += count
         self._heard_at = newest.op.progress_at = now
@@ -279,7 +280,7 @@ class Engine:
         return wires
 
     def hold(self, now: float) -> None:
-        """Nothing may go out now. The patience of operations that want something runs all the same."""
+        """Send nothing now. The patience of operations that want something runs all the same."""
         for op in self._ops:
             op.waits(now)
 
@@ -295,7 +296,7 @@ class Engine:
         if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
             room = self.flow.room(in_flight - unheard, now, paced=op.paced)
         if room <= 0 and urgent and in_flight < self.flow.most_beside:
-            # A window that shrank may be full of requests that nobody answers. Metadata passes those, too.
+            # A window that shrank may be full of requests that get no answer. Metadata passes those, too.
             others = sum(other.sent and other.rank is Priority.METADATA for other in self._ops)
             room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room

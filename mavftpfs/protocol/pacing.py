@@ -1,6 +1,6 @@
 """More requests on their way than the server queues. Layer: protocol; pure.
 
-Theory. ArduPilot queues five requests for everybody and drops the rest silently, but it empties that queue
+Theory. ArduPilot queues five requests for all clients, and drops the rest silently, but it empties that queue
 every few milliseconds (servers.md 3, 15). So only few requests may arrive between two looks at the queue, but
 many may be on their way. Requests that are spread evenly in time can fill a long way. Four at a time leave it
 empty for most of each round trip.

@@ -131,7 +131,7 @@ class CrossDevice(MavftpfsError):
 
 
 class FileBusy(MavftpfsError):
-    """Somebody on the vehicle is writing the file (EBUSY)."""
+    """The vehicle, or another client, is writing the file (EBUSY)."""
 
 
 class InvalidText(MavftpfsError):

@@ -154,7 +154,7 @@ def usable_name(name: bytes) -> bool:
 # answer proves it, and forgotten when the vehicle restarts.
 
 SHARED_QUEUE_WINDOW = 4
-"""Requests in flight where the server has a queue of five for everybody (servers.md 3, ArduPilot)."""
+"""Requests in flight where the server has a queue of five for all clients (servers.md 3, ArduPilot)."""
 
 
 @dataclass(slots=True)
@@ -189,6 +189,6 @@ class Traits:
     rename_replaces: bool | None = None
 
     def forget(self) -> None:
-        """The server restarted, perhaps as another one."""
+        """Forget all: the server restarted, perhaps as another one."""
         for fact in fields(self):
             setattr(self, fact.name, fact.default)

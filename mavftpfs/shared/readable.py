@@ -62,6 +62,6 @@ def readable_time(seconds: float) -> str:
 def _as_text(quoted: re.Match[str]) -> str:
     try:
         name: bytes = ast.literal_eval(quoted[0])
-    except (SyntaxError, ValueError):  # somebody's path or words
+    except (SyntaxError, ValueError):  # a path or words that only look like bytes
         return quoted[0]
     return f"'{printable(name_text(name))}'"

@@ -21,7 +21,7 @@ class Sameness(Enum):
     SAME = "same"
     """All that was told agrees."""
     GREW = "grew"
-    """It is the same file, and somebody appended to it: logs grow."""
+    """It is the same file, and bytes were appended to it: logs grow."""
     UNPROVEN = "unproven"
     """Nothing contradicts, but nothing proves it. Something else can tell more, or no program has bytes that
     could be wrong."""

@@ -7,7 +7,7 @@ from math import inf
 
 
 class Speed:
-    """The mean over the last SPAN seconds, pauses included; not said before it is known.
+    """The mean over the last SPAN seconds, pauses included; not told before it is known.
 
     The first bytes of a transfer, and those after a pause, tell nothing: they come at the speed of the
     buffers on the way. All times in seconds of one clock.
@@ -15,11 +15,11 @@ class Speed:
 
     SPAN = 10.0
     KNOWN = 2.0
-    """Seconds over which bytes were seen before a speed is said."""
+    """Seconds over which bytes were seen before a speed is told."""
     SETTLING = 1.0
     """Seconds from the first byte until they count."""
     PAUSE = 5.0
-    """Seconds without a byte after which all begins anew."""
+    """Seconds without a byte after which the measurement starts again."""
     _STEP = 0.25
 
     def __init__(self) -> None:
