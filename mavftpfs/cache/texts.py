@@ -18,7 +18,7 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import trio
 
@@ -33,14 +33,17 @@ LAST_ERROR = b"last_error.txt"
 MAX_TEXT = 4 << 20
 """Bytes of the longest text that can be saved."""
 
-MAX_PROGRAMS = 256
-MAX_READ = 8
-"""So many programs are remembered, with so many of the last texts that each has read."""
+MAX_READS, MAX_PROGRAM_READS = 32, 8
+"""So many texts that were read are remembered, of all programs and of one."""
 
 B = TypeVar("B")
 
-Program = Hashable
-"""Tells the process that opened a file from all others."""
+
+class Program(Hashable, Protocol):
+    """A process that opens files; equal to itself alone."""
+
+    def ended(self) -> bool:
+        """Return whether it ended, so that it saves nothing any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +126,10 @@ class Texts(ABC, Generic[B]):
         """`require_writable()`: raises Armed, or ReadOnly."""
         self.directory = directory
         self.error_text = b""
-        self._error_at = 0
+        self._error_at = int(wall() * SECOND)
         self._wall = wall
         self._require_writable = require_writable
-        self._reads: OrderedDict[Program, Reads[B]] = OrderedDict()
+        self._reads: OrderedDict[Program | None, Reads[B]] = OrderedDict()
         self._failed: Program | None = None  # the program whose save was refused, if that was the last save
         self._saving = trio.Lock()
         self._upload: TextUpload | None = None
@@ -221,12 +224,23 @@ class Texts(ABC, Generic[B]):
             return
         reads = self._reads.setdefault(program, Reads())
         self._reads.move_to_end(program)
-        if not any(known is base for known in reads.bases):
-            reads.bases = [*reads.bases, base][-MAX_READ:]
         if text not in reads.texts:
-            reads.texts = [*reads.texts, text][-MAX_READ:]
-        while len(self._reads) > MAX_PROGRAMS:
+            reads.texts = [*reads.texts, text][-MAX_PROGRAM_READS:]
+        if not any(known is base for known in reads.bases):
+            reads.bases = [*reads.bases, base][-MAX_PROGRAM_READS:]
+            self._bound_reads()
+
+    def _bound_reads(self) -> None:
+        """Forget what programs read that ended, and then what those read that read last long ago."""
+        if self._remembered > MAX_READS:
+            for program in [program for program in self._reads if program is None or program.ended()]:
+                del self._reads[program]
+        while self._remembered > MAX_READS:
             self._reads.popitem(last=False)
+
+    @property
+    def _remembered(self) -> int:
+        return sum(len(reads.bases) for reads in self._reads.values())
 
     async def save(
         self,
@@ -251,15 +265,14 @@ class Texts(ABC, Generic[B]):
             try:
                 self._require_writable()
                 done = await self.carry_out(Save(name, text, bases, reads.rereads, appended))
-            except Refused as refused:
+            except (Refused, MavftpfsError) as exc:
+                refused = exc if isinstance(exc, Refused) else Refused(exc, [f"nothing was set: {exc}"])
                 self._failed = None if puts_back else program
                 self._know(program, refused.known)
                 self._tell(name, refused.lines, more=puts_back)
-                raise refused.error from refused.__cause__
-            except MavftpfsError as error:
-                self._failed = None if puts_back else program
-                self._tell(name, [f"nothing was set: {error}"], more=puts_back)
-                raise
+                raise refused.error from exc.__cause__
+            finally:
+                self._upload = None
             self._failed = None
             self._know(program, done.known)
             if not puts_back:
@@ -273,17 +286,14 @@ class Texts(ABC, Generic[B]):
             self._reads[program] = Reads(list(known), self._reads[program].texts)
 
     async def upload(self, store: VehicleStore, name: bytes, file: bytes, pieces: Sequence[bytes]) -> None:
-        """Send what a save makes, with its progress in `transfers`.
+        """Send what a save makes, with its progress in `transfers`, until that save ends.
 
         Raises:
             As VehicleStore.write_whole.
         """
         size = sum(map(len, pieces))
         sending = self._upload = TextUpload(self.directory + b"/" + name, size)
-        try:
-            await store.write_whole(file, pieces, sending.on_acked)
-        finally:
-            self._upload = None
+        await store.write_whole(file, pieces, sending.on_acked)
 
     def transfers(self) -> Sequence[dict[str, object]]:
         """Return the upload that is under way, if one is, in the form of `Throttle.transfers`."""

@@ -223,9 +223,8 @@ class _Setting:
         return ExitCode.OK
 
     async def _compare(self, session: Session) -> Wish:
-        self.bar.plan(1, 0)
-        self.bar.begin("reading the parameters", 0)
-        with drawing.shown(self.bar):
+        self.bar.plan(0, 0)
+        with drawing.shown(self.bar, idle="reading the parameters"):
             current = await client.read_parameters(session)
             lines, others = await client.split_by_component(session, self.lines)
         if others and not self.args.skip_unknown:

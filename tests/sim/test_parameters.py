@@ -12,6 +12,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.texts import MAX_READS
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session
@@ -34,7 +35,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.parameters import FLOAT, INT32, Parameter, Selection, Table, parameter
-from tests.support.rigs import Rig, read_file, rig
+from tests.support.rigs import EPOCH, Rig, read_file, rig
 
 ALL, CHANGED, QGC = b"/@PARAM/params.parm", b"/@PARAM/changed.parm", b"/@PARAM/params.params"
 ERRORS = b"/@PARAM/last_error.txt"
@@ -69,17 +70,21 @@ async def vehicle(
         yield here, here.mount()
 
 
-@dataclass
+@dataclass(eq=False)
 class Editor:
     """A program, told from others by itself, that reads a text and saves it."""
 
     tree: Tree
     path: bytes = ALL
     lines: list[str] = field(default_factory=list)
+    running: bool = True
+
+    def ended(self) -> bool:
+        return not self.running
 
     async def open(self, *, write: bool = False, truncate: bool = False, append: bool = False) -> OpenFile:
         return await self.tree.open(
-            self.path, write=write, truncate=truncate, append=append, program=lambda: id(self)
+            self.path, write=write, truncate=truncate, append=append, program=lambda: self
         )
 
     async def read(self) -> Editor:
@@ -157,6 +162,7 @@ async def test_one_download_serves_a_listing_and_the_opens_of_a_second(profile: 
 async def test_size_and_time_stay_until_it_is_read_anew() -> None:
     async with vehicle("ardupilot5", parameters=[parameter("COUNTER", INT32, 7, drift=1)]) as (here, tree):
         before = await tree.stat(ALL)
+        assert (await tree.stat(ERRORS)).mtime >= EPOCH
         await trio.sleep(100)
         assert await tree.stat(ALL) == before
         assert here.count(Opcode.OPEN_FILE_RO) == 1
@@ -245,7 +251,7 @@ async def test_an_editor_that_reads_again_for_its_backup(profile: str) -> None:
         for changes in (0, 1):
             await trio.sleep(20)
             with pytest.raises(ReadOnly):
-                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: id(editor))
+                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
             await editor.read()
             editor.lines = list(lines)
             if changes:
@@ -265,7 +271,7 @@ async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: 
         edited = editor.edit("MODE_001", "5").edit(*bad.split(",")).lines
         await trio.sleep(20)
         with pytest.raises(ReadOnly):
-            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: id(editor))
+            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
         backup = (await editor.read()).lines
         editor.lines = edited
         with pytest.raises((InvalidText, NotTaken)):
@@ -282,6 +288,26 @@ async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: 
         assert ("put back" in await errors(tree)) is (bad == "CLAMPED,70")
         await editor.save()
         assert await errors(tree) == ""
+
+
+@pytest.mark.holds("promise 8")
+async def test_many_programs_that_read_and_end_take_no_editor_its_base() -> None:
+    async with vehicle("ardupilot5", parameters=many(20)) as (here, tree):
+        editor = await Editor(tree).read()
+        for _ in range(3 * MAX_READS):
+            await trio.sleep(2)
+            (await Editor(tree).read()).running = False
+        before = number(here, "LEARNED_01")
+        with pytest.raises(ReadOnly):
+            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
+        edited = editor.edit("MODE_001", "5").lines
+        await editor.read()
+        editor.lines = edited
+        await editor.save()
+        assert number(here, "MODE_001") == 5
+        assert number(here, "LEARNED_01") >= before
+        (texts,) = (one for one in tree._texts if one.names[0] == b"params.parm")
+        assert texts._remembered <= MAX_READS
 
 
 async def test_what_a_program_reads_again_is_its_base() -> None:
@@ -600,7 +626,7 @@ async def test_300_values_over_57600_baud() -> None:
         session = Session(tree, acknowledged=partial(acknowledged, tree))
         await tree.stat(ALL)
         await trio.sleep(20)
-        began, bar, seen = trio.current_time(), Progress(trio.current_time), set[int]()
+        began, bar, seen, states = trio.current_time(), Progress(trio.current_time), set[int](), set[str]()
         lines = [Line(i, f"GAIN_{i:03}", i + 0.5) for i in range(300)]
         wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
         assert len(wish.changes) == 300
@@ -609,6 +635,7 @@ async def test_300_values_over_57600_baud() -> None:
             while True:
                 await trio.sleep(0.1)
                 seen.add(bar.here)
+                states.add(bar.state)
 
         async with trio.open_nursery() as nursery:
             nursery.start_soon(look)
@@ -620,6 +647,7 @@ async def test_300_values_over_57600_baud() -> None:
         upload = sum(map(len, pack_upload([change.after for change in wish.changes])))
         assert took < 2 * (2 * table + upload) / rate
         assert len(seen) > 2
+        assert states == {"", "checking"}, "that it is read back shows"
 
 
 async def acknowledged(tree: Tree) -> dict[str, int]:
