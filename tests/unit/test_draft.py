@@ -238,4 +238,4 @@ class DraftMachine(RuleBasedStateMachine):
 
 
 TestDraft = DraftMachine.TestCase
-TestDraft.settings = settings(max_examples=150, stateful_step_count=40)
+TestDraft.settings = settings(max_examples=80, stateful_step_count=40)

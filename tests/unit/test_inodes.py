@@ -104,7 +104,7 @@ class Kernel(RuleBasedStateMachine):
 
 
 TestKernel = Kernel.TestCase
-TestKernel.settings = settings(max_examples=60, stateful_step_count=40)
+TestKernel.settings = settings(max_examples=40, stateful_step_count=40)
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4))))
