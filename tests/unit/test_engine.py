@@ -429,3 +429,29 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     assert engine.in_flight == 0
     assert engine.take_finished() == []
     assert engine.next_deadline() is None
+
+
+# --- pauses of the server
+
+
+@pytest.mark.parametrize(("others", "patient"), [(8, True), (2, False)])
+def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does(
+    others: int, patient: bool
+) -> None:
+    """What waits in its buffer would be executed twice."""
+    engine = make(limit=1 + others)
+    reading(engine)
+    first = sent(engine, 0.0)
+    for request in first:
+        engine.receive(chunk(request, bytes(SIZE)), 0.05)
+    engine.flow.window = 1 + others
+    engine.flow.pause = 0.3
+    waiting = sent(engine, 0.05)
+    assert len(waiting) == 1 + others
+    engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
+    engine.flow.pause = 0.3
+    sent(engine, 0.1)
+    engine.on_deadline(0.35)
+    assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
+    engine.on_deadline(0.45)
+    assert engine._ledger.again or sent(engine, 0.45)
