@@ -431,6 +431,25 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     assert engine.next_deadline() is None
 
 
+# --- bursts and others
+
+
+def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
+    engine = make()
+    transfer, _ = reading(engine, kind=BurstTransfer)
+    (burst,) = sent(engine, 0.0)
+    engine.drop(transfer)
+    engine.start(mkdir(), 0.0)
+    (request,) = sent(engine, 0.0)
+    for index in range(20):
+        engine.receive(packet(burst, index, bytes(239)), 0.2 * index)
+        engine.on_deadline(0.2 * index)
+        assert sent(engine, 0.2 * index) == []
+    assert engine.stats.unknown == 20
+    engine.receive(ack(request), 4.0)
+    assert engine.stats.replies == 1
+
+
 # --- pauses of the server
 
 

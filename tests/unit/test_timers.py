@@ -125,6 +125,11 @@ def test_but_a_checksum_that_most_would_have_is_asked_for_three_times_before() -
     assert timers.wait(work(0.0)) == pytest.approx(0.3)
 
 
+def test_long_work_does_not_make_small_files_wait() -> None:
+    timers = learned(seen=(100.0, 60.0))
+    assert timers.wait(work(0.06)) < 0.5
+
+
 def test_without_a_round_trip_known_waits_double_at_once() -> None:
     timers = Timers()
     assert [timers.wait(path(sends)) for sends in (1, 2, 3)] == [1.0, 2.0, 3.0]
