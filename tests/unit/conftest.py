@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.clocks import use_virtual_time
 
-REAL_TIME = ("test_control", "test_kernelnews", "test_watching")
+REAL_TIME = ("test_control", "test_kernel", "test_watching")
 """Modules with threads, sockets and programs, which virtual time would not wait for."""
 
 

@@ -107,6 +107,24 @@ async def test_a_mount_that_ends_leaves_the_socket_of_the_next_one_there(tmp_pat
     assert not path.exists()
 
 
+async def test_no_descriptors_left_is_got_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "s.sock"
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    async with serving(path, {"echo": echo}):
+        with socket.socket(socket.AF_UNIX) as client:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (1, limits[1]))
+            try:
+                client.connect(str(path))
+                client.sendall(b'{"command": "echo", "word": "hi"}\n')
+                with trio.fail_after(90):
+                    while not caplog.records:  # noqa: ASYNC110
+                        await trio.sleep(0.01)
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+            answer = await trio.to_thread.run_sync(client.recv, 4096)
+    assert json.loads(answer)["heard"] == "hi"
+
+
 CROWD = 3 * MAX_CLIENTS
 
 

@@ -1,4 +1,4 @@
-"""oneshot.progress: what is counted, and what the lines say."""
+"""client.progress and cli.drawing: what is counted, and what the lines say."""
 
 from __future__ import annotations
 

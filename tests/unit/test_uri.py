@@ -1,4 +1,4 @@
-"""SOURCE in both spellings."""
+"""SOURCE in both spellings, and which of them are one link."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from mavftpfs.link.rendezvous import leads_back, same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_endpoint, parse_source
 from mavftpfs.shared.errors import UsageError
 
@@ -121,3 +122,39 @@ def test_an_endpoint_listens_for_this_computer_unless_it_says_otherwise(text: st
 def test_an_endpoint_has_no_directory() -> None:
     with pytest.raises(UsageError, match="no directory"):
         parse_endpoint("udpout:127.0.0.1:14550#/fs")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin://127.0.0.1:14550", True),
+        ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14551", False),
+        ("udpin:0.0.0.0:14550#/fs", "udpin:0.0.0.0:14550", True),
+        ("udpout:10.0.0.1:14550", "udpout:10.0.0.2:14550", False),
+        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", False),
+        ("/dev/null,57600", "/dev/../dev/null,921600", True),
+        ("/dev/null", "/dev/zero", False),
+    ],
+)
+def test_the_same_link(one: str, other: str, same: bool) -> None:
+    assert same_link(parse_source(one), parse_source(other)) is same
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "source", "back"),
+    [
+        ("udpout:127.0.0.1:14550", "udpin:0.0.0.0:14550", True),
+        ("udpout:localhost:14550", "udpin:127.0.0.1:14550", True),
+        ("udpout:[::1]:14550", "udpin:[::]:14550", True),
+        ("udpout:127.0.0.1:14551", "udpin:0.0.0.0:14550", False),
+        ("udpout:203.0.113.9:14550", "udpin:0.0.0.0:14550", False),
+        ("udpout:127.0.0.2:14550", "udpin:127.0.0.1:14550", False),
+        ("udpout:station.invalid:14550", "udpin:0.0.0.0:14550", False),
+        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", True),
+        ("tcp:127.0.0.1:5760", "tcpin:0.0.0.0:5760", True),
+        ("tcp:127.0.0.1:5760", "udpin:0.0.0.0:5760", False),
+        ("/dev/null", "/dev/null", True),
+    ],
+)
+def test_an_endpoint_that_leads_back(endpoint: str, source: str, back: bool) -> None:
+    assert leads_back(parse_source(endpoint), parse_source(source)) is back

@@ -1,14 +1,16 @@
-"""Every option of the table reaches whoever it is meant for."""
+"""client.connect: every option of the table reaches its user; what a hub calls a program."""
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mavftpfs.client.connect import cache_options, connect_options
+from mavftpfs.client.connect import cache_options, connect_options, process_name
 from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.kernel import presentation
@@ -65,3 +67,20 @@ def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
         value = 77 << 20
     changed = {name: value} if name in OWN else {"client": replace(Options(), **{name: value})}
     assert told(MountOptions(**changed)) != told(MountOptions())
+
+
+@pytest.mark.parametrize(
+    ("argv", "name"),
+    [
+        (["/usr/bin/mavftpfs", "udpin:0.0.0.0:14550", "drone", "-o", "ro"], "udpin:0.0.0.0:14550 drone"),
+        (["/lib/mavftpfs/__main__.py", "ls", "-l", "drone"], "ls drone"),
+        (["/home/me/survey.py", "--token", "secret"], "survey.py"),
+        (["/home/me/survey/__main__.py"], "survey"),
+        (["-c"], "python"),
+        ([""], "python"),
+        ([], "python"),
+    ],
+)
+def test_what_a_hub_calls_a_program(monkeypatch: pytest.MonkeyPatch, argv: list[str], name: str) -> None:
+    monkeypatch.setattr(sys, "argv", argv)
+    assert process_name() == f"{name} (process {os.getpid()})"

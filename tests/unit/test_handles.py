@@ -1,4 +1,4 @@
-"""fuse.handles: inode numbers, lookup counts, renames."""
+"""mount.handles: inode numbers, lookup counts, renames."""
 
 from __future__ import annotations
 
