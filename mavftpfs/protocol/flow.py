@@ -14,7 +14,7 @@ comes. At first the window grows by one with every answer, which doubles it each
 growing, a queue stands, or much is lost.
 
 A serial port has a receive buffer of unknown size in front of a slow server. Bytes that overflow it are lost
-silently. There the window grows from one, by one a round, and goes back by one when more is lost than usual.
+silently. So at a serial port the window is 16 at most, and two requests go out at once, not three.
 
 A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
 pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
@@ -92,8 +92,8 @@ QUEUE_SHARE = 0.15
 (LITTLE at most), plus TICK, plus twice the jitter of the round, which is no queue."""
 
 QUEUE = 0.1
-"""Seconds of answers that wait in a link's queue. At a serial port no more may wait, because a listing waits
-behind them. Where a server pauses so many wait on purpose, because the link sends them meanwhile."""
+"""Seconds of answers that wait in a link's queue on purpose where a server pauses: the link sends them
+meanwhile."""
 
 SMOOTHING = 0.2
 """What one round counts for in an average, at most."""
@@ -147,13 +147,13 @@ class Flow:
         self.budget = budget
         self.alone = False
         self.loss = 0.0
-        self._serial = serial
+        self._depth = DEPTH_SERIAL if serial else DEPTH
         self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
-        self.window = min(1 if serial else FIRST, self.cap)
+        self.window = min(FIRST, self.cap)
         self._pacer: Pacer | None = None
         self._hurried = False
-        self._starting, self._flat = not serial, 0
+        self._starting, self._flat = True, 0
         self._before_silence = 0
         # What is known of the path.
         self._rates: deque[float] = deque(maxlen=ROUNDS)
@@ -208,9 +208,8 @@ class Flow:
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
         elif room > 0 and not urgent and self._pace < inf:
-            depth = DEPTH_SERIAL if self._serial else DEPTH
             earned = (now - self._tokens_at) * self._pace
-            self._tokens = min(max(depth, self._pace * TICK), self._tokens + earned)
+            self._tokens = min(max(self._depth, self._pace * TICK), self._tokens + earned)
             self._tokens_at = now
             self._blocked = self._tokens < room
             room = min(room, int(self._tokens))
@@ -259,7 +258,7 @@ class Flow:
     @property
     def most_beside(self) -> int:
         """How many may be in flight for the sake of metadata; 0 where a server takes only a few."""
-        return 0 if self._serial or self._pacer is not None else self.cap
+        return 0 if self._pacer is not None else self.cap
 
     # --- what happens
 
@@ -286,7 +285,7 @@ class Flow:
         gap, self._answered_at = now - self._answered_at, now
         # An answer that ends a pause has waited for its end. After a run of losses none has.
         waited = rtt is not None and rtt > self._shortest + gap / 2 and self._rate > 0.0
-        if waited and gap > PAUSE + FIRST / self._rate and not self._serial and self._pacer is None:
+        if waited and gap > PAUSE + FIRST / self._rate and self._pacer is None:
             self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
         elif now >= self._paused_at + KNOWN:
             self.pause = 0.0
@@ -304,7 +303,7 @@ class Flow:
         if self._pacer is not None:
             self._pacer.on_replies(now, rtt, count, newest, next_order)
         over = newest >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
-        enough = self._answered >= ROUNDS or self._starting or self.starved or self._serial
+        enough = self._answered >= ROUNDS or self._starting or self.starved
         # At the start a queue grows fast: a few answers that waited in one are enough.
         if not (over and enough) and not (self._starting and self._rtts >= FIRST and self._queued()):
             return
@@ -335,7 +334,7 @@ class Flow:
         if unheard < SILENT:
             return
         if not self._before_silence:
-            self._before_silence = self.window if self._serial else max(1, self.window // 2)
+            self._before_silence = max(1, self.window // 2)
             self.window = min(PROBE, self.window)
         if self._pacer is not None:
             self._pacer.on_silence()
@@ -351,9 +350,7 @@ class Flow:
         congested = self._lost > 0 and not paused and self._queued(1.0, waits)
         usual = self._usual_loss * total
         lost_too_much = congested or (not paused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
-        self._learn_averages(
-            now, total, losses=not (paused or self._queued() or (self._serial and lost_too_much))
-        )
+        self._learn_averages(now, total, losses=not (paused or self._queued()))
         if congested and not self.starved and self._queued(2.0, waits):
             self._rates.clear()  # the path has the rate of this round
         rate, before = self._answered / took, self._rate
@@ -364,11 +361,6 @@ class Flow:
             return
         if not paused:
             self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
-        if self._serial:
-            back = lost_too_much or self._queued()
-            most = int(self._rate * (self._shortest + QUEUE)) + 2
-            self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1, most)
-            return
         if self._starting:
             self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
             overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
@@ -399,7 +391,7 @@ class Flow:
             return
         if self._probing:
             self._probing -= 1
-        elif now >= self._shortest_seen + KNOWN and not (self._starting or self._serial or self._pacer):
+        elif now >= self._shortest_seen + KNOWN and not (self._starting or self._pacer):
             self._probing = 3
         if self._probing == 1:
             self._shortest, self._shortest_seen = least, now

@@ -7,7 +7,6 @@ test_latency.py.
 from __future__ import annotations
 
 import random
-from itertools import pairwise
 
 import pytest
 
@@ -136,11 +135,10 @@ def lose_what_overflows(flow: Flow, holds: int, rounds: int, *, loss: float = 0.
     return windows
 
 
-def test_a_serial_window_grows_from_one_by_one() -> None:
-    windows = lose_what_overflows(Flow(serial=True), MOST_SERIAL, 60)
-    assert windows[0] == 1
-    assert all(after <= before + 1 for before, after in pairwise(windows))
-    assert 9 <= windows[-1] <= MOST_SERIAL
+def test_a_serial_window_is_small_whatever_the_path_holds() -> None:
+    windows = lose_what_overflows(Flow(serial=True), 100, 60)
+    assert max(windows) <= MOST_SERIAL
+    assert windows[-1] >= 9
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.05])
@@ -152,9 +150,9 @@ def test_it_stays_near_what_the_receive_buffer_holds(loss: float) -> None:
 # --- a card that pauses
 
 
-def paused(*, serial: bool = False, base: float = 0.1) -> tuple[Flow, Path]:
+def paused(*, base: float = 0.1) -> tuple[Flow, Path]:
     """Return a flow that has just seen a server pause for 0.2 s."""
-    flow = Flow(serial=serial)
+    flow = Flow()
     path = Path(flow, rate=400.0, base=base)
     path.rounds(40)
     path.now += 0.2
