@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -45,6 +46,7 @@ PERIOD = 0.1
 END_PATIENCE = 3600.0
 """Seconds for a vehicle's mount to deliver and end."""
 _LAST_REPLIES = 3.0
+_OWNER_ONLY = 0o077
 
 Command = Callable[[Member], list[str]]
 """Returns the words that mount one vehicle below the mountpoint, in the foreground."""
@@ -59,7 +61,11 @@ class _Supervisor:
     def __init__(self, request: MountRequest, command: Command, report: Report) -> None:
         # The root itself refuses writes; fusermount3 mounts only where the user may write.
         client = replace(request.options.client, read_only=False)
-        self._request = replace(request, options=replace(request.options, client=client))
+        options = replace(request.options, client=client)
+        if os.geteuid() != 0 and not options.allow_other:
+            # fusermount3 works as root, and the kernel lets root into a user's mount only so.
+            options = replace(options, allow_other=True, dmask=_OWNER_ONLY)
+        self._request = replace(request, options=options)
         self._command = command
         self._report = report
         self._roster = Roster()
@@ -98,7 +104,11 @@ class _Supervisor:
         operations = RootOperations(self._roster, presentation(request.options), self._look, self.status)
         invalidator = Invalidator(InodeTable(), lambda ino, attr_only: None)
         async with opened(request.spec, request.options.client, beats=True) as link:
-            with kernel_mount(operations, request, invalidator):
+            with ExitStack() as stack:
+                try:
+                    stack.enter_context(kernel_mount(operations, request, invalidator))
+                except MountFailed as exc:
+                    raise _explained(exc) from exc
                 self._mounted = True
                 await self._start_control(nursery)
                 async with plain_nursery() as tasks:
@@ -293,6 +303,15 @@ class _Supervisor:
                 for member in self._roster
             ],
         }
+
+
+def _explained(error: MountFailed) -> MountFailed:
+    if "user_allow_other" not in str(error):
+        return error
+    return MountFailed(
+        "to mount below a mount of yours, fusermount3 needs the line user_allow_other in /etc/fuse.conf: "
+        "echo user_allow_other | sudo tee -a /etc/fuse.conf; or mount each vehicle by -o target_system="
+    )
 
 
 async def _collect(process: trio.Process, said: list[str]) -> None:

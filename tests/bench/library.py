@@ -76,5 +76,7 @@ def main(argv: list[str]) -> int:
         rates["mavftpfs.connect"].append(measured(by_library, data))
     for who, found in rates.items():
         print(f"{who:<17} {median(found):6.1f} MB/s   ({', '.join(f'{rate:.1f}' for rate in found)})")
-    print(f"library / mount   {median(rates['mavftpfs.connect']) / median(rates['cp from a mount']):6.2f}")
+    for what, of in (("medians", median), ("best runs", max)):  # on a busy machine the best say more
+        share = of(rates["mavftpfs.connect"]) / of(rates["cp from a mount"])
+        print(f"library / mount   {share:6.2f}   ({what})")
     return 0

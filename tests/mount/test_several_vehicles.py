@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -334,3 +335,66 @@ def test_nothing_can_be_made_beside_the_vehicles(fleet: Fleet) -> None:
 def test_all_and_a_target_exclude_each_other(fleet: Fleet) -> None:
     said = mavftpfs(fleet.source, fleet.field.local("mnt"), "-o", "all,target_system=1", code=1)[1]
     assert "target_system" in said
+
+
+# -- an ordinary user -------------------------------------------------------------------------------
+
+AS_AN_ORDINARY_USER = """
+set -e
+scratch=$1 interpreter=$2
+mknod -m 666 "$scratch/fuse" c 10 229
+mount --bind "$scratch/fuse" /dev/fuse
+mount --bind "$scratch/fuse.conf" /etc/fuse.conf
+mkdir "$scratch/python"
+mount --bind "$interpreter" "$scratch/python"
+mount -t tmpfs -o mode=755 tmpfs /root  # others may not look into root's home, and Python may lie there
+mkdir -p "$interpreter"
+mount --bind "$scratch/python" "$interpreter"
+shift 2
+exec setpriv --reuid=nobody --regid=65534 --clear-groups env -i PATH="$PATH" PYTHONPATH="$PYTHONPATH" \\
+    HOME="$scratch/home" "$@"
+"""
+MOUNT_AND_COPY = """
+"$1" -m mavftpfs "$2" "$3/mnt" -o all || exit
+tries=0
+until cp "$3/mnt/1/log/0.bin" "$3/one" 2>&- && cp "$3/mnt/2/log/1.bin" "$3/two" 2>&-; do
+    tries=$((tries + 1))
+    [ "$tries" -lt 300 ] || break
+    sleep 0.1
+done
+exec "$1" -m mavftpfs umount "$3/mnt"
+"""
+
+
+@pytest.mark.parametrize("allowed", [True, False], ids=["allowed", "forbidden"])
+def test_an_ordinary_user_mounts_all_where_fuse_conf_allows_it(fleet: Fleet, allowed: bool) -> None:
+    """fusermount3 works as root, so the kernel keeps it out of the directory that is the user's own mount."""
+    for system in (1, 2):
+        fleet.launch(system)
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's directories are root's alone
+        scratch, home = Path(name), Path(name, "home")
+        scratch.chmod(0o755)
+        home.mkdir()
+        (home / "mnt").mkdir()
+        for path in (home, home / "mnt"):
+            os.chown(path, 65534, 65534)
+        (scratch / "fuse.conf").write_text("user_allow_other\n" if allowed else "")
+        (scratch / "fuse.conf").chmod(0o644)
+        inside = ["sh", "-c", MOUNT_AND_COPY, "sh", sys.executable, fleet.source, str(home)]
+        done = subprocess.run(
+            [*("unshare", "-m", "sh", "-c", AS_AN_ORDINARY_USER, "sh", name, sys.base_prefix), *inside],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            cwd="/",
+            env={**os.environ, "PYTHONPATH": str(PROJECT)},
+            check=False,
+        )
+        if allowed:
+            assert done.returncode == 0, done.stderr
+            for local, card, log in (("one", 1, "0.bin"), ("two", 2, "1.bin")):
+                assert (home / local).read_bytes() == (fleet.cards[card] / "log" / log).read_bytes()
+        else:
+            (line,) = done.stderr.splitlines()
+            assert "user_allow_other in /etc/fuse.conf" in line
+            assert done.returncode == 3
