@@ -59,9 +59,9 @@ def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def surroundings() -> Iterator[None]:
-    """Give all programs the same surroundings: Ctrl-C and a hang-up end them, also where whoever runs the
-    tests ignores these (`&`, nohup), modes are as usual, and what is no terminal is not taken for one.
-    Modules stay compiled, as in an installation: else each of the many programs compiles all of them anew."""
+    """Give all programs the same surroundings. Ctrl-C and a hang-up end them, also where the tests run with
+    these ignored (`&`, nohup). Modes are as usual, and only a terminal is taken for one. Modules stay
+    compiled, as in an installation: else each of the many programs compiles all of them again."""
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) == signal.SIG_IGN:
             signal.signal(number, handler)
@@ -82,8 +82,8 @@ def order_of_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def nobody_waits_in_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Assert that no task that has the session waits for a path, a node or memory for reads: whoever has one
-    of these may wait for the session."""
+    """Assert that no task that has the session waits for a path, a node or memory for reads: a task that has
+    one of these may wait for the session."""
     schedulers: weakref.WeakSet[Scheduler] = weakref.WeakSet()
     hold = Scheduler._hold
 

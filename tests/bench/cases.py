@@ -2,12 +2,12 @@
 
 The limit is the link's, and at most the server's ceiling, which for PX4 and MAVSDK is whatever they answer. A
 PX4 whose card pauses (px4-nuttx) answers a read later, and answers that wait in the link meanwhile bridge
-that: for 0.25 s and a round trip at most, because whoever lists a directory beside it waits behind them, and
-that page has a bound for it. Of writes it has room for five, and what a full link brings beyond them is
-never answered. How many pauses there are is chance, a tenth more or less in a minute, so a run is compared
-with what its own pauses allowed. The window that a receive buffer survives is the limit of a serial port
-only, which these links are not: six writes a round trip would be 4.8 kB/s at 300 ms, of which a share says
-nothing where 75 kB/s are reached.
+that: for 0.25 s and a round trip at most, because a program that lists a directory beside it waits behind
+them, and that page has a bound for it. It has room for five writes, and what a full link brings beyond them
+is never answered. How many pauses there are is chance, a tenth more or less in a minute, so a run is compared
+with what its own pauses allowed. The window that a receive buffer survives limits only a serial port, and
+these links are none: six writes a round trip would be 4.8 kB/s at 300 ms, and a share of that says nothing
+where 75 kB/s are reached.
 """
 
 from __future__ import annotations

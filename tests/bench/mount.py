@@ -3,8 +3,8 @@
 For each server, link and direction, everybody moves the same file (a shorter one goes to the peers where a
 link has no rate), in turns, each against a freshly started server: nobody pays for what another left behind.
 A link with a rate is the simulator's model, frame by frame. Timed from the first call to the last: for a
-mount, the `cp`. Bytes are compared after each run; whoever does not finish in time, fails, or brings other
-bytes is listed as that.
+mount, the `cp`. Bytes are compared after each run; a client that does not finish in time, fails, or brings
+other bytes is listed as that.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class Cell:
 
     @property
     def window(self) -> int:
-        """Requests in flight that fill the link and that the server can hold: for those who must be told."""
+        """Requests in flight that fill the link and that the server can hold: for clients that must be
+        told."""
         server = WINDOWS.get(self.server, 10_000)
         if self.shape is None:
             return min(server, LOOPBACK_WINDOW)
@@ -77,7 +78,8 @@ class Cell:
 
     @property
     def patience(self) -> float:
-        """Seconds after which a request is lost, for those who must be told: twice a full window's trip."""
+        """Seconds after which a request is lost, for clients that must be told: twice a full window's
+        trip."""
         if self.shape is None:
             return 0.25
         return 0.1 + 2 * (self.shape.rtt + self.window * 277 / self.shape.rate)
@@ -143,7 +145,7 @@ def run_one(cell: Cell, client: Client, source: Path, seed: int) -> Run:
 
 
 def measure(chosen: Sequence[Cell], everybody: Sequence[Client], repetitions: int, folder: Path) -> list[Run]:
-    """Run every cell, all clients in turns; whoever fails in one is not asked there again."""
+    """Run every cell, all clients in turns; a client that fails in one is not asked there again."""
     runs: list[Run] = []
     for cell in chosen:
         left = [client for client in everybody if cell.direction in client.directions]

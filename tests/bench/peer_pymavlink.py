@@ -15,7 +15,7 @@ from pymavlink import mavutil
 from pymavlink.mavftp import MAVFTP, FtpError, MAVFTPSettings
 
 LONG = 3600
-"""Seconds it may take by itself: who runs it has the watch."""
+"""Seconds it may take by itself: its caller has the watch."""
 
 
 def settings(chunk: int | None, window: int | None) -> MAVFTPSettings:

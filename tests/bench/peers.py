@@ -244,7 +244,7 @@ def install() -> None:
 
 
 def clients() -> dict[str, Client]:
-    """Return everybody who can take part, by name."""
+    """Return all clients that can take part, by name."""
     place = _environment()
     python = str(place / "bin/python")
 

@@ -137,12 +137,12 @@ def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
 
 
 def share_of(row: Row) -> float:
-    """Return the length of a bar: none for who failed or was cut off."""
+    """Return the length of a bar: none for a client that failed or was cut off."""
     return (reached(row) or 0.0) if row.outcome is Outcome.OK else 0.0
 
 
 def reached(row: Row) -> float | None:
-    """Return the share of the limit, on the loopback of the bare loop; an upper bound for who was cut off."""
+    """Return the share of the limit, on the loopback of the bare loop. If cut off, it is an upper bound."""
     return row.of_bare if row.of_limit is None else row.of_limit
 
 

@@ -1,4 +1,4 @@
-"""What a killed mount left is told to whoever mounts next, even if that mount is not the next one tried."""
+"""The next mount tells what a killed mount left, even if that mount is not the next one tried."""
 
 from __future__ import annotations
 

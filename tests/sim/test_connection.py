@@ -1,4 +1,5 @@
-"""A connection: who is answered, signing, what a trace says, neighbours with our address, leaving."""
+"""A connection: which senders are answered, signing, what a trace says, neighbours with our address,
+leaving."""
 
 from __future__ import annotations
 
@@ -161,7 +162,7 @@ async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -
 
 
 def join(monkeypatch: pytest.MonkeyPatch, here: Rig, folder: Path) -> None:
-    """Have whoever opens a link, or a spool, get these."""
+    """Make all that opens a link, or a spool, get these."""
 
     @asynccontextmanager
     async def open_link(*_: object) -> AsyncIterator[MemoryLink]:

@@ -503,7 +503,7 @@ async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, auto
 @pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize(("profile", "leaves"), [("px4", False), ("px4-2026", True), ("px4-nuttx", True)])
 async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, autojump: MockClock) -> None:
-    """PX4 has one session, 0, whoever asks: our ACKs may be for the other one's file."""
+    """PX4 has one session, 0, for all clients: our ACKs may be for the other one's file."""
     here = Rig(profile, {b"/d/f": b"x" * 130_000}, CLEAN)
     new = bytes(range(1, 240)) * 500
     async with here.mounted(b"/d", verify="size") as tree:

@@ -69,7 +69,7 @@ class Crowd:
 
 
 async def told(connection: Connection) -> None:
-    """Wait until the vehicle has told who it is."""
+    """Wait until the vehicle has told its id."""
     await trio.sleep(5.0)
     assert connection.vehicle.version is not None
 
@@ -117,7 +117,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(
 async def test_another_vehicle_that_takes_the_address_is_not_read(
     tells: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that does not tell who it is neither, though ours would be believed in the end."""
+    """Nor is one that tells no id, though ours would be believed in the end."""
     scene = Crowd()
     if not tells:
         monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
@@ -215,7 +215,7 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
 
 
 @pytest.mark.holds("promise 10")
-async def test_who_is_not_our_vehicle_does_not_keep_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stranger_does_not_keep_our_vehicle_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """tcpin has one peer at a time. Ours goes away; somebody connects who sends without a pause, then another
     vehicle, which stays, and then ours."""
     monkeypatch.setattr("mavftpfs.link.tcp.PATIENCE", 1.0)
@@ -299,7 +299,7 @@ class Scene:
     async def mounted(self) -> AsyncIterator[Tree]:
         """Give a tree that hears the news as a mount does."""
         async with self.rig.mounted() as tree:
-            await trio.sleep(3.0)  # it told who it is
+            await trio.sleep(3.0)  # it told its id
             yield tree
 
 

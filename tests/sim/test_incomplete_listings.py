@@ -1,5 +1,5 @@
-"""A directory that was refused or not listed to its end is an error for whoever lists it (promise 10), and a
-size that only an open reply tells is not believed where it would make a copy short. Virtual time.
+"""A directory that was refused or not listed to its end is an error for every program that lists it (promise
+10), and a size that only an open reply tells is not believed where it would make a copy short. Virtual time.
 """
 
 from __future__ import annotations

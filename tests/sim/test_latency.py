@@ -196,7 +196,7 @@ async def test_nobody_waits_long_at_a_serial_port(
 async def test_an_upload_goes_on_beside_endless_small_reads(
     profile: str, link: LinkSettings, autojump: MockClock
 ) -> None:
-    """Three readers without a pause: somebody always waits who used little. Nothing was sent."""
+    """Three readers without a pause: one that used little always waits. The upload once sent nothing."""
     copy = Copy(profile, link)
     root = copy.root
     async with copy.rig.connected() as connection, trio.open_nursery() as nursery:

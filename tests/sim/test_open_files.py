@@ -1,4 +1,4 @@
-"""Open files: who sees what, files that lose their name, and files that others replaced.
+"""Open files: what their readers see, files that lose their name, and files that others replaced.
 
 A vehicle that replaces a file between two sessions of its server: test_replaced.
 """
@@ -349,7 +349,7 @@ async def test_a_writer_who_waits_when_the_name_goes_is_let_go() -> None:
         assert here.files() == {}
 
 
-# --- who has a file open that became another one gets ESTALE for good
+# --- a file that was replaced while it was open gives ESTALE for good
 
 OLD, LATER = b"old" * 300, b"NEW" * 300
 """As long as one another: only the times differ."""
@@ -366,7 +366,7 @@ def there(timed: Rig) -> Rig:
 
 
 async def opened(tree: Tree, *, write: bool = False) -> OpenFile:
-    """Return who got bytes of the old file."""
+    """Return an open file that got bytes of the old one."""
     file = await tree.open(FILE, write=write)
     assert bytes(await file.read(0, 9)) == OLD[:9]
     return file
@@ -388,7 +388,7 @@ async def require_lost(reader: OpenFile) -> None:
 
 @pytest.mark.holds("promise 5")
 async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(there: Rig) -> None:
-    """The kernel keeps no pages of the new file meanwhile: it would give them to who has the old one open."""
+    """The kernel keeps no pages of the new file meanwhile: it would give them to readers of the old one."""
     tree = there.mount()
     lost = await reader_of_another(there, tree)
     later = await tree.open(FILE)
@@ -505,7 +505,7 @@ async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one
 async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_new_one(
     there: Rig, smaller: bool
 ) -> None:
-    """The kernel keeps what it was given by one name, whoever asked."""
+    """The kernel keeps what it got by one name, for all programs."""
     tree = there.mount()
     writer = await tree.open(FILE, write=True)
     await writer.write(0, b"mid")

@@ -125,7 +125,7 @@ async def program(tree: Tree, opening: Callable[[Tree], Awaitable[OpenFile]], la
 async def test_a_file_is_opened_before_or_after_its_name_is_changed(
     profile: str, opening: str, change: str
 ) -> None:
-    """Not meanwhile: who opened would hold neither the old file nor the new one."""
+    """Not meanwhile: the opened file would be neither the old one nor the new one."""
     act, left, base = CHANGES[change]
     for later in (-6, -3, 1, 3, 5):
         async with rig(profile, {FILE: OLD, OTHER: LATER}, link=FAR) as here:
@@ -509,7 +509,7 @@ async def test_a_delivery_that_was_given_up_at_its_very_end_goes_on(path: bytes,
 
 
 async def test_emptying_waits_for_no_room(slow: Rig) -> None:
-    """Who writes too fast has to wait; who empties the file makes room, also for the other."""
+    """A writer that is too fast has to wait. One that empties the file makes room, also for the other."""
     tree = slow.mount(dirty_max=64 * 1024)
     file = await tree.create(NEW, exclusive=True)
     await file.write(0, content(128 * 1024))

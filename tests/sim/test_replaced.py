@@ -147,7 +147,7 @@ async def test_a_copy_over_a_reboot_is_of_one_version(
 async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
     profile: str, closed: bool, autojump: MockClock
 ) -> None:
-    """closed: the head was cached by who closed the file before."""
+    """closed: the program closed the file after it got the head, which is cached."""
     async with opened(profile) as (here, tree, handle):
         await read_head(handle)
         if closed:

@@ -1,4 +1,4 @@
-"""What short work costs whoever waits, in round trips, and what the loss of a packet adds. Virtual time."""
+"""How many round trips short work takes, and what the loss of a packet adds. Virtual time."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
 async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
     profile: str, autojump: MockClock
 ) -> None:
-    """It may be asked for before who serves the session has seen that it has nothing more to do."""
+    """It may be asked for before the task with the session has seen that nothing is left to do."""
     rtt, step, steps = 0.1, 239, 60
     here = Rig(profile, {b"/d/f": content(steps * step)}, LinkSettings(rate=1e6, delay=rtt / 2))
     async with here.connected() as connection:

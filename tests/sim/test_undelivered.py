@@ -1,4 +1,5 @@
-"""What the vehicle does not have: who is told, when it is tried again, what the local disk keeps of it."""
+"""What the vehicle does not have: what programs are told, when it is tried again, what the local disk
+keeps."""
 
 from __future__ import annotations
 
@@ -72,11 +73,11 @@ async def close_in_vain(tree: Tree, data: bytes = b"content") -> None:
         await file.release()
 
 
-# --- who is told
+# --- what programs are told
 
 
 async def test_a_checksum_is_the_vehicle_s_or_none(here: Rig, tree: Tree) -> None:
-    """Never that of the bytes that are held here: who asks wants to know what is on the card."""
+    """Never the checksum of the bytes here: a program that asks wants to know what is on the card."""
     file = await tree.open(FILE, write=True)
     await file.write(0, b"new")
     with pytest.raises(NotDeliveredYet) as caught:
@@ -135,7 +136,7 @@ async def test_an_upload_of_what_was_taken_back_is_called_off(end: str) -> None:
         await tree.rmdir(b"/d")
 
 
-# --- who waits
+# --- what waits
 
 
 async def test_a_lost_link_holds_writers_back_before_any_upload_began(here: Rig) -> None:

@@ -189,7 +189,7 @@ class Model:
         try:
             data = bytes(await handle.real.read(offset, size))
         except (FileChanged, NotFound):
-            assert self.excused, "nothing went wrong, so who has it open has it"
+            assert self.excused, "nothing went wrong, so an open file is readable"
             assert handle.file not in self.names.values(), "only a file without a name may be gone"
             return
         except self.excused:

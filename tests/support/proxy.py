@@ -3,9 +3,9 @@
     python -m tests.support.proxy VEHICLE_PORT CLIENT_PORT [CLIENT_PORT...] --seed 1 --loss 0.05 --dup 0.02
 
 The vehicle sends to VEHICLE_PORT (where the proxy listens) and the proxy forwards to each CLIENT_PORT (where
-a mount listens); answers go back to whoever spoke last on VEHICLE_PORT, and to all other clients: everybody
-hears everybody, as behind real routers. All on 127.0.0.1. What happens to each datagram is drawn from the
-seed, by the simulator's model of a link. SIGTERM ends it.
+a mount listens). Answers go back to the vehicle that spoke last on VEHICLE_PORT, and to all other clients:
+everybody hears everybody, as behind real routers. All on 127.0.0.1. What happens to each datagram is drawn
+from the seed, by the simulator's model of a link. SIGTERM ends it.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class Rig:
         self.card.add(self.root + path, data, mtime)
 
     def replace(self, path: bytes, data: bytes, mtime: int | None = None) -> None:
-        """Move another file over it, as others would: who has the old one open keeps it."""
+        """Move another file over it, as others would: an open old one stays as it is."""
         self.put(b"/another", data, mtime)
         self.card.rename(self.root + b"/another", self.root + path)
 

@@ -78,7 +78,7 @@ class Terminal:
             return False
         try:
             data = os.read(self._ours, 65536)
-        except OSError:  # the last one who had the terminal open closed it
+        except OSError:  # the last program that had the terminal open closed it
             return False
         self._shown += data
         return bool(data)

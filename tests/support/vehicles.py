@@ -32,8 +32,8 @@ _reserved: deque[socket.socket] = deque()
 def free_udp_port() -> int:
     """Return a port of the loopback that nobody uses at the moment, for UDP or TCP.
 
-    It is none of those that the kernel gives to whoever asks for any, nor that another worker of pytest, or
-    another run of it, takes: between this and its use, which is in another process, nobody is given it.
+    The kernel does not give it to a program that asks for any port, and no other worker or run of pytest
+    takes it. So it is still free when another process uses it.
     """
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     first = 10_000 + worker % 16 * PORTS_EACH

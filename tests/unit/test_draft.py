@@ -1,4 +1,4 @@
-"""Drafts against a plain model: content, who has a byte, and what is still to be sent."""
+"""Drafts against a plain model: content, where each byte is, and what is still to be sent."""
 
 from __future__ import annotations
 

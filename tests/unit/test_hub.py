@@ -1,4 +1,4 @@
-"""The hub's pure parts: finding frames, where they go, who is next on the line."""
+"""The hub's pure parts: finding frames, where they go, which mount is next on the line."""
 
 from __future__ import annotations
 
@@ -272,7 +272,7 @@ def test_who_left_is_forgotten(net: Net) -> None:
     assert not net.router.taken(STATION, net.now)
 
 
-# -- who is next ----------------------------------------------------------------------------------
+# -- which mount is next --------------------------------------------------------------------------
 
 
 def waiting(text: str) -> Waiting:

@@ -1,4 +1,4 @@
-"""Identity: whether who answers is the vehicle that was there at first."""
+"""Identity: whether the vehicle that answers is the one that was there at first."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_it_may_have_restarted_while_it_was_away() -> None:
 def test_nothing_is_asked_into_a_silence() -> None:
     identity = Watched()
     identity.heard(0.0)
-    assert identity.may_be_asked(1000.0), "it never told who it is"
+    assert identity.may_be_asked(1000.0), "it never told its id"
     identity.told(version(1))
     assert identity.may_be_asked(ABSENCE)
     assert not identity.may_be_asked(ABSENCE + 0.1)
@@ -96,7 +96,7 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity.doubt()
     assert not identity.told(version(2))
     assert standing(identity) is Standing.STRANGER
-    identity.doubt()  # it went: who comes now is not known
+    identity.doubt()  # it went: the next one may be ours
     assert standing(identity) is not Standing.STRANGER
     assert standing(identity) is not Standing.TRUSTED
     assert identity.told(version(1))
@@ -105,8 +105,8 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
 
 
 @pytest.mark.parametrize("silences", [False, True])
-def test_who_is_heard_but_does_not_tell_is_believed_in_the_end(silences: bool) -> None:
-    """Silences between the questions do not begin that anew."""
+def test_a_vehicle_that_is_heard_but_tells_no_id_is_believed_in_the_end(silences: bool) -> None:
+    """Silences between the questions do not make the count begin again."""
     identity = Watched()
     identity.told(version(1))
     identity.doubt()
@@ -119,7 +119,7 @@ def test_who_is_heard_but_does_not_tell_is_believed_in_the_end(silences: bool) -
 
 
 def mute() -> Watched:
-    """Return who told its id once, and never again."""
+    """Return a vehicle's identity that was told once, and never again."""
     identity = Watched()
     identity.told(version(1))
     identity.doubt()

@@ -67,7 +67,7 @@ class Reader:
 
 
 def bursting(*, block: int = 239, limit: int = 4, traits: Traits | None = None) -> tuple[Reader, Payload]:
-    """Return who reads all of it in a burst, and the request for that."""
+    """Return a reader that reads all of the file in a burst, and its request."""
     reader = Reader(bursts=True, block=block, limit=limit, traits=traits)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()

@@ -1,4 +1,5 @@
-"""Who wants the session, who goes first and when a turn ends, as tables; what a reader wants of a file."""
+"""Which tasks want the session, which goes first, when a turn ends, as tables; what a reader wants of a
+file."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
 
 
 def ask_for_storage(client: Client) -> list[StorageInformation]:
-    """Return what it says of its card, to who asks."""
+    """Return what it answers about its card."""
     client.tell(client.framer.encode_request_message(client.vehicle.address, STORAGE_INFORMATION_ID))
     return [message for message in client.hear() if isinstance(message, StorageInformation)]
 

@@ -91,11 +91,11 @@ def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
     [
         pytest.param(
             [(10.0, LANDED, True), (20.0, OURS, True), (21.0, LANDED, False), (31.0, FLIES, True)],
-            id="who may be another one does not disarm ours",
+            id="one that may be another vehicle does not disarm ours",
         ),
         pytest.param(
             [(4.0, LANDED, True), (4.1, OURS, False), (8.0, LANDED, False), (8.1, FLIES, True)],
-            id="seldom heard, it is disarmed when it tells who it is",
+            id="seldom heard, it is disarmed when it tells its id",
         ),
     ],
 )

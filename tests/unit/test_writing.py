@@ -85,7 +85,7 @@ def test_an_ack_without_a_count_is_for_all() -> None:
 
 
 def test_an_ack_of_another_place_is_not_believed_where_acks_tell_the_place() -> None:
-    """PX4 replays its last reply to whoever comes with that seq, whatever he asked (servers.md 2)."""
+    """PX4 replays its last reply to any request with that seq (servers.md 2)."""
     engine = make(limit=1)
     _, source = writing(engine)
     for _ in range(2):
