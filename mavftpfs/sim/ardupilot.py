@@ -1,8 +1,8 @@
 """ArduPilot's FTP server: queue, worker thread and sessions. Layer: sim; pure.
 
 Source: GCS_FTP.cpp of generation A (one session for the vehicle) and of generations B and C (five),
-servers.md 1-13 and 15, a recording. The worker is a generator that yields the time at which it wants to go
-on, None while it is idle.
+servers.md 1-13 and 15, a recording. The worker is a generator. It yields the time at which it wants to go on,
+or None while it is idle.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from mavftpfs.sim.firmware import (
     u32,
 )
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.storage import NoErrno, Storage
 from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
 
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
 _QUEUE = 5
-"""Requests that wait; more are dropped silently."""
+"""So many requests may wait. More are dropped silently."""
 _STEAL_AFTER = 3.0
 """A session idle for so long, in seconds, may be taken by another."""
 
@@ -64,7 +64,8 @@ class Session:
 
 
 class Operations:
-    """The requests but for bursts. Each fills in the reply and returns how long it took; raises a NAK."""
+    """All requests except bursts. Each method fills in the reply and returns how long it took. A NAK is
+    raised."""
 
     def __init__(self, storage: Storage, profile: Profile) -> None:
         self._storage = storage
@@ -125,14 +126,14 @@ class Operations:
         if session.file is not None:
             if now - session.last_sent <= _STEAL_AFTER:
                 raise Refusal(NakCode.FAIL)
-            with contextlib.suppress(OSError):  # the firmware does not look
+            with contextlib.suppress(OSError):  # the firmware ignores its error
                 session.close()
         path = _path(self._profile, request)
         stat = self._storage.stat(path)
         if stat.kind is Kind.DIRECTORY:
             if self._storage.kind is profiles.Storage.FATFS:
                 raise fail(errno.ENOENT, path)
-            raise StaleErrno  # AP_Filesystem_Posix::open gives up without setting errno
+            raise NoErrno  # AP_Filesystem_Posix::open gives up without setting errno
         session.file, session.path, session.writing = self._storage.open(path), path, False
         session.number = request.session
         reply.size, reply.data = 4, u32(stat.size)
@@ -150,7 +151,7 @@ class Operations:
     def _crc(self, request: Request, reply: Reply) -> float:
         path = _path(self._profile, request)
         if self._storage.stat(path).kind is Kind.DIRECTORY:
-            raise StaleErrno
+            raise NoErrno
         checksum, size = self._storage.crc(path)
         reply.size, reply.data = 4, u32(checksum)
         return size / self._profile.crc_rate
@@ -202,7 +203,7 @@ class Operations:
             return None
         if stat.kind is Kind.DIRECTORY:
             return b"D%b\t0\t%d\0" % (name, stat.mtime) if with_time else b"D%b\0" % name
-        if directory == b"/" and self._profile.root_hides_files:
+        if directory == b"/" and self._profile.root_omits_files:
             return None  # the firmware asks for the stat of "//name", which fails
         if stat.kind is Kind.SYMLINK:
             try:
@@ -372,7 +373,7 @@ class ArduPilot(Firmware):
         if request.size > MAX_DATA:
             self._nak(NakCode.INVALID_DATA_SIZE)
         elif ending and request.session != slot.number:
-            self._reply.opcode = ACK  # believed to end another session, of which there is none
+            self._reply.opcode = ACK  # taken for the end of another session, though there is none
         elif stranger and idle < _STEAL_AFTER:
             self._nak(NakCode.INVALID_SESSION)
         else:
@@ -425,7 +426,7 @@ class ArduPilot(Firmware):
         return oldest
 
     def _is_repeat(self, request: Request) -> bool:
-        """Whether this seems to be the request last replied to, by anybody's session on the server."""
+        """Whether this seems to be the request that was answered last, in any session of the server."""
         reply = self._reply
         return (
             request.source == reply.target
@@ -434,7 +435,7 @@ class ArduPilot(Firmware):
         )
 
     def _execute(self, slot: Session, request: Request) -> Iterator[float | None]:
-        """Run a request that has a session; a burst keeps the worker until it is through."""
+        """Run a request that has a session. A burst occupies the worker until it ends."""
         if request.opcode in (ACK, NAK):
             return
         if request.opcode == Opcode.BURST_READ_FILE:
@@ -465,7 +466,7 @@ class ArduPilot(Firmware):
 
     def _fail(self, exc: OSError) -> None:
         """Refuse with errno, or with whatever errno was left by an earlier failure."""
-        if not isinstance(exc, StaleErrno) and exc.errno is not None:
+        if not isinstance(exc, NoErrno) and exc.errno is not None:
             self._errno = exc.errno
         if self._errno == errno.EEXIST:
             self._nak(NakCode.FILE_EXISTS)
@@ -479,7 +480,7 @@ class ArduPilot(Firmware):
             self._reply.size, self._reply.data = 2, bytes([NakCode.FAIL_ERRNO, number & 0xFF])
 
     def _push(self, slot: Session) -> Iterator[float | None]:
-        """Send the reply as soon as the link has room, however long that takes; nothing else happens then."""
+        """Send the reply as soon as the link has room. Until then the server does nothing else."""
         while not self._has_room():
             yield self._horizon + _ROOM_POLL  # room changes between two calls of advance only
         slot.last_sent = self.now

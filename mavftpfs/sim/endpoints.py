@@ -1,7 +1,7 @@
 """`mavftpfs sim DIR`: serves a simulated vehicle over UDP, TCP, a serial port or a pty. Layer: sim.
 
-The vehicle and the model of the link are pure; here they meet the clock. Without a model whole batches go in
-and out; with one, each frame takes its own way through it.
+The vehicle and the model of the link are pure; here they get the clock. Without a model, whole batches go in
+and out. With one, each frame goes through the model by itself.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mavftpfs.sim.vehicle import AUTOPILOT, SimVehicle
 
 _PTY_OUTBOX = 16 * 1024
 _ANSWER_AT = 16
-"""Replies that wait at most for others before they are sent."""
+"""So many replies at most wait for others before all are sent."""
 
 
 class Endpoint:
@@ -57,17 +57,17 @@ class Endpoint:
         """
         while True:
             with trio.CancelScope(deadline=self._next_deadline()) as self._scope:
-                chunks = await self.link.receive()
-                if not chunks:
+                pieces = await self.link.receive()
+                if not pieces:
                     self._reset()
                 self.link.keep_peer()
             if self._scope.cancelled_caught or self.cut:
-                chunks = []
+                pieces = []
             now = trio.current_time()
             if self.model is None:
-                self._exchange(chunks, now)
+                self._exchange(pieces, now)
             else:
-                self._exchange_through(self.model, chunks, now)
+                self._exchange_through(self.model, pieces, now)
 
     def kick(self) -> None:
         """Look at the vehicle again: it was changed from outside."""
@@ -104,9 +104,9 @@ class Endpoint:
         self.vehicle.framer.reset()
         self._splitter.reset()
 
-    def _exchange(self, chunks: list[bytes], now: float) -> None:
-        for chunk in chunks:
-            self.vehicle.receive(chunk, now)
+    def _exchange(self, pieces: list[bytes], now: float) -> None:
+        for piece in pieces:
+            self.vehicle.receive(piece, now)
             if self.vehicle.server.firmware.ready >= _ANSWER_AT:
                 self._send(self.vehicle.outgoing(now))  # the client works on it while the next is served
         self._send(self.vehicle.outgoing(now))
@@ -115,9 +115,9 @@ class Endpoint:
         if frames and not self.cut:
             self.link.send_nowait(frames)
 
-    def _exchange_through(self, model: LinkModel, chunks: list[bytes], now: float) -> None:
-        for chunk in chunks:
-            self._splitter.feed(chunk)
+    def _exchange_through(self, model: LinkModel, pieces: list[bytes], now: float) -> None:
+        for piece in pieces:
+            self._splitter.feed(piece)
         for frame in self._arrived:
             model.push(Direction.TO_VEHICLE, frame, now)
         self._arrived.clear()
@@ -168,7 +168,7 @@ async def _open_pty() -> AsyncIterator[Link]:
     try:
         tty.setraw(slave)
         os.set_blocking(master, False)
-        # Our own hold on the slave keeps the master readable while clients come and go.
+        # The slave stays open here, so the master stays readable while clients come and go.
         description = os.ttyname(slave)
         pipe = FileIO(master, "r+")
         link = StreamLink(description, None, pipe, is_serial=True, outbox_limit=_PTY_OUTBOX)
@@ -254,7 +254,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def link_settings(args: argparse.Namespace) -> LinkSettings:
-    """Return the model's settings; a link without any flaw is no model's business."""
+    """Return the model's settings. A link without any flaw needs no model."""
     return LinkSettings(
         rate=args.rate,
         queue=int(args.queue),
@@ -303,7 +303,7 @@ _REACTING = (signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR)
 async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, out: TextIO) -> None:
     with trio.open_signal_receiver(*_ENDING, *_REACTING) as arriving:
         async with open_endpoint(link_text) as link:
-            # The vehicle was built before its link: only now is it known whether it hears a stream.
+            # The vehicle was built before its link. Whether it hears a stream is clear only now.
             vehicle.set_stream(link.is_stream)
             endpoint = Endpoint(vehicle, link, model)
             system = vehicle.address.system

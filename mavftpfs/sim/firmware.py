@@ -1,7 +1,7 @@
-"""What the simulated firmwares have in common, and the one that has no oddities. Layer: sim; pure.
+"""What the simulated firmwares have in common, and a firmware without oddities. Layer: sim; pure.
 
-Requests and replies are not those of protocol.payload: servers echo fields, leave stray bytes behind `size`
-and must be fast.
+Requests and replies are not those of protocol.payload. Servers echo fields and leave stray bytes behind
+`size`, and this code must be fast.
 
 Time: `handle` and `outgoing` first let everything happen that was due by `now`, in order, at its own instant.
 Replies are emitted in the order of their due times: the outbox is a list of those that are due and a queue
@@ -104,7 +104,8 @@ _PAUSES_KEPT = 1 << 18
 
 
 class Refusal(Exception):
-    """A NAK whose data the server chooses: a code, perhaps more; else they come from errno."""
+    """A NAK with data that the server chooses: a code, perhaps more. For an OSError they come from its
+    errno."""
 
     def __init__(self, code: int, *more: int) -> None:
         super().__init__(code, *more)
@@ -212,7 +213,8 @@ class Firmware(ABC):
             self._ready_bytes += frame_size(wire)
 
     def room(self) -> int:
-        """Bytes free in the link's transmit buffer, less what waits in the outbox; plenty if nobody told."""
+        """Bytes free in the link's transmit buffer, less what waits in the outbox. Plenty if `tx_room` is
+        None."""
         if self.tx_room is None:
             return 10 * FULL_FRAME + self.profile.tx_buffer
         return self.tx_room() - self._ready_bytes

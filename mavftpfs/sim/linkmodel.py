@@ -1,10 +1,10 @@
 """A bad link, as a pure and seeded model of both directions. Layer: sim; pure.
 
-Each direction has a drop-tail queue in front of a transmitter of a fixed rate. In half duplex there is one
-transmitter, which takes frames from the two queues in turn (what a time-division radio amounts to). A frame
-that was sent is lost, doubled, damaged or held back with the given probabilities; else it arrives `delay`
-plus up to `jitter` after its last byte, in order. It is lost too if the link is cut when its last byte leaves
-or when it would arrive.
+Each direction has a drop-tail queue before a transmitter with a fixed rate. In half duplex there is one
+transmitter. It takes frames from the two queues in turn, much as a time-division radio does. A frame that was
+sent is lost, doubled, damaged or delayed with the given probabilities. Else it arrives in order, `delay` plus
+up to `jitter` after its last byte was sent. It is also lost if the link is cut when its last byte leaves or
+when it would arrive.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LinkSettings:
 
     rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
-    hold: seconds by which a reordered frame is late, and three of its airtimes more.
+    hold: a reordered frame is late by so many seconds and three of its airtimes.
     mtu: bytes of the longest frame that ever arrives, None = any.
     burst_loss: share of frames lost in runs of 8 on average.
     """
@@ -131,7 +131,7 @@ class LinkModel:
         return frames
 
     def next_deadline(self) -> float | None:
-        """When something may arrive next (never too late, at times too early); None if nothing will."""
+        """When something may arrive next; at times too early, never too late. None if nothing will."""
         times = [lane.arrivals[0][0] for lane in self._lanes if lane.arrivals]
         for lane in self._lanes:
             if lane.queue:
@@ -139,7 +139,7 @@ class LinkModel:
         return min(times, default=None)
 
     def room(self, direction: Direction) -> int:
-        """Bytes that the queue still takes, as of the last push or pop; a frame counts until it is sent."""
+        """Bytes that the queue still took at the last push or pop. A frame counts until it is sent."""
         lane = self._lanes[direction]
         on_air = lane.on_air if lane.free_at > self._now else 0
         return max(0, self.settings.queue - lane.queued - on_air)

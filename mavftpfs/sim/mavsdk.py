@@ -1,7 +1,8 @@
 """MAVSDK's FTP server. Layer: sim; pure. Source: mavlink_ftp_server.cpp, servers.md 1-10, a recording.
 
-One read stream and one write stream for everybody, a shared file size, a thread for bursts, no replay slot.
-Fields that a handler does not set are 0 in the reply. What is not understood gets no answer.
+All clients share one read stream, one write stream and one file size. There is a thread for bursts, and no
+replay slot. Fields that a handler does not set are 0 in the reply. A request that is not understood gets no
+answer.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class _WriteStream:
     failed: bool = False
 
     def flush(self) -> None:
-        """Write the tail; a full card shows at the next write only, or never."""
+        """Write the tail. That the card is full is noticed only at the next write, or never."""
         offset, data = self.tail
         self.tail = (0, b"")
         try:
@@ -216,7 +217,8 @@ class Mavsdk(Firmware):
     # -- directories -------------------------------------------------------------------------
 
     def _list(self, request: Request) -> bytes:
-        """List from a raw index. A regular file is an exception that nobody catches: the process ends."""
+        """List from a raw index. For a regular file an exception is raised and not caught: the process
+        ends."""
         path = self._path(request)
         if self._existing(path).kind is not Kind.DIRECTORY:
             self.crashed = True
@@ -235,7 +237,7 @@ class Mavsdk(Firmware):
         return bytes(page)
 
     def _entry_text(self, directory: bytes, entry: Entry, with_time: bool) -> bytes:
-        """Format an entry, symlinks followed; what is neither file nor directory is left out, but counted."""
+        """Format an entry, symlinks followed. Anything but a file or directory is left out, but counted."""
         try:
             stat = self.storage.stat(directory + b"/" + entry.name)
         except OSError:
@@ -249,7 +251,7 @@ class Mavsdk(Firmware):
         return text + (b"\t%d\0" % max(stat.mtime, 0) if with_time else b"\0")
 
     def _remove(self, request: Request) -> bytes:
-        """Remove a file or an empty directory, whichever request asked."""
+        """Remove a file or an empty directory: both requests do both."""
         path = self._path(request)
         self._existing(path)
         try:
@@ -360,7 +362,7 @@ class Mavsdk(Firmware):
         raise Silence
 
     def _send_packet(self, burst: _Burst) -> None:
-        """Send the next packet from wherever the stream's position is now."""
+        """Send the next packet from the stream's present position, which other requests may have moved."""
         due = burst.due
         burst.due += self.profile.burst_interval
         burst.packets += 1

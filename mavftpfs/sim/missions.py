@@ -1,7 +1,7 @@
 """Missions of one vehicle, and what ArduPilot makes of `@MISSION/*.dat`. Layer: sim; pure.
 
 Source: servers.md 11 and 17; AP_Filesystem_Mission and a recording. An upload replaces all items when it is
-closed. One that is refused is ACKed all the same by some, and the old items stay.
+closed. If it is refused, the old items stay; some versions ACK the close all the same.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PLACELESS = frozenset((20, 112, 114, 115, 177, 178, 183, 206, 211))
 class Missions:
     """Items by kind: mission, fence, rally. The mission's first item is home.
 
-    limit: more items are refused. says_so: a refused upload is EINVAL at the close; else nobody is told.
+    limit: more items are refused. says_so: a refused upload is EINVAL at the close; else the close is ACKed.
     """
 
     limit: int = 700
@@ -46,7 +46,7 @@ class Missions:
         """Take an upload.
 
         Raises:
-            OSError: EINVAL, it is refused and that is told.
+            OSError: EINVAL, it is refused, and `says_so`.
         """
         kind = NAMES.index(name)
         items = self._parsed(kind, data)
@@ -72,7 +72,7 @@ class Missions:
         return [self._kept(place, item, kind) for place, item in enumerate(items)]
 
     def _kept(self, place: int, item: Item, kind: int) -> Item:
-        """Return what of an item there is room for: no ids, no yaw of a waypoint, heights in steps."""
+        """Return the item as it is stored: without ids, a waypoint without yaw, heights in steps."""
         p1, p2, p3, p4, x, y, z, _, command, _, _, frame, *_ = item
         if command == _WAYPOINT and kind == 0:
             p2 = p3 = p4 = 0.0
@@ -83,7 +83,7 @@ class Missions:
 
 
 class MissionFile:
-    """One of the files as a session has it open."""
+    """A mission file that a session has open."""
 
     def __init__(
         self, missions: Missions, name: bytes, claimed: int, *, write: bool, on_close: Callable[[], None]
@@ -96,7 +96,7 @@ class MissionFile:
         self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
-        """See OpenFile; items are those of now."""
+        """See OpenFile. The items are the present ones."""
         if self._written is not None:
             raise fail(errno.EINVAL)
         return self._missions.packed(self._name)[offset : offset + size]

@@ -1,10 +1,10 @@
 """The parameters of one vehicle, and what its server makes of `@PARAM/param.pck`. Layer: sim; pure.
 
 Source: servers.md 11 and 17; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. This packs
-and parses on its own, so that it does not share a mistake with the code that it tests.
+and parses by code of its own, so that it has no mistake in common with the code that it tests.
 
-A *table* holds the values. It packs a download, and an upload changes it: PX4 parses what comes at once and
-strictly, ArduPilot parses all of it when the file is closed, and does not say what it thinks of it.
+A *table* holds the values. It packs a download, and an upload changes it: PX4 parses strictly, each write as
+it comes. ArduPilot parses the whole file when it is closed, and does not tell whether it took it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAGIC_DEFAULTS = 0x671C
 INT8, INT16, INT32, FLOAT = 1, 2, 3, 4
 HEADER = struct.Struct("<HHH")
 PX4_BLOCK = 239
-"""PX4 pads for this block size, whichever is asked for."""
+"""PX4 pads for this block size, even if the client reads in others."""
 
 _MAX_NAME = 16
 _HAS_DEFAULT = 1
@@ -35,9 +35,9 @@ _WIDTHS = {INT8: 1, INT16: 2, INT32: 4, FLOAT: 4}
 class Parameter:
     """A parameter. `value` and `default` are as stored, little-endian; a default of None is the value.
 
-    drift: what it grows by in each second, by itself. limits: it takes the nearest value between them.
-    read_only: what is set is ignored. needs: the parameter is there while the one of that name is not 0.
-    misfit: its default does not fit its type and so is told though it looks equal (SIM_OH_RELAY_MSK).
+    drift: it grows by so much each second, by itself. limits: a value outside becomes the nearest one inside.
+    read_only: it is not set. needs: it is there only while the parameter of that name is not 0. misfit: its
+    default does not fit its type, so a download has the default though it looks equal (SIM_OH_RELAY_MSK).
     """
 
     name: bytes
@@ -62,7 +62,7 @@ def unpack(kind: int, value: bytes | bytearray) -> float:
 
 
 def pack(kind: int, number: float) -> bytes:
-    """Store a number; an integer that does not fit takes the nearest one that does."""
+    """Return a number as it is stored; for an integer that does not fit, the nearest one that does."""
     if kind == FLOAT:
         return struct.pack("<f", number)
     bits = 8 * _WIDTHS[kind]
@@ -104,7 +104,7 @@ class Selection:
 
 
 def selection(query: bytes) -> Selection:
-    """Read what follows the `?`. Unknown keys are ignored, and a number that is none is 0."""
+    """Parse the text behind the `?`. Unknown keys are ignored, and a text that is no number counts as 0."""
     found = dict.fromkeys((b"start", b"count", b"withdefaults"), 0)
     for option in query.split(b"&"):
         key, _, value = option.partition(b"=")
@@ -116,7 +116,8 @@ def selection(query: bytes) -> Selection:
 def pack_file(chosen: Sequence[Parameter], total: int, *, block: int, defaults: bool, every: bool) -> bytes:
     """Return param.pck for reads of `block` bytes: the last value of an entry crosses no block's end.
 
-    total: what the header says. defaults: with them, where they differ or for every entry.
+    total: as the header says it. defaults: with default values, for every entry (`every`) or where they
+    differ.
     """
     out = bytearray(HEADER.pack(MAGIC_DEFAULTS if defaults else MAGIC, len(chosen), total))
     last = b""
@@ -154,12 +155,12 @@ class Table:
         self._packed: dict[tuple[Selection, int], bytes] = {}
 
     def visible(self, now: float) -> list[Parameter]:
-        """Return what is there now, with the values of now."""
+        """Return the parameters that are there now, with their present values."""
         self._drift(now)
         return [one for one in self._held.values() if self._is_there(one)]
 
     def number(self, name: str, now: float) -> float:
-        """Return a value of now. Raises KeyError: there is no such parameter now."""
+        """Return a present value. Raises KeyError: there is no such parameter now."""
         return {one.name: one for one in self.visible(now)}[name.encode()].number
 
     def set(self, name: bytes, number: float, now: float) -> None:
@@ -252,14 +253,14 @@ class Upload:
         raise NotImplementedError
 
     def close(self, now: float) -> None:
-        """The client ended it."""
+        """The client closed the file."""
         raise NotImplementedError
 
 
 class StrictUpload(Upload):
-    """PX4's: each entry is set as soon as it is there. The first mistake ends the upload, to its Terminate.
-
-    A chunk that was taken may come again; one that leaves a hole is a mistake. Unknown names are skipped.
+    """PX4's: each entry is set as soon as all of it came. After a mistake every write fails, and the close. A
+    chunk that was taken may come again; one that leaves a hole is a mistake. Unknown names are
+    skipped.
     """
 
     def __init__(self, table: Table) -> None:
@@ -312,9 +313,8 @@ class StrictUpload(Upload):
 
 
 class LenientUpload(Upload):
-    """ArduPilot's: chunks in any order, all set when it is closed. Unknown names are skipped.
-
-    says_so: a file that is refused is EINVAL at the close; else nobody is told.
+    """ArduPilot's: chunks in any order, and all is set at the close. Unknown names are skipped. says_so: a
+    file that is refused is EINVAL at the close; else the close is ACKed.
     """
 
     def __init__(self, table: Table, *, says_so: bool) -> None:
@@ -323,7 +323,7 @@ class LenientUpload(Upload):
         self._taken = bytearray()
 
     def write(self, offset: int, data: bytes, now: float) -> None:
-        """See Upload. The header makes the file as long as it says at once; what does not come is 0."""
+        """See Upload. The header tells the length of the file. Bytes that do not come are 0."""
         stop = offset + len(data)
         if offset == 0 and len(data) >= HEADER.size:
             magic, _, length = HEADER.unpack_from(data)
@@ -366,10 +366,10 @@ class LenientUpload(Upload):
 
 
 class ParameterFile:
-    """param.pck as a session has it open. clock: the server's.
+    """param.pck that a session has open. clock: the server's.
 
-    live: as ArduPilot's, which packs the values of now at each read, for blocks of the size of the first one;
-    another size is EINVAL (AP_Filesystem_Param::read). Else as PX4's: packed once, any size is read.
+    live: as ArduPilot's. Each read packs the present values, for blocks of the size of the first read;
+    another size is EINVAL (AP_Filesystem_Param::read). Else as PX4's: packed once, and read in any sizes.
     """
 
     def __init__(

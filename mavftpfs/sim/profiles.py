@@ -22,7 +22,7 @@ class Family(Enum):
 
 
 class Storage(Enum):
-    """What the files lie on, as far as it shows."""
+    """The filesystem of the card, as far as clients notice it."""
 
     POSIX = "posix"
     NUTTX_FAT = "nuttx-fat"
@@ -32,9 +32,8 @@ class Storage(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """What differs between servers. Times in seconds, sizes in bytes, rates in bytes per second.
-
-    Fields that a family has no use for are ignored by it.
+    """What differs between servers. Times in seconds, sizes in bytes, rates in bytes per second. A family
+    ignores the fields that it does not need.
     """
 
     name: str
@@ -47,7 +46,7 @@ class Profile:
 
     # Requests
     list_with_time: bool = False
-    """Opcode 16 is answered; otherwise it is an unknown opcode like any other."""
+    """Opcode 16 is answered; else it is an unknown opcode."""
     bare_time_directories: bool = False
     """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
     unknown_code: int = 7
@@ -59,8 +58,8 @@ class Profile:
     double_nul: bool = False
     """Listing entries end in two zero bytes (ArduPilot before mid-2026)."""
     drop_long_names: bool = False
-    """A name too long for a page is left out; else it ends the listing early (ArduPilot)."""
-    root_hides_files: bool = False
+    """A name too long for a page is left out. False: it ends the listing early (ArduPilot)."""
+    root_omits_files: bool = False
     """Listing `/` shows no plain files, listing `.` does (ArduPilot SITL, generation A)."""
     counted_path_nul: bool = True
     """A path may count its trailing NUL in `size` (ArduPilot since mid-2025)."""
@@ -81,7 +80,8 @@ class Profile:
     open_replaces: bool = False
     """An open closes what any client has open; else it is refused (PX4 of September 2026)."""
     checks_sender: bool = False
-    """Only the client that asked gets the answer again, without stray bytes (PX4 of September 2026)."""
+    """An answer is repeated only to the client that asked, and without stray bytes (PX4 of September
+    2026)."""
     sticky_stream_failure: bool = False
     """A read that crossed the end spoils every later read until reopened (MAVSDK before 4.1)."""
 
@@ -115,7 +115,7 @@ class Profile:
     rx_buffer: int = 212_992
     """Frame bytes that may wait while the server is busy; more are lost (PX4)."""
     tx_buffer: int = 15_000
-    """Bytes a burst may send per tick (PX4); the link's own room may be less."""
+    """Bytes that a burst may send per tick (PX4); the link may have room for less."""
 
     # Bursts
     burst_packets: int = 0
@@ -123,7 +123,7 @@ class Profile:
     burst_interval: float = 0.0
     """Time per burst packet at best."""
     short_packet_completes: bool = False
-    """burst_complete is set on the short last packet and its NAK; else on the NAK (ArduPilot)."""
+    """burst_complete is set on the short last packet and on the NAK. False: only on the NAK (ArduPilot)."""
     exact_eof_offset: bool = True
     """False: the EOF NAK's offset is a packet too small where sizes divide (ArduPilot generation A)."""
 
@@ -140,7 +140,7 @@ _ARDUPILOT = Profile(
     unknown_code=1,
     virtual_trees=TREES,
     double_nul=True,
-    root_hides_files=True,
+    root_omits_files=True,
     counted_path_nul=False,
     write_only_creates=False,
     burst_packets=500,

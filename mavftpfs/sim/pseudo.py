@@ -110,9 +110,8 @@ def _is_parameter_file(name: bytes) -> bool:
 class VirtualTrees:
     """The trees of one vehicle.
 
-    trees: their names. exact: claimed sizes are right, and an upload of parameters is parsed as it comes
-    (PX4 of 2026). says_so: ends a refused upload with an error (ArduPilot since mid-2025). clock: the
-    server's.
+    trees: their names. exact: claimed sizes are right, and an upload of parameters is parsed as it comes (PX4
+    of 2026). says_so: the close of a refused upload fails (ArduPilot since mid-2025). clock: the server's.
     """
 
     def __init__(
@@ -142,7 +141,7 @@ class VirtualTrees:
         self._leaked_listings = 0
 
     def owns(self, path: bytes) -> bool:
-        """Whether the path lies in one of these trees; one leading slash does not matter."""
+        """Whether the path lies in one of these trees, with or without a leading slash."""
         tree = path.removeprefix(b"/").partition(b"/")[0]
         return tree in self._open
 
@@ -252,7 +251,7 @@ class VirtualTrees:
 
 
 class VirtualFile:
-    """An open virtual file. What is written to it goes nowhere."""
+    """An open virtual file. Written bytes are dropped."""
 
     def __init__(self, content: bytes, size: int, *, on_close: Callable[[], None]) -> None:
         self._content = content

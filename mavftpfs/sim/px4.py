@@ -1,7 +1,7 @@
 """PX4's FTP server. Layer: sim; pure. Source: mavlink_ftp.cpp, servers.md 1-13 and 15.
 
-One session for everybody on the link; requests run inline in the receiver thread, which also sends bursts
-every 10 ms. Directory and path requests are in px4ops.
+All clients on the link share one session. Requests run in the receiver thread, which also sends bursts every
+10 ms. Directory and path requests are in px4ops.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mavftpfs.sim.firmware import (
     parse,
 )
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.storage import NoErrno, Storage
 from mavftpfs.sim.tree import OpenFile
 
 _Fields = tuple[int, int, int, int, int, int, int]
@@ -48,7 +48,7 @@ _EOF = int(NakCode.EOF)
 _FAIL_ERRNO = int(NakCode.FAIL_ERRNO)
 _COUNT_SIZE = 4
 _NOT_KEPT = int(NakCode.NO_SESSIONS_AVAILABLE)
-"""First byte of short answers that PX4 does not keep for a repeated request, a NAK's or not."""
+"""PX4 does not keep short answers with this first byte for a repeated request, NAK or not."""
 
 Replies = list[tuple[Address, bytes]]
 
@@ -93,8 +93,8 @@ class Stream:
         return REPLY.pack(seq, 0, opcode, len(data), Opcode.BURST_READ_FILE, complete, self.offset, data)
 
 
-# A transfer is hundreds of thousands of ReadFile or WriteFile requests a second on a fast link. What a row of
-# them needs is looked at once; the first that is not like the others ends it, and goes the usual way.
+# A fast link brings hundreds of thousands of ReadFile or WriteFile requests a second. So a row of like
+# requests is checked once. The first that differs ends the row, and is handled as usual.
 
 
 def read_row(
@@ -201,11 +201,11 @@ class Px4(px4ops.PathRequests):
         super().handle_run(wires[served:], source, now)
 
     def _is_plain(self, wire: bytes, now: float) -> bool:
-        """Whether a row that begins with this is answered at once, and nothing else is due before."""
+        """Whether a row that begins with this request is answered at once, with nothing else due before."""
         idle = self._stream is None and not self._pending and not self._later and self.tx_room is None
-        fresh = now - self._last_request <= _BUFFER_LIFE and now < self._last_request + self._idle_close
+        lately = now - self._last_request <= _BUFFER_LIFE and now < self._last_request + self._idle_close
         quick = not self._has_cost and not self._extra_cost and self._busy_until <= now
-        if not (idle and fresh and quick and self._started is not None):
+        if not (idle and lately and quick and self._started is not None):
             return False
         repeated = self._cached is not None and HEADER.unpack_from(wire)[0] + 1 == self._cached_seq
         named = self._path if self.profile.keeps_buffers else self.scratch
@@ -269,7 +269,7 @@ class Px4(px4ops.PathRequests):
             self._dispatch(parse(wire, source), wire, now)
 
     def _is_cached(self, seq: int, source: Address) -> bool:
-        """Whether a request of this number was answered last."""
+        """Whether the last answer was to a request with this number."""
         if self._cached is None or seq + 1 != self._cached_seq:
             return False
         return source == self._cached_target or not self.profile.checks_sender
@@ -296,7 +296,7 @@ class Px4(px4ops.PathRequests):
         return px4ops.nak_data(code, self._errno)
 
     def _failed(self, exc: OSError) -> bytes:
-        if not isinstance(exc, StaleErrno) and exc.errno is not None:
+        if not isinstance(exc, NoErrno) and exc.errno is not None:
             self._errno = exc.errno
         return self._refuse(_FAIL_ERRNO)
 
@@ -330,8 +330,8 @@ class Px4(px4ops.PathRequests):
             self.emit(target, wire, due, self.now)
 
     def _replay(self, now: float) -> None:
-        """Send the last answer again. PX4 before September 2026 sends 254 bytes out of a cache of 19: what
-        follows the data is stray memory."""
+        """Send the last answer again. PX4 before September 2026 sends 254 bytes out of a cache of 19: stray
+        memory follows the data."""
         assert self._cached is not None
         self.replays += 1
         missing = MAX_DATA - _CACHED_DATA
@@ -371,7 +371,7 @@ class Px4(px4ops.PathRequests):
         opened, self._file = self._file, None
         self._stream = None
         if opened is not None:
-            with contextlib.suppress(OSError):  # PX4 does not look
+            with contextlib.suppress(OSError):  # PX4 ignores its error
                 opened.close()
 
     def _close_idle(self) -> None:
@@ -398,7 +398,7 @@ class Px4(px4ops.PathRequests):
         return self._open(self.path_of(request), write=True, create=True, truncate=False)
 
     def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
-        """Open; the ACK tells the size before a truncation, and reads end there for ever."""
+        """Open. The ACK tells the size before a truncation, and later reads end at that size."""
         if self._file is not None:
             if not self.profile.open_replaces:
                 raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
@@ -470,7 +470,7 @@ class Px4(px4ops.PathRequests):
     # -- bursts ------------------------------------------------------------------------------
 
     def _burst(self, request: Request) -> bytes:
-        """Start a stream. Session 0 may be accepted with no file open; the request's size is ignored."""
+        """Start a burst. Some versions accept session 0 with no file open. The request's size is ignored."""
         self._check_session(request.session)
         self._stream = Stream(request.source, request.offset, request.seq + 1)
         self._tick = max(self._tick, self._tick_after(self._last_request))

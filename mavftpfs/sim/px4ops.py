@@ -10,7 +10,7 @@ from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
 from mavftpfs.sim.firmware import Firmware, Refusal, Request, c_string, u32
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.storage import NoErrno, Storage
 from mavftpfs.sim.tree import Entry, Kind, OpenFile, fail
 
 _WORK_BUFFER = 256
@@ -21,7 +21,7 @@ _LOGS = b"@MAV_LOG"
 class PathRequests(Firmware):
     """Listings, and requests that name a path.
 
-    scratch: the buffer that most of them leave their path in.
+    scratch: a buffer; most requests leave their path in it.
     """
 
     def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
@@ -55,7 +55,7 @@ class PathRequests(Firmware):
         return path
 
     def check_writable(self, path: bytes) -> None:
-        """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
+        """Refuse paths outside the whitelist. For WriteFile the path is the content of the scratch buffer."""
         if self.is_protected(path):
             raise Refusal(NakCode.FILE_PROTECTED)
 
@@ -65,7 +65,7 @@ class PathRequests(Firmware):
         return bool(root) and (not path.startswith(root) or b"/../" in path)
 
     def _list(self, request: Request) -> bytes:
-        """List from a raw readdir index; whatever fails is FileNotFound."""
+        """List from a raw readdir index. Every failure is FileNotFound."""
         self.scratch = path = self.path_of(request)
         try:
             entries = self.storage.entries(path)
@@ -101,7 +101,7 @@ class PathRequests(Firmware):
         data = request.data[: min(request.size, MAX_DATA - 1)]
         old, _, rest = data.partition(b"\0")
         if len(rest) < 2:
-            raise StaleErrno
+            raise NoErrno
         self.scratch = old = self.resolve(old)
         new = self.resolve(c_string(rest)[:_RENAME_LIMIT])
         self.check_writable(new)
@@ -115,7 +115,7 @@ class PathRequests(Firmware):
             if self.storage.stat(path).kind is Kind.DIRECTORY:
                 raise fail(errno.EISDIR, path)
         except FileNotFoundError as exc:
-            raise StaleErrno from exc
+            raise NoErrno from exc
         checksum, size = self.storage.crc(path)
         self._extra_cost += size / self.profile.crc_rate
         return u32(checksum)
@@ -127,12 +127,13 @@ class PathRequests(Firmware):
         try:
             self.storage.truncate(path, request.offset)
         except OSError as exc:
-            raise StaleErrno from exc
+            raise NoErrno from exc
         return b""
 
 
 def nak_data(code: int, number: int) -> bytes:
-    """Return a NAK's data; once errno is EEXIST every NAK says so (mavlink_ftp.cpp, _process_request)."""
+    """Return a NAK's data. While errno is EEXIST, every NAK is "file exists" (mavlink_ftp.cpp,
+    _process_request)."""
     if number == errno.EEXIST:
         return bytes([NakCode.FILE_EXISTS])
     if code != NakCode.FAIL_ERRNO:

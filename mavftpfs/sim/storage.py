@@ -1,7 +1,6 @@
 """A tree as one firmware's filesystem shows it. Layer: sim; pure.
-
-Adds what FatFs, LittleFS and NuttX do differently (servers.md 6, 8, 9) and the virtual `@` trees.
-StaleErrno means that the firmware reports a failure and leaves its errno as it was.
+This adds what FatFs, LittleFS and NuttX do differently (servers.md 6, 8, 9) and the virtual `@` trees.
+NoErrno: the firmware fails without setting errno, so it reports an older one.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ _CRC_BLOCK = 65_536
 _SECTOR = 512
 
 
-class StaleErrno(OSError):
-    """A failure that sets no errno: the server reports whatever the last one left."""
+class NoErrno(OSError):
+    """A failure that sets no errno: the server reports the errno of an earlier failure."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,7 +82,7 @@ class Storage:
         return opened
 
     def lose_power(self) -> None:
-        """Forget what was written to files that are still open, where the storage does that."""
+        """Forget what was written to files that are still open, if this storage loses it."""
         for opened in self._writing:
             opened.lose()
         self._writing.clear()
@@ -143,15 +142,15 @@ class Storage:
             if self.kind is profiles.Storage.FATFS:
                 raise fail(errno.EACCES, path) from exc
             if self.kind is profiles.Storage.POSIX:
-                self.unlink(path)  # tried after rmdir failed; its EISDIR is what gets reported
+                self.unlink(path)  # tried after rmdir failed; its EISDIR is reported
             raise
 
     def rename(self, old: bytes, new: bytes) -> None:
-        """Rename, with this filesystem's view of an existing target."""
+        """Rename. An existing target is handled as this filesystem does."""
         self._refuse_virtual(old)
         self._refuse_virtual(new)
         if self.kind is profiles.Storage.LITTLEFS:
-            raise StaleErrno
+            raise NoErrno
         source, target = self._resolve(old), self._resolve(new)
         if self._fat:
             self._check_name(new)
@@ -188,8 +187,8 @@ class Storage:
     def _resolve(self, path: bytes) -> bytes:
         """Return the path as this filesystem has it.
 
-        On FAT ends of names are dropped (`_kept`); where case is folded, as NuttX does with short names, each
-        name is replaced by the one that exists in another case, if there is none in this.
+        FAT drops ends of names (`_kept`). Where case is folded, as NuttX does with short names, a name that
+        does not exist becomes the one that exists in another case.
         """
         if not self._fat:
             return path
@@ -204,8 +203,8 @@ class Storage:
     def _kept(self, name: bytes) -> bytes:
         """Return a name without the end that FAT drops.
 
-        FatFs drops all dots and blanks there (its create_name). NuttX keeps them in long names; one dot
-        behind a short name only begins an empty extension.
+        FatFs drops all dots and blanks there (its create_name). NuttX keeps them in long names. One dot
+        behind a short name begins an empty extension, and is lost.
         """
         if self.kind is profiles.Storage.NUTTX_FAT:
             return name.removesuffix(b".") if self._is_short(name) else name
@@ -237,15 +236,14 @@ class Storage:
 
 
 def _in_page_850(name: bytes) -> str:
-    """Return a name in capitals as FatFs has it, to which its bytes are code page 850 (servers.md 9)."""
+    """Return a name in capitals as FatFs has it. FatFs takes its bytes for code page 850 (servers.md 9)."""
     return "".join(c.upper() if len(c.upper()) == 1 else c for c in name.decode("cp850"))
 
 
 class _FatFile:
-    """A FAT file open for writing: its directory entry learns the size when it is closed, and the sector that
-    was written last is in memory until then, or until another one is written.
-
-    On FatFs a full card is EIO, a write of nothing too, and a gap holds whatever the card held.
+    """A FAT file open for writing. Its directory entry gets the size when the file is closed. The sector that
+    was written last is in memory until then, or until another one is written. On FatFs a full card is EIO,
+    and so is a write of no bytes; a gap has the old bytes of the card.
     """
 
     def __init__(self, real: TreeFile, fatfs: bool, rng: random.Random) -> None:
@@ -280,7 +278,7 @@ class _FatFile:
         self._real.close()
 
     def lose(self) -> None:
-        """The power goes: what was appended since the file was opened is gone, and what was in memory."""
+        """The power fails: bytes appended since the file was opened are lost, and those in memory."""
         if not self._open:
             return
         if self._on_card:

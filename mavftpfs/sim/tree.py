@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 
 class Kind(Enum):
-    """What readdir says an entry is."""
+    """The type of an entry, as readdir tells it."""
 
     FILE = "file"
     DIRECTORY = "directory"
@@ -46,11 +46,11 @@ class OpenFile(Protocol):
         ...
 
     def write(self, offset: int, data: bytes) -> int:
-        """Write and return the number of bytes that found room, at least 1 unless `data` is empty."""
+        """Write, and return how many bytes had room: at least 1 unless `data` is empty."""
         ...
 
     def size(self) -> int:
-        """Return the present size; that of a virtual file may be a lie."""
+        """Return the present size. Virtual files may tell a wrong one."""
         ...
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ def fail(number: int, path: bytes = b"") -> OSError:
 
 
 def split_path(path: bytes) -> list[bytes]:
-    """Split into names; empty names and `.` vanish, `..` takes the name before it away.
+    """Split into names. Empty names and `.` are dropped, `..` drops the name before it.
 
     Raises:
         OSError: ENAMETOOLONG for a name over 255 bytes, EINVAL for a NUL.
@@ -204,7 +204,8 @@ class MemoryTree:
         return bytes(self._find_file(path).data)
 
     def set_order(self, path: bytes, names: Iterable[bytes]) -> None:
-        """Fix the readdir order of a directory; also of names to come and the dot entries. Others follow."""
+        """Set the readdir order of a directory, also for later names and the dot entries. Other names
+        follow."""
         node = self._find(path)
         node.order = dict.fromkeys([*names, *node.order])
 
@@ -282,7 +283,7 @@ class MemoryTree:
         return int(self._clock()) if self._clock is not None else DEFAULT_MTIME
 
     def _walk(self, names: list[bytes]) -> list[_Node]:
-        """Return the nodes from the root to where these names lead."""
+        """Return the nodes of this path, from the root on."""
         chain = [self._root]
         for name in names:
             if chain[-1].kind is not Kind.DIRECTORY:
@@ -363,7 +364,7 @@ class MemoryTree:
 
 
 class _MemoryFile:
-    """An open file of a MemoryTree; lives on when the name is removed."""
+    """An open file of a MemoryTree. It stays usable when its name is removed."""
 
     __slots__ = ("_data", "_node", "_tree", "_write")
 

@@ -1,7 +1,7 @@
 """A simulated vehicle: an FTP server with the rest of an autopilot's MAVLink around it. Layer: sim; pure.
 
-Neither does any I/O. Requests or frames in, replies or frames out, and `now` in monotonic seconds, which must
-not go back; `next_deadline` says when to ask again. Nothing a client sends makes the server raise.
+Neither does any I/O. Requests or frames go in, replies or frames come out. `now` is in monotonic seconds and
+must not go back. `next_deadline` says when to ask again. No request can make the server raise.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ _FIRMWARES: dict[Family, type[Firmware]] = {
 class FtpServer:
     """The FTP server of one vehicle component.
 
-    tree: what it serves. profile: whose behaviour it has. rng: its stray memory and its bad luck.
-    firmware: whose code answers, with its counters. requests: counts by opcode, of all that were handed in.
+    tree: the files that it serves. profile: the server that it behaves like. rng: for stray memory and
+    chance. firmware: the code that answers, with its counters. requests: how many came, by opcode.
     """
 
     def __init__(
@@ -101,9 +101,8 @@ class FtpServer:
         return self.firmware.next_deadline()
 
     def reboot(self, now: float) -> None:
-        """Lose every session, queue and reply, as a vehicle that restarts does.
-
-        Files stay, but for what FAT storage learns only when a file is closed.
+        """Lose every session, queue and reply, as a vehicle that restarts does. Files stay, except for what
+        FAT storage writes only when a file is closed.
         """
         self.firmware.crashed = False
         self._storage.lose_power()
@@ -142,12 +141,12 @@ class SimVehicle:
 
     Args:
         telemetry: bytes per second of unasked messages beside heartbeat and system time.
-        armed: state at the start; also after a reboot it is disarmed.
+        armed: at the start; after a reboot it is always disarmed.
         tells_storage: answers when asked for STORAGE_INFORMATION; None: as the profile does.
         signing_key: as for Framer.
 
     Attributes:
-        tells_time: sends its boot time unasked; ArduCopter does not, unless somebody wants its EXTRA3.
+        tells_time: sends its boot time unasked. ArduCopter does so only if a program asked for its EXTRA3.
     """
 
     def __init__(
@@ -201,7 +200,7 @@ class SimVehicle:
         self._next_telemetry = float("-inf")
 
     def set_stream(self, stream: bool) -> None:
-        """Say, before it gets anything, whether `receive` will get pieces of a stream; else datagrams."""
+        """Say, before the first `receive`, whether it will get pieces of a stream or datagrams."""
         self.framer.stream = stream
 
     def receive(self, data: bytes, now: float) -> None:
@@ -291,7 +290,8 @@ class SimVehicle:
         self._next_beat = now + HEARTBEAT_PERIOD
 
     def _add_telemetry(self, frames: list[bytes], now: float) -> None:
-        """Add what is due; ArduPilot sends a quarter for a second after each FTP reply (GCS_Common.cpp)."""
+        """Add what is due. For a second after each FTP reply ArduPilot sends only a quarter
+        (GCS_Common.cpp)."""
         slowed = self.profile.family is Family.ARDUPILOT and now - self._replied_at < _SLOWED_FOR
         rate = self.telemetry / (_SLOWED if slowed else 1.0)
         for _ in range(_MOST_TELEMETRY_PER_CALL):
@@ -301,7 +301,7 @@ class SimVehicle:
             self._telemetry_step += 1
             frames.append(frame)
             self._next_telemetry = max(self._next_telemetry, self._booted_at or 0.0) + len(frame) / rate
-        self._next_telemetry = now  # nothing more is made up for: an autopilot skips what it could not send
+        self._next_telemetry = now  # an autopilot skips what it could not send
 
     def _on_command(self, command: CommandLong, now: float) -> None:
         wanted = int(command.params[0]) if abs(command.params[0]) < 1e6 else -1
