@@ -1,4 +1,5 @@
-"""Reading through the session where the server, the link or the moment is unkind. Virtual time."""
+"""Reading through the session: every size from every server, and where the server, the link or the moment is
+unkind. Virtual time."""
 
 from __future__ import annotations
 
@@ -11,9 +12,10 @@ from trio.testing import MockClock
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address, FtpRun
-from mavftpfs.protocol.payload import Opcode, Payload, request
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN
+from mavftpfs.session.scheduler import ReadMode
 from mavftpfs.shared.errors import (
     MavftpfsError,
     RemoteProtocolError,
@@ -21,10 +23,74 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
-from tests.support.rigs import Rig
+from mavftpfs.sim.profiles import PROFILES
+from tests.support.rigs import Rig, rig
+from tests.support.takingturns import taking_turns
 from tests.support.transfers import ROOTS, MemorySink, begin_to_read, content, read_file
 
 STRANGER = Address(255, 190)
+
+
+BAD = LinkSettings(delay=0.02, loss=0.2, duplicate=0.02, reorder=0.05)
+SIZES = (0, 1, 5, 238, 239, 240, 478, 4096, 35_850, 40_152, 119_500, 131_073)
+EACH = pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+BOTH = pytest.mark.parametrize("mode", ["window", "burst"])
+
+
+@BOTH
+@EACH
+async def test_every_size_comes_whole(profile: str, mode: ReadMode) -> None:
+    files = {b"/s%d" % size: content(size, size) for size in SIZES}
+    options, link = ConnectOptions(read_mode=mode), LinkSettings(delay=0.005)
+    async with rig(profile, files, link=link, options=options) as here:
+        for path, data in files.items():
+            assert await read_file(here.connection, here.root + path) == data
+
+
+@pytest.mark.holds("fault lost")
+@BOTH
+@EACH
+async def test_little_of_a_large_file_is_asked_for_twice_over_a_bad_link(
+    profile: str, mode: ReadMode
+) -> None:
+    data, options = content(300_000), ConnectOptions(read_mode=mode)
+    async with rig(profile, {b"/big": data}, link=BAD, options=options) as here:
+        assert await read_file(here.connection, here.root + b"/big") == data
+        sent = here.connection.engine.stats.by_opcode
+        asked = sent[Opcode.READ_FILE] + sent[Opcode.BURST_READ_FILE]
+        assert asked <= 1.5 * (-(-len(data) // MAX_DATA)) / (1 - BAD.loss) ** 2
+    assert here.server.open_sessions == 0 or profile == "spec"
+
+
+async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
+    """What goes out in a pause, as if it were over already, only overflows the buffer of a server so near."""
+    data = content(1_000_000)
+    async with rig("px4-nuttx", {b"/big": data}, link=LinkSettings(delay=0.001)) as here:
+        assert await read_file(here.connection, here.root + b"/big") == data
+        assert here.connection.engine.stats.by_opcode[Opcode.READ_FILE] <= 1.25 * (-(-len(data) // MAX_DATA))
+
+
+@EACH
+async def test_listings_over_a_bad_link(profile: str) -> None:
+    files = {b"file %03d.bin" % number: b"x" * number for number in range(150)}
+    async with rig(profile, {b"/d/" + name: data for name, data in files.items()}, link=BAD) as here:
+        here.put_directory(b"/d/sub")
+        listing = await here.connection.store.list_directory(here.root + b"/d")
+        assert listing.complete
+        sizes = {entry.name: entry.size for entry in listing.entries if entry.name != b"sub"}
+        assert sizes == {name: len(data) for name, data in files.items()}
+        assert len(listing.entries) == len(files) + 1
+
+
+@EACH
+async def test_what_has_no_size_is_read_to_its_end_over_a_bad_link(profile: str) -> None:
+    """Where a read may cross the end, the bytes are right; where it may not (MAVSDK), that is an error."""
+    data = content(10_000)
+    async with rig(profile, {b"/f": data}, link=BAD) as here:
+        try:
+            assert await here.connection.store.read_whole(here.root + b"/f", 20_000) == data
+        except MavftpfsError:
+            assert profile.startswith("mavsdk")
 
 
 async def test_an_open_reply_without_a_size_is_an_error_at_once(autojump: MockClock) -> None:

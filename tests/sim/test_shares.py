@@ -20,7 +20,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
 from tests.support.rigs import Rig
-from tests.support.transfers import MemorySink, MemorySource
+from tests.support.transfers import MemorySink, MemorySource, begin_to_read
 
 LONG = 60.0
 SHORT = 10.0
@@ -254,6 +254,22 @@ async def test_never_more_is_written_than_a_short_queue_holds(
     assert here.card.data(b"/d/f") == source.content
     assert here.server.firmware.dropped_requests == 0
     assert connection.engine.stats.retransmissions == 0
+
+
+async def test_a_slow_link_that_becomes_fast_is_used(autojump: MockClock) -> None:
+    """The pace of a radio is kept while that is the way; then the cable is plugged in."""
+    size = 3_000_000
+    here = Rig("px4", {b"/d/f": random.Random(1).randbytes(size)}, LinkSettings(rate=5760.0, delay=0.05))
+    async with here.connected() as connection:
+        reader, sink = await begin_to_read(connection, b"/d/f", 0)
+        for rate in (100_000.0, 5760.0):
+            await trio.sleep(15.0)
+            here.model.settings = LinkSettings(rate=rate, queue=16_384, delay=0.01)
+            await trio.sleep(5.0)
+            before = sink.have.total
+            await trio.sleep(5.0)
+            assert sink.have.total - before > 0.8 * 5.0 * rate * MAX_DATA / FRAME
+        reader.close()
 
 
 @pytest.mark.soak
