@@ -216,28 +216,6 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, auto
     assert place.data(b"log") == data
 
 
-@pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(profile: str, autojump: MockClock) -> None:
-    """More comes for a file that was closed for lack of bytes: it is reopened, and that is looked at."""
-    place = Place(profile, QUICK)
-    async with place.rig.connected() as connection:
-        faults = place.rig.faults
-        faults.requests.clear()
-        source = MemorySource(b"a" * 3000)
-        upload = await connection.store.open_upload(place.root + b"/new", source)
-        await upload.finish()
-        source.add(b"b" * 100)
-        upload.wake()
-        await upload.finish()
-        assert source.all_proven
-        assert connection.store.traits.wo_truncates is (profile in TRUNCATING)
-        assert source.rollbacks == ([True] if profile in TRUNCATING else [])
-        assert faults.requests.count(Opcode.CREATE_FILE) == 1 + (profile in TRUNCATING)
-    assert place.data(b"new") == b"a" * 3000 + b"b" * 100
-    assert place.rig.server.open_sessions == 0
-
-
 # --- the Terminate goes out right behind the last requests
 
 LINK = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)

@@ -102,21 +102,6 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
         assert here.data(b"/d/new") == b"hello world"
 
 
-@pytest.mark.holds("fault refused retry")
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojump: MockClock) -> None:
-    here = Rig(profile, {b"/d/file": b"content"})
-    faults = here.faults
-    async with here.connected() as connection:
-        faults.ignore(Opcode.REMOVE_FILE)
-        with pytest.raises(RequestTimeout):
-            await connection.store.remove(path(profile, "file"))
-        assert names(here) == [b"file"]
-        for _ in range(20):
-            faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
-        await connection.store.make_directory(path(profile, "dir"))
-
-
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
@@ -289,21 +274,6 @@ async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> Non
                 nursery.start_soon(timed, tree.unlink(D + b"/a"), 5.0)
             await timed(tree.unlink(D + b"/long"), 5.0)  # for it the delivery is called off
         await file.release()
-
-
-@pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
-async def test_a_new_file_s_close_outlasts_bad_luck(profile: str, autojump_clock: MockClock) -> None:
-    here = Rig(profile)
-    here.card.add_directory(b"/d")
-    async with here.connected() as connection:
-        await connection.store.list_directory(b"/d")
-        faults = here.faults
-        faults.requests.clear()
-        for _ in range(8):
-            faults.lose_reply_to(Opcode.TERMINATE_SESSION)
-        await connection.store.create_empty(b"/d/new")
-        assert here.card.data(b"/d/new") == b""
-    assert here.server.open_sessions == 0
 
 
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:

@@ -80,10 +80,13 @@ async def test_whether_the_card_can_rename_is_found_out_once(each: Rig) -> None:
     assert each.count(Opcode.RENAME) == renamed + each.renames
 
 
-async def test_a_refusal_of_that_moment_is_not_taken_for_a_card_that_cannot_rename(here: Rig) -> None:
-    here.faults.refuse(Opcode.RENAME, FAIL_ERRNO, errno.EIO)
+@pytest.mark.parametrize("refusal", [(FAIL_ERRNO, errno.EIO), (NakCode.FAIL,)], ids=["errno", "odd"])
+async def test_a_refusal_of_that_moment_is_not_taken_for_a_card_that_cannot_rename(
+    here: Rig, refusal: tuple[int, ...]
+) -> None:
+    here.faults.refuse(Opcode.RENAME, *refusal)
     await write_file(here.mount(), FILE, NEW)
-    assert here.data(FILE) == NEW
+    assert here.files() == {FILE: NEW, OTHER: NEW}
     assert here.connection.store.traits.rename_works
 
 
@@ -158,12 +161,6 @@ async def test_a_refusal_for_another_reason_says_nothing_of_replacing(here: Rig,
     await tree.rename(OTHER, FILE)
     assert here.files() == {FILE: NEW}
     assert here.count(Opcode.RENAME) == renamed + 1, "nothing was moved aside"
-
-
-async def test_a_server_that_says_no_by_an_odd_error_is_learnt_too(here: Rig) -> None:
-    here.faults.refuse(Opcode.RENAME, NakCode.FAIL)
-    await write_file(here.mount(), FILE, NEW)
-    assert here.files() == {FILE: NEW, OTHER: NEW}
 
 
 async def test_what_cannot_be_replaced_safely_stays() -> None:

@@ -127,6 +127,15 @@ async def rename_over(tree: Tree) -> None:
     await tree.rename(b"/d/file", b"/d/other")
 
 
+async def rename_over_open(tree: Tree) -> None:
+    """Run mv over a file that a program reads."""
+    file = await tree.open(b"/d/other")
+    try:
+        await rename_over(tree)
+    finally:
+        await file.release()
+
+
 async def unlink(tree: Tree) -> None:
     """Run rm."""
     await tree.unlink(b"/d/file")
@@ -163,13 +172,14 @@ OPERATIONS: dict[Call, State] = {
     truncate: changed(file=OLD[:300]),
     rename: without(b"file", new=OLD),
     rename_over: without(b"file", other=OLD),
+    rename_over_open: without(b"file", other=OLD),
     unlink: without(b"file"),
     mkdir: changed(new=None),
     rmdir: without(b"sub"),
 }
 """What the directory holds after each."""
 
-RENAMES = (rename, rename_over)
+RENAMES = (rename, rename_over, rename_over_open)
 IN_PLACE = (create, replace, change, append, truncate)
 """What is done byte by byte where nothing can be renamed."""
 

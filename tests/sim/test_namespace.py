@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 
 import pytest
 import trio
@@ -34,7 +33,7 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind
-from tests.support.rigs import KINDS, RENAMING, Rig, card, list_all, read_file, rig, write_file
+from tests.support.rigs import KINDS, Rig, card, list_all, read_file, rig, write_file
 
 SCENE = {b"/d/a": b"A", b"/d/b": b"B", b"/d/full/x": b"X", b"/d/empty/gone": b""}
 FILES = {b"/d/a": b"A", b"/d/b": b"B", b"/d/full/x": b"X"}
@@ -428,37 +427,3 @@ async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: 
     torn.put(FILE, OLD)
     await tree.list(b"/d")
     assert not unfinished
-
-
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(profile: str) -> None:
-    old = bytes(range(256)) * 200
-    for count in range(1, 30):
-        here = Rig(profile, {b"/d/a": b"A", b"/d/long": old})
-        async with here.connected(QUICK):
-            tree, cut = here.mount(), trio.Event()
-            file = await tree.open(b"/d/long")
-            await file.read(0, 10)
-
-            def power_off(here: Rig = here, cut: trio.Event = cut) -> None:
-                here.link.cut()
-                cut.set()
-
-            here.faults.after(count, power_off)
-            with suppress(MavftpfsError):
-                await tree.rename(b"/d/a", b"/d/long")
-            file.close()
-            done = not cut.is_set()
-            here.link.cut()  # or leaving would tidy up
-        here.faults.call_off()
-        here.vehicle.reboot(trio.current_time())
-        here.link.restore()
-        async with here.connected(QUICK):
-            await list_all(here, here.mount())  # of the same name, so that what is left is nobody's
-        files = here.files()
-        assert files[b"/d/long"] in (old, b"A")
-        assert b"A" in files.values()
-        assert here.litter() == []
-        if done:
-            return
-    raise AssertionError("it was never done")

@@ -13,32 +13,20 @@ from mavftpfs.cache.delivery import SENT_TWICE
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.flow import FIRST
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
-from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 from tests.support.rigs import Rig, write_file
 from tests.support.takingturns import taking_turns
-from tests.support.transfers import MemorySource, content, know, path, put, read_file, start, under_way
+from tests.support.transfers import MemorySource, content, know, path, read_file, start, under_way
 
 EVERY_PROFILE = sorted(PROFILES)
 
 STRANGER = Address(255, 190)
 
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
-
-
-@pytest.mark.holds("rule 14.22")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: MockClock) -> None:
-    sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
-    here = Rig(profile, {b"/d/f1": b"something older and longer"}, BAD)
-    async with here.connected() as connection:
-        for size in sizes:
-            await put(connection, path(profile, f"f{size}"), content(size, size))
-            assert here.card.data(path(profile, f"f{size}")) == content(size, size)
-    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
@@ -281,15 +269,6 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
     assert here.data(b"/d/new") == data
 
 
-async def test_when_armed_ok_writes_in_flight(autojump: MockClock) -> None:
-    here = Rig("px4", {b"/d": None})
-    here.vehicle.arm()
-    async with here.connected(ConnectOptions(when_armed="ok")) as connection:
-        upload = await start(connection, "px4", MemorySource(b"hello"))
-        await upload.finish()
-    assert here.card.data(b"/d/new") == b"hello"
-
-
 @pytest.mark.parametrize("more", [b"", b"more"])
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
 async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
@@ -403,12 +382,18 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
         await upload.end()
 
 
+@pytest.mark.holds("promise 7")
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_finish_again_after_success_sends_only_what_is_new(profile: str, autojump: MockClock) -> None:
+async def test_finish_again_after_success_sends_only_what_is_new(
+    profile: str, probed: bool, autojump: MockClock
+) -> None:
+    """Unless opening the file anew empties it, as is found out then at the latest."""
     here = Rig(profile, {b"/d": None}, PLAIN)
-    faults = here.faults
+    faults, empties = here.faults, PROFILES[profile].write_only_truncates
     async with here.connected() as connection:
-        know(connection, profile)
+        if probed:
+            know(connection, profile)
         source = MemorySource(content(1000))
         upload = await start(connection, profile, source)
         await upload.finish()
@@ -420,10 +405,13 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, a
         source.add(b"more")
         upload.wake()
         await upload.finish()
-        again = PROFILES[profile].write_only_truncates
-        assert faults.requests.count(Opcode.WRITE_FILE) == (5 if again else 1)
+        assert connection.store.traits.wo_truncates is empties
+        assert source.rollbacks == ([True] if empties else [])
+        assert faults.requests.count(Opcode.CREATE_FILE) == empties
+        assert faults.requests.count(Opcode.WRITE_FILE) <= (5 if empties else 1)
         assert source.all_proven
     assert here.data(b"/d/new") == bytes(source.content)
+    assert here.server.open_sessions == 0
 
 
 async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock) -> None:
