@@ -102,6 +102,20 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
         assert here.data(b"/d/new") == b"hello world"
 
 
+@pytest.mark.holds("fault refused retry")
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_was_not_answered_is_done_if_a_listing_shows_it(profile: str, autojump: MockClock) -> None:
+    here = Rig(profile, {b"/d/file": b"content"})
+    async with here.connected() as connection:
+        here.faults.ignore(Opcode.REMOVE_FILE)
+        with pytest.raises(RequestTimeout):
+            await connection.store.remove(path(profile, "file"))
+        for _ in range(20):
+            here.faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
+        await connection.store.make_directory(path(profile, "dir"))
+        assert names(here) == [b"dir", b"file"]
+
+
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
