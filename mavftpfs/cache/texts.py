@@ -202,7 +202,11 @@ class Texts(ABC, Generic[B]):
                 raise ReadOnly(f"{name.decode()} is only read")
             return ErrorHandle(self.error_text)
         if write:
-            self._require_writable()
+            try:
+                self._require_writable()
+            except MavftpfsError as error:
+                self._tell(name, [f"nothing was set: {error}"])
+                raise
         shown = await self.show(name, reread=not truncate)
         return TextHandle(self, name, shown, write=write, truncate=truncate, append=append, program=program)
 

@@ -227,6 +227,8 @@ class _Setting:
         with drawing.shown(self.bar, idle="reading the parameters"):
             current = await client.read_parameters(session)
             lines, others = await client.split_by_component(session, self.lines)
+        if not self.name:
+            lines = client.spelled(lines, current)
         if others and not self.args.skip_unknown:
             raise InvalidText(f"{_of_others(others)}; --skip-unknown leaves them out")
         if others and not self.done:

@@ -171,10 +171,18 @@ def assignments(words: Sequence[str]) -> list[Line]:
             line = Line(number, name.strip(), parse_number(value.strip()))
         except BadValue as exc:
             raise UsageError(f"{word}: {exc}") from None
-        if any(other.name == line.name and not same(other.value, line.value) for other in lines):
+        if any(
+            other.name.upper() == line.name.upper() and not same(other.value, line.value) for other in lines
+        ):
             raise UsageError(f"{line.name} is given two values")
         lines.append(line)
     return lines
+
+
+def spelled(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Line]:
+    """Return lines with the vehicle's own spelling of their names, where that differs by case only."""
+    names = {one.name.upper(): one.name for one in current}
+    return [replace(line, name=names.get(line.name.upper(), line.name)) for line in lines]
 
 
 def load(path: Path) -> list[Line]:

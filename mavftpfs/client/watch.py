@@ -35,7 +35,7 @@ from mavftpfs.shared.readable import readable_size
 REOPEN = 5.0
 """Seconds until a link that cannot be opened is tried again."""
 SPARE = 1 << 20
-"""Bytes that are left free on the local disk."""
+"""Bytes that are left free on the local disk; they count as needed."""
 
 HandOn = Callable[[Path], Awaitable[str]]
 """Does something with a log that came; returns why it failed, or ""."""
@@ -350,7 +350,7 @@ class Watch:
             missing = 0 if wanted.here else wanted.size - wanted.begun
             free = free_space(self._local)
             if free - SPARE < missing:
-                needed = f"{readable_size(missing)} are needed, {readable_size(free)} are free"
+                needed = f"{readable_size(missing + SPARE)} are needed, {readable_size(free)} are free"
                 self._complain("local", f"{self._local} is full: {needed}; waiting for room")
                 return False
         self._settled("local")

@@ -43,7 +43,7 @@ def test_printing(source: str) -> None:
 
 
 def test_setting(source: str) -> None:
-    assert param(source, "RTL_ALT=3000") == ["RTL_ALT 1500 -> 3000"]
+    assert param(source, "rtl_alt=3000") == ["RTL_ALT 1500 -> 3000"]
     assert param(source, "RTL_ALT") == ["RTL_ALT,3000"]
     assert "all of it holds" in said(source, "RTL_ALT=3000.0")
     lines = said(source, "RTL_ALT=1500", "WPNAV_SPEED=750.5").splitlines()
@@ -65,7 +65,7 @@ def test_setting(source: str) -> None:
         (("RTL_ALT", "=3"), "not both"),
         (("=3",), "write NAME=VALUE"),
         (("RTL_ALT=1.5",), "not a whole number"),
-        (("RTL_ALT=1", "RTL_ALT=2"), "given two values"),
+        (("RTL_ALT=1", "rtl_alt=2"), "given two values"),
         (("NOPE=1",), "has no NOPE"),
         (("RTL_ALT=1", "WPNAV_SPEED"), "not both"),
         (("--load", "/nowhere/x"), "No such file"),

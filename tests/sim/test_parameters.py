@@ -503,6 +503,11 @@ async def test_nothing_is_set_in_flight_nor_after_it(profile: str) -> None:
             await early.flush()
         assert errno_for(caught.value) == 30
         await early.release()
+        early.close()
+        await here.disarm()
+        await Editor(tree).save("# all is well\n")
+        assert await errors(tree) == ""
+        await here.arm()
         with pytest.raises(Armed):
             await Editor(tree).open(write=True)
         assert "armed" in await errors(tree)
