@@ -319,8 +319,8 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
         return  # the program that lists it gets the error
     except (RequestTimeout, VehicleLost):
         pass  # for the user the same: no answer
-    except SessionBusy:
-        pass  # as when connect_timeout ends the same wait
+    except SessionBusy as exc:
+        raise NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use") from exc
     except (NotFound, NotADirectory, FtpNak) as exc:
         if options.root == ROOT or errno_for(exc) not in (errno.ENOENT, errno.ENOTDIR):
             raise NoFtp(f"{_vehicle(connection)} does not show its files: {exc}") from exc
@@ -332,8 +332,6 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
 
 def no_answer(connection: Connection, options: Options) -> NoFtp:
     """Return the error for no answer to an FTP request within connect_timeout."""
-    if connection.scheduler.server.kept_out:
-        return NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
     return NoFtp(
         f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "
         f"within {options.connect_timeout:g} s ({_flag(connection)})"

@@ -261,7 +261,7 @@ class Connection:
             self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
 
     def _on_doubt(self) -> None:
-        self._doubted.set()  # it is to be asked who answers
+        self._doubted.set()  # `_ask_about_vehicle` goes on
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
@@ -279,7 +279,8 @@ class Connection:
     # --- what runs as long as the connection
 
     async def _beat(self) -> None:
-        """Each second: send a heartbeat, tell the window who else is about, note when the vehicle is lost.
+        """Each second: send a heartbeat, tell the window whether there are other clients, note when the
+        vehicle is lost.
 
         Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
         """
@@ -294,9 +295,12 @@ class Connection:
                 self.was_lost = True
 
     async def _ask_about_vehicle(self) -> None:
-        """Ask who it is, when it started, and for its card, a few times: none of that is needed. Ask for the
-        first two again each time that it may have restarted or become another one. The boot time first:
-        nothing else is asked before the id, and then a restart is known."""
+        """Ask for the vehicle's id, boot time and card.
+
+        At first that is done a few times only, since none of it is needed. Id and boot time are asked for
+        again each time that the vehicle may have restarted, or may be another one. The boot time comes first:
+        no file is asked for before the id is told, and by then a restart is known.
+        """
         vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
         await self._first_heartbeat.wait()
         in_doubt = False
@@ -383,7 +387,7 @@ async def connected(
 
 
 class _Task:
-    """One that whoever cancels us (Ctrl-C) cannot stop: the session must be terminated first."""
+    """A task that Ctrl-C does not cancel: the session is terminated first."""
 
     def __init__(self, nursery: trio.Nursery, function: Callable[[], Awaitable[None]]) -> None:
         self.scope = trio.CancelScope(shield=True)

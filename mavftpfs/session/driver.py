@@ -1,8 +1,8 @@
 """The pump between link and engine. Layer: session; the only task that reads the link.
 
 Everything but `pump` and `run` is synchronous: an operation started by any task is on the wire before
-that task next awaits. Waiters are woken once per batch of input, never once per packet (a trio event
-and a time-out per request cost more than the rest of a chunk together).
+that task next awaits. Tasks that wait are woken once per batch of input, never once per packet: a trio
+event and a time-out per request cost more than the rest of a chunk together.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Driver:
 
     Attributes:
         peer: the network address that the vehicle is known by; None where the link has only one.
-        second: where somebody else says that he is the vehicle, too.
+        second: the network address of another sender that claims to be the vehicle.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class Driver:
                 self._budget.on_reply(wire, now)
         self.vehicle.identity.heard(now)
         if self.vehicle.identity.standing is not Standing.TRUSTED:
-            return  # what was asked is asked again once it is known who answers
+            return  # requests are repeated when the vehicle has told its id
         if self._trace is not None:
             for wire in wires:
                 self._trace(now, "reply", wire)
@@ -270,8 +270,8 @@ class Driver:
         return True
 
     def _on_impostor(self, source: Address, sender: NetAddress, now: float) -> None:
-        """Say once that somebody else claims to be the vehicle. Its own new address is not, so wait until the
-        vehicle was heard again where it was."""
+        """Warn once that another sender claims to be the vehicle. The vehicle itself may have moved there. So
+        warn only when it is heard at its old address again."""
         if self._impostor_at is None:
             self._impostor_at = now
         elif self.vehicle.identity.heard_since(self._impostor_at):

@@ -49,7 +49,7 @@ LONG_WAIT_TRIPS = 20.0
 of an upload again takes up to four round trips."""
 
 RELIEF = 0.5
-"""Seconds that whoever waited so long keeps what he got."""
+"""Seconds for which a user that had waited so long keeps its turn."""
 
 RECENT = 10.0
 """Seconds for which what was read stays provisional, also of files that were closed since: another client is
@@ -107,7 +107,7 @@ class SessionUser:
 
     @property
     def awaited(self) -> bool:
-        """Whether somebody waits for what it does, who is told if it gets no turn in time."""
+        """Whether a caller waits for it, and gets an error if it has no turn in time."""
         return self.asked_at is not None
 
     @property
@@ -147,12 +147,12 @@ class SessionUser:
         return self.asked_at is not None and now - self.asked_at >= limit
 
     def rank(self, now: float, rtt: float | None) -> tuple[bool, float]:
-        """Return what orders those who wait: the least goes first."""
+        """Return its place among the users that wait: the least goes first."""
         heavy = self.used(now) >= LIGHT_USE and not self.waited_long(now, rtt)
         return heavy, now if self.asked_at is None else self.asked_at
 
     def gives_way(self, rival: float, began: float, now: float, rtt: float | None) -> bool:
-        """Return whether its turn, which began then, ends for whoever used so much (seconds) and waits."""
+        """Return whether its turn, which began then, ends for a user that waits, and used so many seconds."""
         slice_ = now - began
         if slice_ < RELIEF and self.waited_long(began, rtt):
             return False
@@ -259,7 +259,7 @@ class Scheduler:
         self.server.wake()
 
     def renew(self, user: SessionUser) -> None:
-        """From now on somebody waits for it, and for no longer than that."""
+        """A caller begins to wait for it now; its patience begins anew."""
         user.asked_at = self.clock()
         if user in self._queue:
             self._be_patient(self._queue[user])
@@ -272,8 +272,9 @@ class Scheduler:
     async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
         """Wait for the session, and have it for the length of the body.
 
-        The body must not wait for a path, a node or memory for reads: others that have them may wait for the
-        session. If it is cancelled while it opens or closes, something may be open, which `serve` closes.
+        The body must not wait for a path, a node or memory for reads: a task that has one of these may be
+        waiting for the session. If the body is cancelled while it opens or closes a file, `serve` closes what
+        may be open.
 
         Raises:
             VehicleLost, Armed: it cannot be used now. RequestTimeout, SessionBusy: others keep it.
@@ -384,17 +385,17 @@ class Scheduler:
             await server.close_maybe_open()
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
-        """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path. What
-        had the new name cannot be read any more."""
-        for user in list(self.users):  # who is told may close it
+        """A file or directory was renamed. Users of it, and of what lies in it, go on under the new path. A
+        file that had the new name cannot be read any more."""
+        for user in list(self.users):  # a user may be closed by that
             if user.path == new:
                 user.on_removed()
             else:
                 user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
-        """The file of this name was removed or replaced: what its readers still want cannot be had."""
-        for user in list(self.users):  # who is told may close it
+        """The file of this name was removed or replaced: its readers get no more of it."""
+        for user in list(self.users):  # a user may be closed by that
             if user.path == path:
                 user.on_removed()
 
@@ -408,7 +409,7 @@ class Scheduler:
         echoes = engine.traits.ack_carries_own_session  # then each client has an id of its own
         if session is not None and (not echoes or session == engine.home_session):
             self._touched_at = now
-        # Whoever uses sessions may just have used ours, too, in a request that was not heard.
+        # A client that uses sessions may have used ours, too, by a request that was not heard.
         reads = newcomer or now - self._touched_at <= RECENT
         self.doubt.raise_it("another FTP client is active", reads=reads)
         if not echoes and self.server.session is not None and took_session(payload):
@@ -427,7 +428,7 @@ class Scheduler:
             self.server.abandon()
 
     def _on_reads_doubted(self, reason: str) -> None:
-        """What was read lately is provisional, also of files closed since."""
+        """What was read lately may be another file's, also of files that were closed since."""
         for user in [*self.users, *(user for _, user in self.gone)]:
             user.on_suspect(reason)
 
@@ -461,8 +462,8 @@ class Scheduler:
                     await self._grant(user)
 
     async def _grant(self, user: SessionUser) -> None:
-        """Give it the session, and wait until it is given back. If the vehicle answered meanwhile, those that
-        wait for a later turn have not waited in vain."""
+        """Give a user the session, and wait until it is given back. If the vehicle answered meanwhile, the
+        users in the queue may wait longer: it is not silent."""
         turn, began = self._queue.pop(user), self.clock()
         self._hold(turn)
         turn.granted.end()

@@ -38,7 +38,7 @@ SILENCE_PX4 = 10.5
 """Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
 
 TERMINATE_LIMIT = 5.0
-"""Seconds to wait for a Terminate that is sent for somebody else's sake."""
+"""Seconds to wait for a Terminate of whose failure no caller is told."""
 
 STALL = 2.0
 """Seconds without a reply, while a file is read or written, after which its session is not believed in."""
@@ -130,7 +130,8 @@ class PathGate:
 
     @asynccontextmanager
     async def passing(self, on_shut: Callable[[], None]) -> AsyncIterator[None]:
-        """Wait to be let in, and stay inside for the length of the body; on_shut: who is to let us in."""
+        """Wait to be let in, and stay inside for the length of the body. on_shut: called while the gate is
+        shut, to wake the upload that shut it."""
         self.waiting += 1
         try:
             while self.shut:
@@ -163,14 +164,13 @@ class PathGate:
 
 
 class ServerSession:
-    """Opens, closes and remembers; lets its user sleep until there is news.
+    """Opens and closes files, and knows what is open. Its user sleeps here until there is news.
 
-    op_deadline: seconds to wait for a Terminate of whose failure somebody is told.
+    op_deadline: seconds to wait for a Terminate of whose failure a caller is told.
 
     Attributes:
         state: see State. session: what is open in the state OPEN. transfer: what reads or writes it now.
         maybe_open: files that may be open over there by our doing, by session id.
-        kept_out: whether the last request that needs no session was refused because of somebody else's.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
         changed: where tasks park until the state is another one.
     """
@@ -192,7 +192,6 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
-        self.kept_out = False
         self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
@@ -283,8 +282,8 @@ class ServerSession:
             )
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
-        """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or the
-        network brought an older one once more."""
+        """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or a late
+        copy of an older open came."""
         return nak.retransmitted or (self.doubt.is_active() and not self._others_heard())
 
     # --- closing
@@ -292,9 +291,8 @@ class ServerSession:
     async def close(self, limit: float | None = None) -> bool:
         """Terminate; return False if the server had closed it before, by itself.
 
-        A session that is not there counts as closed by us if we had to ask twice, within a time in which no
-        server closes an idle one: the first request did it. limit: seconds to wait for the answer; None: as
-        for any request, for somebody is told of a failure.
+        If a repeated Terminate finds no session, the first one closed it, unless the server may have closed
+        it as idle. limit: seconds to wait for the answer; None: as for any request.
 
         Raises:
             FtpNak: closing failed over there. RequestTimeout: no answer; it may be open now.
@@ -317,13 +315,12 @@ class ServerSession:
             self.maybe_open.pop(session.id, None)
             if nak.code not in _NOT_OPEN:
                 raise
-            # Our own first request closed it, if no server closes an idle session so soon.
             return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
         finally:
             self._enter(State.CLOSED)
 
     async def close_quietly(self) -> None:
-        """Close after a failure that is already being reported, or for somebody else's sake."""
+        """Close where no caller is to be told of a failure."""
         with suppress(MavftpfsError):
             await self.close(TERMINATE_LIMIT)
 
@@ -354,8 +351,8 @@ class ServerSession:
         return closed
 
     def abandon(self) -> None:
-        """What is open is lost, or not to be believed: nothing more comes of it, and it is closed before the
-        next open. After a restart, too: that news may come after it was opened anew."""
+        """Believe no more in what is open: its transfer ends, and it is closed before the next open. This is
+        also done after a restart, which may be noticed only when a file was opened anew."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
         if self.session is not None:
@@ -363,7 +360,7 @@ class ServerSession:
         self.wake()
 
     def lose(self, lost: SessionLost) -> None:
-        """Who used it found it lost: abandon it, and where the server ended it, doubt what was read."""
+        """Its user found it lost. Abandon it; if the server ended it, what was read is in doubt."""
         self.abandon()
         if lost.by_server:
             self.doubt.raise_it(str(lost))
@@ -382,11 +379,13 @@ class ServerSession:
     # --- requests beside the session, and what to do when it is taken
 
     async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
-        """Carry out a request that needs no session of its own, and carries a path to be looked up: some
-        servers take that amiss while a file is written. Another client's session may keep it out
-        (ArduPilot): then it is made and asked anew, after silences.
+        """Carry out a request that needs no session of its own, and carries a path.
 
-        changes: a refusal of what was sent twice may answer the second execution, and is the caller's news.
+        It passes the path gate: looking up a path disturbs an upload on NuttX. ArduPilot refuses it while
+        another client has a session: then a new one is made and sent after a silence.
+
+        changes: it changes the card. If it was sent twice, a refusal may answer the second execution, and is
+            raised at once.
 
         Raises:
             VehicleLost. SessionBusy: that session did not go away. Else what the request fails with.
@@ -401,13 +400,8 @@ class ServerSession:
             except FtpNak as nak:
                 if nak.code not in _TAKEN or self.session is not None or (changes and nak.retransmitted):
                     raise
-                try:
-                    await self._remedy(nak, remedies)
-                except SessionBusy:
-                    self.kept_out = True
-                    raise
+                await self._remedy(nak, remedies)
             else:
-                self.kept_out = False
                 return operation
 
     async def find_out_sessions(self) -> None:

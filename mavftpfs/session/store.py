@@ -1,8 +1,8 @@
 """The vehicle's files, as the caches see them. Layer: session; implements cache.remote.VehicleStore.
 
-Did that change happen? A request whose answer may have been lost can be carried out twice, and the second
-answer is then a refusal (docs/servers.md 14.4). Such a refusal, and a silence, are never interpreted: a
-listing tells what became of it. While there is doubt (session.doubt) the network may do the same to a request
+Did that change happen? A request whose answer was lost is sent again, may be carried out twice, and is then
+refused the second time (docs/servers.md 14.4). So after such a refusal, and after a silence, a listing tells
+whether the change happened. While there is doubt (session.doubt) the network may also have doubled a request
 that we sent once. Then names rest between two changes: `settle` is the one place that waits for late copies.
 """
 
@@ -71,8 +71,8 @@ COPY_RATE = 100_000.0
 """Bytes per second that the slowest card checksums; the question is not repeated before."""
 
 VERIFY_LIMIT = 4.0
-"""Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
-an answer within `op_deadline`, and this comes after it."""
+"""Seconds to spend on finding out what became of a request that was not answered. The caller was promised an
+answer within `op_deadline`, and this comes after it."""
 
 _OFTEN = 0.25
 """Seconds after which a transfer looks up at the latest."""
@@ -109,9 +109,9 @@ Verdict = Callable[[], Awaitable[Outcome]]
 class Store:
     """Reads, lists, checks and changes remote files; see cache.remote for what each call does.
 
-    What changes the card raises FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or Armed: it
-    did not happen; or OutcomeUnknown: nobody knows. Only create_empty looks at no listing: after its
-    RequestTimeout the file may be there, and empty.
+    A change of the card that fails with FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or
+    Armed did not happen. After OutcomeUnknown that is not known. Only create_empty looks at no listing: after
+    its RequestTimeout the file may be there, and empty.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
@@ -322,7 +322,7 @@ class Store:
             await self._perform(request, partial(self._is_new_directory, path))
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
-        """Rename; who reads the old path goes on under the new one. completes: in flight, too. confirm: the
+        """Rename; readers of the old path go on under the new one. completes: in flight, too. confirm: the
         ACK alone is not believed."""
         data = wire_path(old) + b"\0" + wire_path(new)
         if len(data) > RENAME_ROOM:

@@ -1,9 +1,9 @@
-"""One upload: who waits for it, what becomes of it next, and how it uses its turns. Layer: session.
+"""One upload: its callers, what it does next, and how it uses its turns. Layer: session.
 
 A file is made by CreateFile. Where OpenFileWO was seen to keep a file's content an upload can be interrupted
 at any time: Terminate right behind the window, and later OpenFileWO and what of that was not ACKed. Where it
 was seen to empty files that would begin the file anew, so the upload keeps the session until its source has
-nothing more. Where neither was seen yet, the upload is interrupted when somebody waits, and reopening its
+nothing more. Where neither was seen yet, the upload is interrupted when another user waits, and reopening its
 file tells. What was ACKed before an ACKed Terminate is written.
 
 PX4 on NuttX checks each WriteFile against a scratch buffer that every path operation overwrites
@@ -45,11 +45,11 @@ STARVE = 1.5
 """Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
 
 BRIEF_STARVE = 0.05
-"""The same where it can be interrupted and somebody else waits."""
+"""The same where it can be interrupted and another user waits."""
 
 PATIENCE = 10.0
-"""Seconds of the session after which one that cannot be interrupted, and has nothing to send at the moment,
-lets go of it for who waits: a log that trickles would keep it for ever."""
+"""Seconds after which an upload that cannot be interrupted gives the session to a user that waits when it
+has nothing to send: else a log that trickles would keep it for ever."""
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
@@ -149,11 +149,12 @@ class Upload(SessionUser):
 
     @property
     def awaited(self) -> bool:
-        """Whether somebody waits for the end."""
+        """Whether a caller waits in `finish`."""
         return not all(finisher.done for finisher in self._finishers)
 
     def on_armed_changed(self) -> None:
-        """What waits for it is told at once, and it ends its turn by itself. On disarming it goes on."""
+        """If it waits for a turn, its callers get Armed at once; in a turn it sees that itself. After
+        disarming it goes on."""
         if self._vehicle.may_write:
             self._retry_at = 0.0
         else:
@@ -163,7 +164,7 @@ class Upload(SessionUser):
     # --- its task
 
     async def run(self) -> None:
-        """Take a turn whenever there is something to send, until it is given up. What fails is tried again in
+        """Take a turn whenever there is something to send, until `end`. After a failure it is tried again in
         the background."""
         try:
             while not self._ended:
@@ -185,8 +186,8 @@ class Upload(SessionUser):
             self._over.set()
 
     def _due_in(self) -> float:
-        """Return in how many seconds it wants a turn, unless it is woken before. A silent vehicle is only
-        tried while somebody waits for the end."""
+        """Return in how many seconds it wants a turn, unless it is woken before. A vehicle that is lost is
+        tried only while a caller waits."""
         now = self._clock()
         wanted = self.awaited or (not self._held and self._has_work())
         if not wanted or not self._vehicle.may_write:
@@ -200,7 +201,7 @@ class Upload(SessionUser):
         return source.has_more() or not source.acked.empty or (self.awaited and not source.closed)
 
     def _fail(self, error: MavftpfsError) -> None:
-        """Tell those that wait, and try again later; after a refusal only when somebody waits again."""
+        """Raise an error in all `finish`, and try again later; after a refusal only at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
         self._failures += 1
@@ -250,8 +251,9 @@ class Upload(SessionUser):
         return truncates is False or (truncates is None and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
-        """Everything that was given before these began to wait is ACKed, and the file was closed. Where it
-        cannot be written on, more costs the whole file once more, so it is held until somebody waits for it.
+        """Let these callers go: everything that the source had when they began to wait is ACKed, and the file
+        was closed. Where it cannot be written on, more bytes cost the whole file once more, so they wait for
+        the next `finish`.
 
         Raises:
             MavftpfsError: the source fails.
@@ -305,7 +307,7 @@ class Upload(SessionUser):
                     return None
                 session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
         except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT:  # somebody removed the file
+            if errno_for(nak) == errno.ENOENT:  # another client, or the vehicle, removed the file
                 return None
             if traits.wo_truncates is not None:
                 raise
@@ -380,8 +382,8 @@ class Upload(SessionUser):
             rival = turn.rival
             stop = stop or self._reason_to_stop(session, transfer, fed_at, rival)
             if server.is_stalled(transfer):
-                # The session may be somebody else's (servers.md 14.9). Where closing would cost the whole
-                # file, only if there is somebody else; the server tells the rest.
+                # Another client may have taken the session (servers.md 14.9). Where closing would cost the
+                # whole file, only if another client was heard; else the server will tell.
                 rivals = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
                 stop = Stop.DOUBT if rivals else stop
             if stop is not None:
@@ -430,9 +432,10 @@ class Upload(SessionUser):
     def _let_trail(self, stop: Stop, transfer: WriteTransfer) -> bool:
         """Have the Terminate go out right behind the last requests if that is right; return whether it does.
 
-        It is a round trip less for who waits.
-        Servers carry them out in order; what gets lost is sent when the file is open again. Where others'
-        paths cause refusals, the answers are waited for: that alone sets it right."""
+        That is a round trip less for the user that waits. Servers carry requests out in order, and what gets
+        lost is sent when the file is open again. But where path operations cause refusals (NuttX) the answers
+        are waited for, because only the running upload can put that right.
+        """
         if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
             return False
         if self._engine.traits.paths_disarm or self._scheduler.is_excluded(self.path):

@@ -64,7 +64,7 @@ delays a message less, and simulators may run slower than the clock."""
 
 
 class Standing(Enum):
-    """What is known of who answers."""
+    """Whether the one that answers is the vehicle that was mounted."""
 
     TRUSTED = "trusted"
     DOUBTED = "doubted"
@@ -72,10 +72,10 @@ class Standing(Enum):
 
 
 class Identity:
-    """Who the vehicle is.
+    """Tells the vehicle from another one at its address, by the unique id.
 
     Attributes:
-        standing: of who answers now; only a trusted one is asked for files.
+        standing: of the one that answers now. Only a trusted one is asked for files.
         left_at: when it was heard last before it was away, the last time.
         heard_at: when it was heard last.
     """
@@ -85,13 +85,18 @@ class Identity:
         whether it was a stranger meanwhile: it is trusted again."""
         self.standing = Standing.TRUSTED
         self._on_doubt, self._on_settled = on_doubt, on_settled
-        self._known: AutopilotVersion | None = None
+        self._known: AutopilotVersion | None = None  # its id, once it was told
+        # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
         self._strange = False
+        # It told its id once, and then left PATIENCE questions unanswered. Without that memory each silence
+        # would hold all requests back for so long.
         self._mute = False
+        # It answers from another network address. If it does not tell its id there, it is a stranger: else
+        # any sender that keeps silent about its id could take the vehicle's place (promise 1).
         self._moved = False
-        self._unanswered = 0
+        self._unanswered = 0  # questions, since it is doubted
         self.heard_at: float | None = None
-        self._back_at = self.left_at = -inf
+        self._back_at = self.left_at = -inf  # the end of the last absence, and its beginning
 
     def may_be_asked(self, now: float) -> bool:
         """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
@@ -113,7 +118,7 @@ class Identity:
         self.doubt()
 
     def moved(self, now: float) -> None:
-        """Its network address is another one: only who it is makes it believed there, if it ever told."""
+        """It answers from another network address. If it ever told its id, it has to tell it there."""
         self.reopened(now)
         self.standing, self._moved, self._unanswered = Standing.DOUBTED, True, 0
 
@@ -136,7 +141,7 @@ class Identity:
         self._on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
-        """It told who it is; return whether it is the same as ever."""
+        """It told its id; return whether that is the same as ever."""
         self._mute = False
         if self._known is not None and is_another(self._known, version):
             self._is_stranger()
@@ -147,7 +152,7 @@ class Identity:
         return True
 
     def unanswered(self) -> None:
-        """It was heard, but did not tell who it is though it was asked."""
+        """It was heard, and did not tell its id though it was asked."""
         self._unanswered += 1
         if self._unanswered < PATIENCE or self.standing is not Standing.DOUBTED:
             return
@@ -325,8 +330,8 @@ class Vehicle:
                 self.on_refusal()
 
     def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:
-        """Learn from one, in this order: who is about, which of them is the vehicle, whether that is armed,
-        and that it lives."""
+        """Learn from a heartbeat, in this order: which components there are, which of them is the vehicle,
+        whether it is armed, and that it lives."""
         source, pilot = heartbeat.source, heartbeat.autopilot != MAV_AUTOPILOT_INVALID
         if source == self.own:
             self.on_double()
@@ -341,7 +346,7 @@ class Vehicle:
             return
         if pilot:
             self._disarmed_at = -inf if heartbeat.armed else now
-            # Who may be another one does not say that ours is on the ground.
+            # While it is unknown which vehicle answers, "disarmed" is not believed.
             if heartbeat.armed or self.identity.may_be_asked(now):
                 self._on_armed(heartbeat.armed)
         # A component may send no heartbeats of its own; its system's autopilot then speaks for it.
