@@ -36,6 +36,9 @@ def card(vehicle: SimVehicle, request: pytest.FixtureRequest) -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what tests fsspec's patterns and not us, but on one vehicle: that takes a minute on each."""
-    for item in [item for item in items if "_glob_edge_cases[" in item.name and "[px4-" not in item.name]:
-        items.remove(item)
+    """Leave what tests fsspec's patterns and not us to the soak, on one vehicle: that takes a minute."""
+    for item in [item for item in items if "_glob_edge_cases[" in item.name]:
+        if "[px4-" in item.name:
+            item.add_marker(pytest.mark.soak)
+        else:
+            items.remove(item)

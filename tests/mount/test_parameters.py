@@ -31,10 +31,14 @@ class Texts:
         self.real = FLOAT_NAME[profile]
         self.whole = INT_NAME[profile]
 
+    def values(self) -> dict[str, float]:
+        """Return all values."""
+        packed = self.mount.read_bytes(self.folder / "param.pck")
+        return {one.name: one.value for one in unpack(packed).parameters}
+
     def told(self, name: str) -> float:
         """Return a value."""
-        packed = self.mount.read_bytes(self.folder / "param.pck")
-        return {one.name: one.value for one in unpack(packed).parameters}[name]
+        return self.values()[name]
 
     def errors(self) -> str:
         """Return what the last save said."""
@@ -52,34 +56,41 @@ class Texts:
 
 
 @pytest.fixture(scope="module", params=list(FLOAT_NAME))
-def texts(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> Texts:
-    """A mount of a vehicle with parameters."""
-    source = module_field.sim(small_tree, request.param).source
-    return Texts(module_field.mount(source), request.param)
+def texts(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> Iterator[Texts]:
+    """A mount of a vehicle with parameters, and a home where vim leaves its backups of what was refused."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(module_field.local("home")))
+        source = module_field.sim(small_tree, request.param).source
+        mount = module_field.mount(source)
+        yield Texts(mount, request.param)
+        mount.finish()
 
 
 @pytest.fixture(autouse=True)
 def restored(texts: Texts) -> Iterator[None]:
     """Give the next test the values that this one found."""
-    before = {name: texts.told(name) for name in (texts.real, texts.whole)}
+    before = texts.values()
     yield
-    texts.shell("".join(f"echo {name},{value} >> params.parm;" for name, value in before.items()))
+    lines = [f"{name},{before[name]}" for name in (texts.real, texts.whole)]
+    texts.shell(f"printf '%s\\n' {' '.join(lines)} >> params.parm")
 
 
 VIM = "vim -es -N -i NONE -n -u NONE"
 BACKUP = f"{VIM} --cmd 'set writebackup backupskip='"
-PAUSE = "-c 'call system(\"sleep 3\")'"
+PAUSE = "-c 'call system(\"sleep 1\")'"
+"""What a vehicle sets by itself moves each second."""
 MOVING = {"ATC_RAT_PIT_P": "STAT_RUNTIME", "MC_PITCHRATE_P": "LND_FLIGHT_T_LO"}
 
 
 @pytest.mark.parametrize("vim", [VIM, BACKUP])
 def test_vim_sets_what_its_user_changed(texts: Texts, vim: str) -> None:
     """Also though it reads the file once more to make a backup, and values have moved since."""
-    before, moved = texts.told(texts.whole), texts.told(MOVING[texts.real])
+    before, moving = texts.values(), MOVING[texts.real]
     texts.shell(f"{vim} -c '%s/^{texts.real},.*/{texts.real},0.5/' {PAUSE} -c wq params.parm")
-    assert texts.told(texts.real) == 0.5
-    assert texts.told(texts.whole) == before
-    assert texts.told(MOVING[texts.real]) > moved
+    after = texts.values()
+    assert after[texts.real] == 0.5
+    assert after[texts.whole] == before[texts.whole]
+    assert after[moving] > before[moving]
     assert texts.errors() == ""
 
 
@@ -93,11 +104,11 @@ def test_vim_that_changed_nothing_sets_nothing(texts: Texts, vim: str) -> None:
 
 def test_vim_on_a_terminal_saves_without_a_question(texts: Texts) -> None:
     """Though what the vehicle sets by itself moved between the listing, the open and the save."""
-    texts.shell("ls -l; sleep 2")
+    texts.shell("ls -l; sleep 1")
     words = ["vim", "-N", "-i", "NONE", "-n", "-u", "NONE", "--cmd", "set backupskip=", str(texts.all)]
     terminal = Terminal(words, 100, 30)
     terminal.read_until(lambda shown: "params.parm" in shown.raw)
-    time.sleep(2)
+    time.sleep(1)
     terminal.type(f":%s/^{texts.real},.*/{texts.real},0.75/\r:w\r")
     terminal.read_until(lambda shown: "written" in shown.raw or "WARNING" in shown.raw)
     terminal.type(":q\r")

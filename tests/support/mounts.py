@@ -152,6 +152,10 @@ class Mount:
         facts: dict[str, Any] = ask(socket, {"command": "status"}, timeout=20)["status"]
         return facts
 
+    def bytes_read(self) -> int:
+        """Return how much has come of the files that are being read."""
+        return sum(one["done"] for one in self.status()["transfers"])
+
     def alive_or_ended(self) -> Process:
         """Return the process."""
         assert self.process is not None
