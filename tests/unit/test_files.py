@@ -307,6 +307,15 @@ async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_li
     assert (timed.count(OPEN), timed.count(*LISTS)) == (2, listings)
 
 
+async def test_a_file_that_became_smaller_while_its_bytes_were_doubted(here: Rig) -> None:
+    handle = await here.mount().open(LOG)
+    await handle.read(0, 100)
+    here.put(LOG, DATA[:1000])
+    here.connection.scheduler.doubt.raise_it("somebody else")
+    with pytest.raises(FileChanged):
+        await handle.read(0, 100)
+
+
 @pytest.mark.parametrize("doubted", [False, True])
 async def test_closing_the_last_handle_under_a_read_ends_it(doubted: bool) -> None:
     """doubted: the file is being opened anew."""

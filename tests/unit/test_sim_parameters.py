@@ -137,3 +137,11 @@ def test_a_table_may_tell_every_default() -> None:
     every = Table(unpacked(some), every_default=True).download(Selection(defaults=True), 239, 0)
     assert len(every) == len(some) + 4
     assert [one.default for one in unpacked(every)] == [bytes(4), struct.pack("<i", 3)]
+
+
+def test_a_parameter_may_need_another() -> None:
+    table = Table([parameter("GRIP_ENABLE", INT32, 0), parameter("GRIP_GRAB", INT32, 9, needs="GRIP_ENABLE")])
+    table.set(b"GRIP_GRAB", 100, 0)
+    assert [one.number for one in table.visible(0)] == [0]
+    table.set(b"GRIP_ENABLE", 1, 0)
+    assert table.number("GRIP_GRAB", 0) == 9
