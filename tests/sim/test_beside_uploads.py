@@ -16,7 +16,6 @@ from trio.testing import MockClock
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import Armed, FtpNak, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -28,6 +27,7 @@ from tests.support.transfers import (
     content,
     know,
     path,
+    put,
     read_file,
     start,
     under_way,
@@ -48,55 +48,35 @@ OP_DEADLINE = 30.0
 OPCODE = 3
 
 
-class Place:
-    """A vehicle with a directory in which there is a file, and what comes to its server.
+FILES = {b"/d/other": b"q" * 3000, b"/d/brief": b"q" * 100}
 
-    came: the requests' opcodes, and when they came. lose: of requests that do not come.
-    """
 
-    def __init__(self, profile: str, link: LinkSettings) -> None:
-        self.rig = Rig(profile, {b"/d/other": b"q" * 3000, b"/d/brief": b"q" * 100}, link)
-        self.root = self.rig.root + b"/d"
-        self.came: list[tuple[int, float]] = []
-        self.lose: list[int] = []
-        self._handle = self.rig.server.handle
-        self.rig.server.handle = self._on_request  # type: ignore[method-assign]
+async def read_brief(here: Rig) -> None:
+    assert await read_file(here.connection, here.root + b"/d/brief") == FILES[b"/d/brief"]
 
-    def _on_request(self, wire: bytes, source: Address, now: float) -> None:
-        if wire[OPCODE] in self.lose:
-            self.lose.remove(wire[OPCODE])
-            return
-        self.came.append((wire[OPCODE], now))
-        self._handle(wire, source, now)
 
-    async def read(self, connection: Connection) -> None:
-        """Read a small file."""
-        assert await read_file(connection, self.root + b"/brief") == b"q" * 100
+async def read_now_and_then(here: Rig, rng: random.Random, longest: float = 0.8) -> None:
+    while True:
+        await trio.sleep(rng.uniform(0.0, longest))
+        await read_brief(here)
 
-    async def upload(self, connection: Connection, name: bytes, data: bytes) -> None:
-        """Upload without a mount, where it is known what OpenFileWO does."""
-        source = MemorySource(data)
-        connection.store.traits.wo_truncates = False
-        upload = await connection.store.open_upload(self.root + b"/" + name, source)
-        upload.wake()
-        await upload.finish()
-        assert source.all_proven
-        assert self.data(name) == data
 
-    async def copy(self, tree: Tree, name: bytes, data: bytes) -> float:
-        """Do what cp does; return how long closing took."""
-        file = await tree.create(b"/d/" + name, exclusive=True)
-        for at in range(0, len(data), 50_000):
-            await file.write(at, data[at : at + 50_000])
-        began = trio.current_time()
-        try:
-            await file.flush()
-        finally:  # the kernel releases it in any case
-            await file.release()
-        return trio.current_time() - began
+async def upload(here: Rig, name: bytes, data: bytes) -> None:
+    """Upload without a mount, where it is known what OpenFileWO does."""
+    here.connection.store.traits.wo_truncates = False
+    await put(here.connection, here.root + b"/d/" + name, data)
+    assert here.data(b"/d/" + name) == data
 
-    def data(self, name: bytes) -> bytes:
-        return self.rig.data(b"/d/" + name)
+
+async def copy(tree: Tree, name: bytes, data: bytes) -> None:
+    """Do what cp does; each error of flush and release shows."""
+    file = await tree.create(b"/d/" + name, exclusive=True)
+    for at in range(0, len(data), 50_000):
+        await file.write(at, data[at : at + 50_000])
+    try:
+        await file.flush()
+    finally:  # the kernel releases it in any case
+        await file.release()
 
 
 async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
@@ -113,14 +93,14 @@ async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autojump: MockClock) -> None:
-    place = Place(profile, QUICK)
-    async with place.rig.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+    here = Rig(profile, FILES, QUICK)
+    async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
         nursery.start_soon(trickle, tree, b"/d/log")
         await trio.sleep(10)
         for number in range(4):
             with trio.fail_after(15):
-                await place.copy(tree, b"b%d" % number, b"b" * 1000)
-            assert place.data(b"b%d" % number) == b"b" * 1000
+                await copy(tree, b"b%d" % number, b"b" * 1000)
+            assert here.data(b"/d/b%d" % number) == b"b" * 1000
             file = await tree.open(b"/d/other")
             with trio.fail_after(15):
                 assert await file.read(number * 300, 300) == b"q" * 300
@@ -132,60 +112,60 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
-    place = Place(profile, SLOW)
+    here = Rig(profile, FILES, SLOW)
     data = random.Random(4).randbytes(300_000)
-    async with place.rig.mounted(b"/d") as tree:
+    async with here.mounted(b"/d") as tree:
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(place.copy, tree, b"big", data)
+            nursery.start_soon(copy, tree, b"big", data)
             await trio.sleep(10)
             with trio.fail_after(5):
-                assert await read_file(place.rig.connection, place.root + b"/other") == b"q" * 3000
+                assert await read_file(here.connection, here.root + b"/d/other") == b"q" * 3000
             with trio.fail_after(10):
-                await place.copy(tree, b"small", b"b" * 1000)
-        assert place.rig.connection.store.traits.wo_truncates is False, "learnt on the way"
-    assert place.data(b"big") == data
-    assert place.data(b"small") == b"b" * 1000
+                await copy(tree, b"small", b"b" * 1000)
+        assert here.connection.store.traits.wo_truncates is False, "learnt on the way"
+    assert here.data(b"/d/big") == data
+    assert here.data(b"/d/small") == b"b" * 1000
 
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
-    place = Place(profile, SLOW)
+    here = Rig(profile, FILES, SLOW)
     data = random.Random(4).randbytes(600_000)
     waited: list[float] = []
-    async with place.rig.mounted(b"/d") as tree:
-        faults = place.rig.faults
+    async with here.mounted(b"/d") as tree:
+        faults = here.faults
         faults.requests.clear()
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(place.copy, tree, b"big", data)
+            nursery.start_soon(copy, tree, b"big", data)
             await trio.sleep(10)
-            assert await read_file(place.rig.connection, place.root + b"/other") == b"q" * 3000  # the trial
+            assert await read_file(here.connection, here.root + b"/d/other") == b"q" * 3000  # the trial
             await trio.sleep(2)
             began = trio.current_time()
             with pytest.raises(RequestTimeout):
-                await place.copy(tree, b"small", b"b" * 1000)
+                await copy(tree, b"small", b"b" * 1000)
             waited.append(trio.current_time() - began)
             began = trio.current_time()
-            await place.rig.connection.store.list_directory(place.root)
+            await here.connection.store.list_directory(here.root + b"/d")
             waited.append(trio.current_time() - began)
         assert waited[0] <= 2 * OP_DEADLINE + 3, "for close, and for the release behind it"
         assert waited[1] < 3
-        assert place.rig.connection.store.traits.wo_truncates is True
+        assert here.connection.store.traits.wo_truncates is True
         await trio.sleep(60)
-        assert place.data(b"small") == b"b" * 1000, "brought later"
+        assert here.data(b"/d/small") == b"b" * 1000, "brought later"
         # big twice, small, and an empty file that shows whether the card can rename
         assert faults.requests.count(Opcode.CREATE_FILE) <= 2 + 1 + 1
-    assert place.data(b"big") == data
+    assert here.data(b"/d/big") == data
 
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: MockClock) -> None:
     """The whole file again for each line is more than a link carries."""
-    place = Place(profile, QUICK)
-    async with place.rig.mounted(b"/d") as tree, trio.open_nursery() as nursery:
-        faults = place.rig.faults
+    here = Rig(profile, FILES, QUICK)
+    async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+        faults = here.faults
         faults.requests.clear()
         nursery.start_soon(trickle, tree, b"/d/log", 3.0)
         await trio.sleep(300)
@@ -199,13 +179,13 @@ async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: M
 @pytest.mark.parametrize(("profile", "step"), [("px4", 1), ("px4-nuttx", 100), ("ardupilot", 100)])
 async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, autojump: MockClock) -> None:
     """A program without a buffer of its own writes faster than answers come, and slower than the link."""
-    place = Place(profile, LinkSettings(rate=100_000.0, delay=0.02))
+    here = Rig(profile, FILES, LinkSettings(rate=100_000.0, delay=0.02))
     data = random.Random(5).randbytes(70_000 + 700 * step)
-    async with place.rig.mounted(b"/d") as tree:
+    async with here.mounted(b"/d") as tree:
         file = await tree.create(b"/d/log", exclusive=True)
         await file.write(0, data[:70_000])
         await trio.sleep(10)  # it is on its way, and all there is was sent
-        faults = place.rig.faults
+        faults = here.faults
         faults.requests.clear()
         for at in range(70_000, len(data), step):
             await file.write(at, data[at : at + step])
@@ -213,7 +193,7 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, auto
         await file.flush()
         await file.release()
     assert faults.requests.count(Opcode.WRITE_FILE) <= 1.1 * (700 * step // 239) + 3
-    assert place.data(b"log") == data
+    assert here.data(b"/d/log") == data
 
 
 # --- the Terminate goes out right behind the last requests
@@ -237,87 +217,65 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
     profile: str, autojump: MockClock
 ) -> None:
     """What was refused behind the Terminate was sent again, and refused again, for ever."""
-    place = Place(profile, LINK)
-    place.rig.card.capacity = place.rig.card.used + 20_400
-    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
-        nursery.start_soon(_read_always, place, connection)
+    here = Rig(profile, FILES, LINK)
+    here.card.capacity = here.card.used + 20_400
+    async with here.connected():
+        here.nursery.start_soon(read_now_and_then, here, random.Random(1), 0.0)
         with trio.fail_after(200), pytest.raises(FtpNak):
-            await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
-        nursery.cancel_scope.cancel()
-
-
-async def _read_always(place: Place, connection: Connection) -> None:
-    while True:
-        await place.read(connection)
+            await upload(here, b"new", random.Random(1).randbytes(SIZE))
 
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClock) -> None:
     """Who waits for an upload was told nothing before the vehicle was disarmed (promise 9)."""
-    place = Place(profile, LINK)
-    vehicle, handle = place.rig.vehicle, place.rig.server.handle
+    here = Rig(profile, FILES, LINK)
+    vehicle, handle = here.vehicle, here.server.handle
 
     def on_request(wire: bytes, source: Address, now: float) -> None:
-        closing = wire[OPCODE] == Opcode.TERMINATE_SESSION and place.came[-1][0] == Opcode.WRITE_FILE
+        closing = wire[OPCODE] == Opcode.TERMINATE_SESSION and here.faults.requests[-1] == Opcode.WRITE_FILE
         if closing and now > 3.0 and not vehicle.armed:
             vehicle.arm()  # that is heard before it is closed
         else:
             handle(wire, source, now)
 
     vehicle.server.handle = on_request  # type: ignore[method-assign]
-    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
-        nursery.start_soon(_read_always, place, connection)
+    async with here.connected():
+        here.nursery.start_soon(read_now_and_then, here, random.Random(1), 0.0)
         with trio.fail_after(60), pytest.raises(Armed):
-            await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
-        nursery.cancel_scope.cancel()
+            await upload(here, b"new", random.Random(1).randbytes(SIZE))
 
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("link", BAD)
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_two_uploads_and_a_reader_over_bad_links(profile: str, link: str, autojump: MockClock) -> None:
-    place = Place(profile, BAD[link])
+    here = Rig(profile, FILES, BAD[link])
     rng = random.Random(1)
-    async with place.rig.connected(seed=1) as connection, trio.open_nursery() as nursery:
-
-        async def read_now_and_then() -> None:
-            while True:
-                await trio.sleep(rng.uniform(0.0, 0.8))
-                await place.read(connection)
-
+    async with here.connected(seed=1):
         with trio.fail_after(600):
             async with trio.open_nursery() as uploads:
-                nursery.start_soon(read_now_and_then)
+                here.nursery.start_soon(read_now_and_then, here, rng)
                 for name in (b"one", b"two"):
-                    uploads.start_soon(place.upload, connection, name, rng.randbytes(SMALL))
-        nursery.cancel_scope.cancel()
+                    uploads.start_soon(upload, here, name, rng.randbytes(SMALL))
 
 
 @pytest.mark.holds("promise 7")
 async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
     """Each wait for the other's late requests to be dead counted as a turn, and began the wait anew after
     which it goes before readers: one of them was sent, the other did not get a byte in ten minutes."""
-    place = Place("ardupilot", BAD["mixing"])
+    here = Rig("ardupilot", FILES, BAD["mixing"])
     rng = random.Random(1)
     sources = [MemorySource(rng.randbytes(SIZE)) for _ in range(2)]
-    async with place.rig.connected(seed=1) as connection, trio.open_nursery() as nursery:
+    async with here.connected(seed=1) as connection:
         connection.store.traits.wo_truncates = False
         for number, source in enumerate(sources):
-            upload = await connection.store.open_upload(place.root + b"/%d" % number, source)
-            upload.wake()
-
-        async def read_now_and_then() -> None:
-            while True:
-                await trio.sleep(rng.uniform(0.0, 0.8))
-                await place.read(connection)
-
-        nursery.start_soon(read_now_and_then)
+            (await connection.store.open_upload(here.root + b"/d/%d" % number, source)).wake()
+        here.nursery.start_soon(read_now_and_then, here, rng)
         for _ in range(3):
             before = [source.proven.total for source in sources]
             await trio.sleep(60)
             assert all(source.proven.total > old for source, old in zip(sources, before, strict=True))
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.holds("promise 7")
@@ -334,12 +292,12 @@ async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
 async def test_uploads_that_alternate_fill_a_short_queue(
     count: int, link: LinkSettings, most: float, autojump: MockClock
 ) -> None:
-    place = Place("ardupilot", link)
+    here = Rig("ardupilot", FILES, link)
     began = trio.current_time()
-    async with place.rig.connected() as connection, trio.open_nursery() as nursery:
+    async with here.connected(), trio.open_nursery() as nursery:
         for number in range(count):
             data = random.Random(number).randbytes(60_000)
-            nursery.start_soon(place.upload, connection, b"%d" % number, data)
+            nursery.start_soon(upload, here, b"%d" % number, data)
     assert trio.current_time() - began < most
 
 

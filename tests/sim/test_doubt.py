@@ -338,12 +338,8 @@ async def read_all(tree: Tree, target: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("what", "after", "nth", "first"),
     [
-        (
-            Opcode.RENAME,
-            Opcode.RENAME,
-            1,
-            True,
-        ),  # what moved the old file aside comes when the new one is there
+        # What moved the old file aside comes when the new one is there.
+        (Opcode.RENAME, Opcode.RENAME, 1, True),
         (Opcode.RENAME, Opcode.RENAME, 1, False),
         (Opcode.RENAME, Opcode.REMOVE_FILE, 1, True),
         (Opcode.RENAME, Opcode.REMOVE_FILE, 1, False),
@@ -352,7 +348,7 @@ async def read_all(tree: Tree, target: bytes) -> bytes:
         (Opcode.CREATE_FILE, Opcode.RENAME, 2, False),
     ],
 )
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "mavsdk"])
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5"])
 async def test_a_late_rename_or_remove_never_loses_old_and_new(
     profile: str, what: Opcode, after: Opcode, nth: int, first: bool, known: bool, autojump: MockClock
 ) -> None:
