@@ -16,7 +16,7 @@ from typing import Any
 
 from fsspec import AbstractFileSystem
 
-from mavftpfs.api.drone import Drone, connect
+from mavftpfs.api.drone import Drone, UsageError, connect
 from mavftpfs.api.pythonfile import READ_BUFFER
 from mavftpfs.api.vehicle import Entry
 from mavftpfs.protocol.url import is_url, parse_url
@@ -100,7 +100,11 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
     root_marker = "/"
     blocksize = 1 << 20
 
-    def __init__(self, source: str, auto_mkdir: bool = False, idle: float = IDLE, **options: Any) -> None:
+    def __init__(
+        self, source: str = "", auto_mkdir: bool = False, idle: float = IDLE, **options: Any
+    ) -> None:
+        if not source:
+            raise UsageError("which vehicle? Give its SOURCE, such as source='udpin:0.0.0.0:14550'")
         own = {name: options.pop(name) for name in list(options) if name in _FSSPEC_OPTIONS}
         super().__init__(**own)
         self.source = source

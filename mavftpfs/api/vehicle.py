@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -325,7 +326,11 @@ class Drone:
         """
 
         async def work(downloads: download.Downloads) -> None:
-            await downloads.get([await self._existing(path)], Path(local), into=False, recursive=recursive)
+            wanted = await self._existing(path)
+            try:
+                await downloads.get([wanted], Path(local), into=False, recursive=recursive)
+            except IsADirectory as exc:
+                raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True") from exc
 
         outcome = await self._download(verify, work)
         return [fetched.wanted.local for fetched in outcome.fetched]
@@ -377,10 +382,12 @@ class Drone:
         `path` is an existing directory, or the new name.
 
         Raises:
-            NotDelivered: a file is not there; see there.
+            FileNotFoundError, IsADirectoryError: of `local`. NotDelivered: a file is not there; see there.
         """
         told: list[str] = []
         with translated():
+            if stat.S_ISDIR(os.stat(local).st_mode) and not recursive:
+                raise IsADirectory(f"{os.fspath(local)} is a directory; put it with recursive=True")
             found = upload.collect(Path(local), recursive=recursive)
             batches = [(Path(local), found)]
             tell = lambda where, size, how: told.append(os.fsdecode(where))  # noqa: E731

@@ -254,7 +254,7 @@ async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     for status in await mounts_on(spec):
         with suppress(KeyError, TypeError):
             if is_wanted(status, options):
-                return session_on(status, options.root)
+                return session_on(status, options.root, read_only=options.read_only)
     return None
 
 
@@ -283,7 +283,8 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     system, component = status["vehicle"]["system"], status["vehicle"]["component"]
     if options.target_system not in (0, system) or options.target_component not in (0, component):
         raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")
-    session = session_on(status, normalise(os.fsencode(status["root"]) + b"/" + subtree))
+    root = normalise(os.fsencode(status["root"]) + b"/" + subtree)
+    session = session_on(status, root, read_only=options.read_only)
     if subtree != ROOT:
         place = name_text(os.fsencode(mountpoint) + subtree)
         try:
@@ -295,7 +296,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     return session
 
 
-def session_on(status: Mapping[str, Any], root: bytes) -> Session:
+def session_on(status: Mapping[str, Any], root: bytes, *, read_only: bool = False) -> Session:
     """Return the files below `root` of a vehicle, by the mount with this status."""
     mountpoint = status["mountpoint"]
 
@@ -306,7 +307,7 @@ def session_on(status: Mapping[str, Any], root: bytes) -> Session:
     async def counts() -> Mapping[str, Any]:
         return dict((await mount_status(mountpoint))["cache"])
 
-    files = MountedFiles(mountpoint, os.fsencode(status["root"]), root)
+    files = MountedFiles(mountpoint, os.fsencode(status["root"]), root, read_only=read_only)
     return Session(files, root, acknowledged, mountpoint, counts=counts)
 
 

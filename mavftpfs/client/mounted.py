@@ -153,9 +153,10 @@ class MountedFile:
 class MountedFiles:
     """Implements Files by the kernel's calls."""
 
-    def __init__(self, mountpoint: str, mounted: bytes, root: bytes) -> None:
+    def __init__(self, mountpoint: str, mounted: bytes, root: bytes, *, read_only: bool = False) -> None:
         """`mounted`: the vehicle's directory on the mountpoint; `root`: the vehicle's directory that is our
-        `/`."""
+        `/`. read_only: refuse changes, whatever the mount allows."""
+        self._read_only = read_only
         self._mountpoint = os.fsencode(mountpoint)
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
@@ -168,6 +169,11 @@ class MountedFiles:
                 f"{os.fsdecode(self._mountpoint)}"
             )
         return self._mountpoint + remote[len(self._mounted) :].rstrip(b"/")
+
+    def _place_to_change(self, path: bytes) -> bytes:
+        if self._read_only:
+            raise errors.ReadOnly(f"{path!r} is only read")
+        return self._place(path)
 
     async def stat(self, path: bytes) -> Stat:
         """As os.stat."""
@@ -196,12 +202,17 @@ class MountedFiles:
     async def _open(self, path: bytes, flags: int) -> MountedFile:
         def opened(place: bytes) -> tuple[int, int]:
             fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
+            found = os.fstat(fd)
+            if stat.S_ISDIR(found.st_mode):
+                os.close(fd)
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             # Else the kernel asks for 128 KiB at once, which takes 22 s on a radio. The mount itself reads
             # ahead.
             os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
-            return fd, os.fstat(fd).st_size
+            return fd, found.st_size
 
-        place = self._place(path)
+        writable = bool(flags & (os.O_RDWR | os.O_TRUNC))
+        place = self._place_to_change(path) if writable else self._place(path)
         fd, size = await _call(path, opened, place)
         return MountedFile(path, fd, size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
 
@@ -214,7 +225,7 @@ class MountedFiles:
 
     async def truncate(self, path: bytes, size: int) -> None:
         """As os.truncate."""
-        await _call(path, os.truncate, self._place(path), size)
+        await _call(path, os.truncate, self._place_to_change(path), size)
 
     async def crc32(self, path: bytes) -> int:
         """Ask the vehicle."""
@@ -223,20 +234,20 @@ class MountedFiles:
     async def mkdir(self, path: bytes) -> None:
         """As os.mkdir."""
         with _about_parent(path):
-            await _call(path, os.mkdir, self._place(path))
+            await _call(path, os.mkdir, self._place_to_change(path))
 
     async def rmdir(self, path: bytes) -> None:
         """As os.rmdir."""
-        await _call(path, os.rmdir, self._place(path))
+        await _call(path, os.rmdir, self._place_to_change(path))
 
     async def unlink(self, path: bytes) -> None:
         """As os.unlink."""
-        await _call(path, os.unlink, self._place(path))
+        await _call(path, os.unlink, self._place_to_change(path))
 
     async def rename(self, old: bytes, new: bytes) -> None:
         """As os.rename."""
         try:
-            await _call(old, os.rename, self._place(old), self._place(new))
+            await _call(old, os.rename, self._place_to_change(old), self._place(new))
         except _ABOUT_TARGET as exc:
             raise type(exc)(_sentence(type(exc), new)) from exc
 

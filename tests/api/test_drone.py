@@ -30,6 +30,8 @@ class Local:
     stat, listdir, rmdir = staticmethod(os.stat), staticmethod(os.listdir), staticmethod(os.rmdir)
     remove, rename, truncate = staticmethod(os.remove), staticmethod(os.rename), staticmethod(os.truncate)
 
+    open = staticmethod(open)
+
     def mkdir(self, path: str, *, parents: bool = False, exist_ok: bool = False) -> None:
         Path(path).mkdir(parents=parents, exist_ok=exist_ok)
 
@@ -86,6 +88,7 @@ CALLS: dict[str, Call] = {
     "bytes": lambda on, d: (on.write_bytes(d + "/a", DATA), on.read_bytes(d + "/a") == DATA),
     "read nothing": lambda on, d: on.read_bytes(d + "/nothing"),
     "read a directory": lambda on, d: on.read_bytes(d + "/e"),
+    "open a directory": lambda on, d: on.open(d + "/e").close(),
     "write a directory": lambda on, d: on.write_bytes(d + "/e", b""),
     "write below nothing": lambda on, d: on.write_bytes(d + "/nothing/n", b""),
     "exists, with a slash": lambda on, d: [on.exists(d + name) for name in ("/a/", "/e/", "/nothing/")],
@@ -182,11 +185,13 @@ def test_get_and_put(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None
     assert (tmp_path / "x").read_bytes() == DATA
     fetched = shared.get(f"{card.name}/d", tmp_path / "y", recursive=True)
     assert [path.read_bytes() for path in fetched] == [DATA]
-    with pytest.raises(IsADirectoryError):
+    with pytest.raises(IsADirectoryError, match="recursive=True"):
         shared.get(f"{card.name}/d", tmp_path / "z")
     with pytest.raises(FileNotFoundError):
         shared.get(f"{card.name}/nothing", tmp_path / "z")
-    with pytest.raises(ValueError, match="is not there"):
+    with pytest.raises(IsADirectoryError, match="recursive=True"):
+        shared.put(local, card.name)
+    with pytest.raises(FileNotFoundError):
         shared.put(tmp_path / "nothing", card.name)
     with pytest.raises(FileNotFoundError, match="no such directory"):
         shared.put(tmp_path / "x", f"{card.name}/nothing/")
@@ -354,6 +359,12 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
             assert drone.status()["mountpoint"] == str(mount.path)
     with pytest.raises(mavftpfs.UsageError, match="use_mount=False"):
         mavftpfs.connect(str(mount.path), use_mount=False)
+    with mavftpfs.connect(vehicle.source, ro=True) as drone:
+        for change in (CALLS["bytes"], CALLS["mkdir"], CALLS["truncate"], CALLS["remove"], CALLS["rename"]):
+            with pytest.raises(OSError, match="is only read") as caught:
+                change(drone, "")
+            assert caught.value.errno == errno.EROFS
+        assert drone.read_bytes("/f") == DATA
     with mavftpfs.connect(vehicle.source, use_mount=False) as drone:
         assert drone.mountpoint is None
         assert drone.read_bytes("/f") == DATA
@@ -362,7 +373,7 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
 NAMED = [
     *("list a file", "list nothing", "stat nothing", "mkdir there", "mkdir below nothing", "rmdir full"),
     *("rmdir a file", "remove a directory", "remove nothing", "rename nothing", "rename over a directory"),
-    *("truncate nothing", "read a directory", "write a directory", "write below nothing"),
+    *("truncate nothing", "read a directory", "open a directory", "write a directory", "write below nothing"),
 ]
 
 

@@ -126,6 +126,8 @@ def test_urls(source: str) -> None:
     fs, path = fsspec.core.url_to_fs("mftp://comp=1:/d/a%20b", source=source)
     assert (fs.storage_options["target_component"], path) == (1, "/d/a b")
     assert fsspec.filesystem("mftp", source=source) is fsspec.filesystem("mftp", source=source)
+    with pytest.raises(ValueError, match="which vehicle"):
+        fsspec.open("mftp://d/f").open()
     with pytest.raises(ValueError, match="component"):
         fsspec.open("mftp://comp=999:/d", source=source)
 
