@@ -133,11 +133,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def packed(items: list[pytest.Item]) -> list[pytest.Item]:
     """Order files for workers that take one at a time: those that wait for a kernel and those that compute
-    in turns, then the short ones, so that none is left running alone at the end."""
+    in turns, then the others, so that none is left running alone at the end. A long text takes long."""
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    longest = sorted(files, key=lambda path: -len(files[path]))
+    longest = sorted(files, key=lambda path: -path.stat().st_size)
     waiting = [path for path in longest if tier_of(path) in ("mount", "api")]
     computing = [path for path in longest if tier_of(path) == "sim"]
     turns = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
