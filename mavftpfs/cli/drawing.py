@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -76,21 +75,14 @@ class _Screen:
         return Group(row, Text(current(progress, width - _ROOM), no_wrap=True))
 
 
-@contextmanager
-def shown(progress: Progress, idle: str = "looking at what is there") -> Iterator[Progress]:
-    """Show progress on stderr during the body, if that is a terminal; nothing of it stays at the end.
-
-    idle: what is shown while nothing is planned.
-    """
+def drawn(progress: Progress, idle: str) -> AbstractContextManager[object]:
+    """Draw progress on stderr during the body, if that is a terminal that can be drawn on."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield progress
-        return
+        return nullcontext()
     screen = _Screen(progress, console, idle)
-    # If rich takes stdout, its output goes to stderr; only on one terminal are they the same.
+    # What goes to stdout would come out on stderr if rich took it; only on one terminal are they the same.
     to_terminal = sys.stdout.isatty()
-    live = Live(
+    return Live(
         screen, console=console, refresh_per_second=_REFRESH, transient=True, redirect_stdout=to_terminal
     )
-    with live:
-        yield progress

@@ -16,7 +16,8 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cli import drawing, verbs
+from mavftpfs.cli import verbs
+from mavftpfs.cli.showing import shown
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.parameters import Change, Difference, Wish
@@ -224,7 +225,7 @@ class _Setting:
 
     async def _compare(self, session: Session) -> Wish:
         self.bar.plan(0, 0)
-        with drawing.shown(self.bar, idle="reading the parameters"):
+        with shown(self.bar, idle="reading the parameters"):
             current = await client.read_parameters(session)
             lines, others = await client.split_by_component(session, self.lines)
         if not self.name:
@@ -271,7 +272,7 @@ class _Setting:
         if not changes:
             return
         try:
-            with drawing.shown(self.bar):
+            with shown(self.bar):
                 await client.set_values(session, changes, self.bar)
         except MavftpfsError as error:
             for line in await client.last_error(session):

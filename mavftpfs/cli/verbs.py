@@ -20,9 +20,10 @@ from typing import Any, TypeVar
 
 import trio
 
-from mavftpfs.cli import drawing, watching
+from mavftpfs.cli import watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line
 from mavftpfs.cli.report import count_files
+from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
 from mavftpfs.client import scan as scanning
@@ -247,7 +248,7 @@ def _download(
         async with noting_losses(session, bar):
             await function(download.Downloads(fetcher, outcome, tell, say))
 
-    with _on_interrupt(lambda: _here(outcome)), drawing.shown(bar):
+    with _on_interrupt(lambda: _here(outcome)), shown(bar):
         with_session(args, work, component)
 
 
@@ -365,7 +366,7 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
             f"{line}; {bar.name} was on its way: look what is there before you use it" if bar.name else line
         )
 
-    with _on_interrupt(stopped), drawing.shown(bar):
+    with _on_interrupt(stopped), shown(bar):
         with_session(args, work, component, writing=True)
     return ExitCode.OK
 
@@ -431,7 +432,7 @@ def recover(args: Args) -> int:
         async with noting_losses(session, bar):
             await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
-    with drawing.shown(bar):
+    with shown(bar):
         with_session(args, work, writing=True)
     return ExitCode.OK
 

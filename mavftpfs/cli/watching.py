@@ -16,7 +16,7 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cli import drawing
+from mavftpfs.cli.showing import shown
 from mavftpfs.client.download import Wish
 from mavftpfs.client.files import Target
 from mavftpfs.client.progress import Progress
@@ -51,7 +51,7 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
         await Watch(wanted, say, hand_on, bar).run(target)
 
     try:
-        with drawing.shown(bar, idle=""):
+        with shown(bar, idle=""):
             say(f"waiting for vehicles on {args.source}; Ctrl-C ends it")
             run(work)
     except KeyboardInterrupt:

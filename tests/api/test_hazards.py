@@ -347,6 +347,7 @@ def test_importing_it_loads_little(tmp_path: Path) -> None:
     everything = loaded("import mavftpfs.trio; mavftpfs.connect")
     assert "mavftpfs.api.drone" in everything
     assert not {"pyfuse3", "rich", "argparse", "mavftpfs.cli", "mavftpfs.mount"} & everything
+    assert not {"pyfuse3", "rich"} & loaded("import mavftpfs.cli.param")
 
 
 # -- trio -----------------------------------------------------------------------------------------

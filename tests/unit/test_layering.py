@@ -77,7 +77,7 @@ SOLE_IMPORTERS = {
     "pyfuse3": {"mount.operations", "mount.kernel", "mount.root"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
-    "rich": {"cli"},
+    "rich": {"cli.drawing", "cli.demo"},
 }
 
 MAX_FUNCTION_LINES = 60
