@@ -6,12 +6,10 @@ Saving replaces all items, and only reading back tells whether the vehicle took 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from mavftpfs.cache.attributes import SECOND
-from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, problems_refused
-from mavftpfs.cache.virtual import VirtualTrees
+from mavftpfs.cache.texts import Access, Refused, Save, Saved, Shown, Texts, cause_of, problems_refused
 from mavftpfs.parameters.missions import (
     FENCE,
     MISSION,
@@ -25,7 +23,7 @@ from mavftpfs.parameters.missions import (
     unpack,
 )
 from mavftpfs.parameters.text import Problem
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotTaken, RemoteProtocolError
+from mavftpfs.shared.errors import MavftpfsError
 
 DIRECTORY = b"/@MISSION"
 KINDS = {b"mission.waypoints": MISSION, b"fence.waypoints": FENCE, b"rally.waypoints": RALLY}
@@ -36,19 +34,11 @@ Items = Sequence[Item]
 class Missions(Texts[Items]):
     """The texts of `@MISSION`."""
 
+    directory = DIRECTORY
     names = tuple(KINDS)
 
-    def __init__(
-        self,
-        store: VehicleStore,
-        virtual: VirtualTrees,
-        *,
-        wall: Callable[[], float],
-        require_writable: Callable[[], None],
-    ) -> None:
-        super().__init__(DIRECTORY, wall, require_writable)
-        self._store = store
-        self._virtual = virtual
+    def __init__(self, access: Access) -> None:
+        super().__init__(access)
         self._shown: dict[bytes, tuple[bytes, Shown[Items]]] = {}
 
     def forget(self) -> None:
@@ -61,12 +51,7 @@ class Missions(Texts[Items]):
         known = self._shown.get(name)
         if known is not None and known[0] == raw:
             return known[1]
-        try:
-            items = unpack(raw, KINDS[name])
-        except RemoteProtocolError:  # it may have changed while it was read
-            self._virtual.outdate(_file_of(name))
-            raw = await self._virtual.content(_file_of(name), reread=True)
-            items = unpack(raw, KINDS[name])
+        raw, items = await self.parsed(_file_of(name), raw, lambda raw: unpack(raw, KINDS[name]))
         shown: Shown[Items] = Shown(render(items).encode(), items, int(self._wall() * SECOND))
         self._shown[name] = raw, shown
         return shown
@@ -95,14 +80,8 @@ class Missions(Texts[Items]):
         Raises:
             Refused: the vehicle has other items afterwards.
         """
-        failure: MavftpfsError | None = None
-        file, kind = _file_of(name), KINDS[name]
-        self._virtual.outdate(file)
-        try:
-            await self.upload(self._store, name, file, pack_upload(wanted, kind, self._store.address()))
-        except MavftpfsError as error:
-            failure = error
-        self._virtual.outdate(file)
+        kind = KINDS[name]
+        failure = await self.send(name, _file_of(name), [pack_upload(wanted, kind, self._store.address())])
         try:
             found = differences(wanted, (await self.show(name, reread=True)).base, kind)
         except MavftpfsError as error:
@@ -112,10 +91,7 @@ class Missions(Texts[Items]):
         missed = [one.text for one in found if one.kept]
         if not missed:
             return found
-        refused = failure is None or isinstance(failure, FtpNak)
-        why = (
-            NotTaken(f"the vehicle has not taken it: {missed[0]}") if refused or failure is None else failure
-        )
+        why = cause_of(failure, f"the vehicle has not taken it: {missed[0]}")
         raise Refused(why, [str(why), *missed])
 
 

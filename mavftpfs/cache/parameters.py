@@ -7,13 +7,22 @@ that they do not know, cut numbers to fit, and ACK what they refuse (docs/server
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mavftpfs.cache.attributes import SECOND
-from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, problems_refused, require_found
-from mavftpfs.cache.virtual import PARAM_FILE, VirtualTrees
+from mavftpfs.cache.texts import (
+    Access,
+    Refused,
+    Save,
+    Saved,
+    Shown,
+    Texts,
+    cause_of,
+    problems_refused,
+    require_found,
+)
+from mavftpfs.cache.virtual import PARAM_FILE
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import Download, pack_upload, unpack
 from mavftpfs.parameters.saving import Values, Verdict, judge, make_plan, pick_base, unchanged
@@ -54,19 +63,11 @@ class Snapshot:
 class Parameters(Texts[Values]):
     """The texts of `@PARAM`."""
 
+    directory = split(PARAM_FILE)[0]
     names = (ALL, CHANGED, QGC)
 
-    def __init__(
-        self,
-        store: VehicleStore,
-        virtual: VirtualTrees,
-        *,
-        wall: Callable[[], float],
-        require_writable: Callable[[], None],
-    ) -> None:
-        super().__init__(split(PARAM_FILE)[0], wall, require_writable)
-        self._store = store
-        self._virtual = virtual
+    def __init__(self, access: Access) -> None:
+        super().__init__(access)
         self._snapshot: Snapshot | None = None
         self._rendered: dict[bytes, Shown[Values]] = {}
         self._defaults: dict[str, Number] | None = None
@@ -111,19 +112,9 @@ class Parameters(Texts[Values]):
         """
         raw = await self._virtual.content(PARAM_FILE, reread=reread)
         if self._snapshot is None or self._snapshot.raw is not raw:
-            self._take(raw, await self._whole(raw))
+            self._take(*await self.parsed(PARAM_FILE, raw, lambda raw: _complete(unpack(raw))))
         assert self._snapshot is not None
         return self._snapshot
-
-    async def _whole(self, raw: bytes) -> Download:
-        """Parse a download; one that does not add up is read once more: it may have changed while it was
-        read.
-        """
-        try:
-            return _complete(unpack(raw))
-        except RemoteProtocolError:
-            self._virtual.outdate(PARAM_FILE)
-            return _complete(unpack(await self._virtual.content(PARAM_FILE, reread=True)))
 
     def _take(self, raw: bytes, download: Download) -> None:
         """Take a new download. If its values are those of the last one, the texts stay as they are.
@@ -214,15 +205,8 @@ class Parameters(Texts[Values]):
         Raises:
             Refused: some do not.
         """
-        failure: MavftpfsError | None = None
-        self._virtual.outdate(PARAM_FILE)
-        try:
-            for start in range(0, len(wanted), AT_ONCE):
-                pieces = pack_upload(wanted[start : start + AT_ONCE])
-                await self.upload(self._store, name, PARAM_FILE, pieces)
-        except MavftpfsError as error:
-            failure = error
-        self._virtual.outdate(PARAM_FILE)  # a program may have read it while the upload waited for its turn
+        uploads = [pack_upload(wanted[at : at + AT_ONCE]) for at in range(0, len(wanted), AT_ONCE)]
+        failure = await self.send(name, PARAM_FILE, uploads)
         try:
             after = (await self._read(reread=True)).values
         except MavftpfsError as error:
@@ -231,8 +215,7 @@ class Parameters(Texts[Values]):
         verdict = judge(wanted, after)
         if verdict.missed:
             more = "" if len(verdict.missed) == 1 else f" (and {len(verdict.missed) - 1} more)"
-            refused = failure is None or isinstance(failure, FtpNak)
-            why = NotTaken(verdict.missed[0] + more) if refused or failure is None else failure
+            why = cause_of(failure, verdict.missed[0] + more)
             raise Refused(why, _said(verdict, failure), known)
         return verdict
 

@@ -18,15 +18,25 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import trio
 
 from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.parameters.text import Problem
-from mavftpfs.shared.errors import InvalidText, LocalProtocolError, MavftpfsError, NotFound, ReadOnly
+from mavftpfs.shared.errors import (
+    FtpNak,
+    InvalidText,
+    LocalProtocolError,
+    MavftpfsError,
+    NotFound,
+    NotTaken,
+    ReadOnly,
+    RemoteProtocolError,
+)
 from mavftpfs.shared.model import EntryKind, split
 
 LAST_ERROR = b"last_error.txt"
@@ -37,6 +47,7 @@ MAX_READS, MAX_PROGRAM_READS = 32, 8
 """So many texts that were read are remembered, of all programs and of one."""
 
 B = TypeVar("B")
+P = TypeVar("P")
 
 
 class Program(Hashable, Protocol):
@@ -117,18 +128,26 @@ class TextUpload:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Access:
+    """What all texts of a vehicle need. wall: the time since 1970. require_writable: raises Armed, ReadOnly."""
+
+    store: VehicleStore
+    virtual: VirtualTrees
+    wall: Callable[[], float]
+    require_writable: Callable[[], None]
+
+
 class Texts(ABC, Generic[B]):
     """The texts in one `@` directory."""
 
-    def __init__(
-        self, directory: bytes, wall: Callable[[], float], require_writable: Callable[[], None]
-    ) -> None:
-        """`require_writable()`: raises Armed, or ReadOnly."""
-        self.directory = directory
+    directory: ClassVar[bytes]
+
+    def __init__(self, access: Access) -> None:
+        self._store, self._virtual = access.store, access.virtual
+        self._wall, self._require_writable = access.wall, access.require_writable
         self.error_text = b""
-        self._error_at = int(wall() * SECOND)
-        self._wall = wall
-        self._require_writable = require_writable
+        self._error_at = int(self._wall() * SECOND)
         self._reads: OrderedDict[Program | None, Reads[B]] = OrderedDict()
         self._failed: Program | None = None  # the program whose save was refused, if that was the last save
         self._saving = trio.Lock()
@@ -289,15 +308,36 @@ class Texts(ABC, Generic[B]):
         if known is not None and program in self._reads:
             self._reads[program] = Reads(list(known), self._reads[program].texts)
 
-    async def upload(self, store: VehicleStore, name: bytes, file: bytes, pieces: Sequence[bytes]) -> None:
-        """Send what a save makes, with its progress in `transfers`, until that save ends.
+    async def parsed(self, file: bytes, raw: bytes, parse: Callable[[bytes], P]) -> tuple[bytes, P]:
+        """Parse a packed file that was read. One that does not add up is read once more: it may have changed
+        while it was read. Returns the bytes that were parsed, too.
 
         Raises:
-            As VehicleStore.write_whole.
+            RemoteProtocolError; else as RemoteStore.read_whole.
         """
-        size = sum(map(len, pieces))
-        sending = self._upload = TextUpload(self.directory + b"/" + name, size)
-        await store.write_whole(file, pieces, sending.on_acked)
+        try:
+            return raw, parse(raw)
+        except RemoteProtocolError:
+            self._virtual.outdate(file)
+            raw = await self._virtual.content(file, reread=True)
+            return raw, parse(raw)
+
+    async def send(
+        self, name: bytes, file: bytes, uploads: Sequence[Sequence[bytes]]
+    ) -> MavftpfsError | None:
+        """Send what a save makes, in pieces that are not cut, and return why that ended, if it failed. Its
+        progress is in `transfers`, until the save ends. What came of it only another download tells.
+        """
+        failure: MavftpfsError | None = None
+        self._virtual.outdate(file)
+        try:
+            for pieces in uploads:
+                sent = self._upload = TextUpload(self.directory + b"/" + name, sum(map(len, pieces)))
+                await self._store.write_whole(file, pieces, sent.on_acked)
+        except MavftpfsError as error:
+            failure = error
+        self._virtual.outdate(file)  # a program may have read it while the upload waited for its turn
+        return failure
 
     def transfers(self) -> Sequence[dict[str, object]]:
         """Return the upload that is under way, if one is, in the form of `Throttle.transfers`."""
@@ -487,6 +527,13 @@ def problems_refused(name: bytes, problems: Sequence[Problem]) -> Refused:
     ordered = sorted(problems, key=lambda problem: problem.number)
     lines = [f"{name.decode()}:{problem.number}: {problem.reason}" for problem in ordered]
     return Refused(InvalidText(lines[0]), [*lines, "nothing was set"])
+
+
+def cause_of(failure: MavftpfsError | None, missed: str) -> MavftpfsError:
+    """Return the error of a save that does not hold: why the upload failed, or NotTaken if the vehicle
+    answered all of it. missed: what the vehicle did not take.
+    """
+    return NotTaken(missed) if failure is None or isinstance(failure, FtpNak) else failure
 
 
 def require_found(found: B | None, name: bytes) -> B:

@@ -29,7 +29,7 @@ from mavftpfs.cache.parameters import Parameters
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.texts import Program, Texts
+from mavftpfs.cache.texts import Access, Program, Texts
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback
@@ -118,10 +118,8 @@ class Tree:
             spool_directory=spool,
         )
         self._context = self._writing.context
-        self._texts: tuple[Texts[Any], ...] = tuple(
-            texts(store, self._virtual, wall=wall, require_writable=self._require_texts_writable)
-            for texts in (Parameters, Missions)
-        )
+        access = Access(store, self._virtual, wall, self._require_texts_writable)
+        self._texts: tuple[Texts[Any], ...] = (Parameters(access), Missions(access))
 
     # --- asking
 

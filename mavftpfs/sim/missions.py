@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from mavftpfs.sim.tree import fail
+from mavftpfs.sim.tree import ClaimedFile, fail
 
 MAGIC = 0x763D
 NAMES = (b"mission.dat", b"fence.dat", b"rally.dat")
@@ -82,18 +82,16 @@ class Missions:
         return (p1, p2, p3, p4, x, y, height, place, command, 0, 0, frame, 0, 1, kind)
 
 
-class MissionFile:
+class MissionFile(ClaimedFile):
     """A mission file that a session has open."""
 
     def __init__(
         self, missions: Missions, name: bytes, claimed: int, *, write: bool, on_close: Callable[[], None]
     ) -> None:
+        super().__init__(claimed, on_close)
         self._missions = missions
         self._name = name
-        self._claimed = claimed
         self._written = bytearray() if write else None
-        self._on_close = on_close
-        self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
         """See OpenFile. The items are the present ones."""
@@ -109,15 +107,7 @@ class MissionFile:
         self._written[offset : offset + len(data)] = data
         return len(data)
 
-    def size(self) -> int:
-        """See OpenFile."""
-        return self._claimed
-
-    def close(self) -> None:
-        """See OpenFile."""
-        if self._closed:
-            return
-        self._closed = True
-        self._on_close()
+    def closed(self) -> None:
+        """See ClaimedFile."""
         if self._written is not None:
             self._missions.replace(self._name, bytes(self._written))

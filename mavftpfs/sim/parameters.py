@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mavftpfs.sim.tree import fail
+from mavftpfs.sim.tree import ClaimedFile, fail
 
 MAGIC = 0x671B
 MAGIC_DEFAULTS = 0x671C
@@ -365,7 +365,7 @@ class LenientUpload(Upload):
         self._table.set(entry.name, number, now)
 
 
-class ParameterFile:
+class ParameterFile(ClaimedFile):
     """param.pck that a session has open. clock: the server's.
 
     live: as ArduPilot's. Each read packs the present values, for blocks of the size of the first read;
@@ -383,16 +383,14 @@ class ParameterFile:
         upload: Upload | None,
         on_close: Callable[[], None],
     ) -> None:
+        super().__init__(claimed, on_close)
         self._table = table
         self._wanted = wanted
         self._clock = clock
-        self._claimed = claimed
         self._live = live
         self._upload = upload
-        self._on_close = on_close
         self._block: int | None = None
         self._content = b""
-        self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
         """See OpenFile."""
@@ -419,15 +417,7 @@ class ParameterFile:
         self._upload.write(offset, data, self._clock())
         return len(data)
 
-    def size(self) -> int:
-        """See OpenFile."""
-        return self._claimed
-
-    def close(self) -> None:
-        """See OpenFile."""
-        if self._closed:
-            return
-        self._closed = True
-        self._on_close()
+    def closed(self) -> None:
+        """See ClaimedFile."""
         if self._upload is not None:
             self._upload.close(self._clock())

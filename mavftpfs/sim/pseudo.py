@@ -24,7 +24,7 @@ from mavftpfs.sim.parameters import (
     parameter,
     selection,
 )
-from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
+from mavftpfs.sim.tree import ClaimedFile, Entry, Kind, OpenFile, Stat, fail
 
 TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 MAX_HANDLES = 4
@@ -250,14 +250,12 @@ class VirtualTrees:
         return tree, name.strip(b"/")
 
 
-class VirtualFile:
+class VirtualFile(ClaimedFile):
     """An open virtual file. Written bytes are dropped."""
 
-    def __init__(self, content: bytes, size: int, *, on_close: Callable[[], None]) -> None:
+    def __init__(self, content: bytes, claimed: int, *, on_close: Callable[[], None]) -> None:
+        super().__init__(claimed, on_close)
         self._content = content
-        self._size = size
-        self._on_close = on_close
-        self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
         """See OpenFile."""
@@ -266,13 +264,3 @@ class VirtualFile:
     def write(self, offset: int, data: bytes) -> int:
         """See OpenFile."""
         return len(data)
-
-    def size(self) -> int:
-        """See OpenFile."""
-        return self._size
-
-    def close(self) -> None:
-        """See OpenFile."""
-        if not self._closed:
-            self._closed = True
-            self._on_close()

@@ -58,6 +58,31 @@ class OpenFile(Protocol):
         ...
 
 
+class ClaimedFile:
+    """What the open files that a server makes itself have in common: the size that they claim, and a close
+    that counts once. on_close: called by it first.
+    """
+
+    def __init__(self, claimed: int, on_close: Callable[[], None]) -> None:
+        self._claimed = claimed
+        self._on_close = on_close
+        self._closed = False
+
+    def size(self) -> int:
+        """See OpenFile."""
+        return self._claimed
+
+    def close(self) -> None:
+        """See OpenFile."""
+        if not self._closed:
+            self._closed = True
+            self._on_close()
+            self.closed()
+
+    def closed(self) -> None:
+        """Do what is to be done at the end."""
+
+
 class TreeFile(OpenFile, Protocol):
     """An open file of a tree."""
 
