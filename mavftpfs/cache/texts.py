@@ -130,7 +130,7 @@ class TextUpload:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What all texts of a vehicle need. wall: the time since 1970. require_writable: raises Armed, ReadOnly."""
+    """What all texts of a vehicle need. wall: the time of day. require_writable: raises Armed, ReadOnly."""
 
     store: VehicleStore
     virtual: VirtualTrees
