@@ -11,6 +11,17 @@ import trio
 from trio.testing import MockClock
 
 
+class HandClock:
+    """Time that passes when a test says so."""
+
+    def __init__(self, now: float = 0.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        """Return the time."""
+        return self.now
+
+
 def run(main: Callable[[], Awaitable[Any]], *, clock: trio.abc.Clock | None = None, **more: Any) -> Any:
     """Run a test on virtual time, also where it does not mention it."""
     return trio.run(main, clock=clock or MockClock(autojump_threshold=0), **more)

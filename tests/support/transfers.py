@@ -20,7 +20,8 @@ ROOTS = {"px4-nuttx": b"/fs/microsd"}
 
 
 def content(size: int, seed: int = 0) -> bytes:
-    return random.Random(seed).randbytes(size)
+    """Return random bytes; those of a smaller size are the head of those of a larger one."""
+    return random.Random(seed).randbytes(size + -size % 4)[:size]
 
 
 def path(profile: str, name: str) -> bytes:

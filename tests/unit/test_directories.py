@@ -12,24 +12,16 @@ from mavftpfs.cache.directories import Directories, Directory
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing
+from tests.support.clocks import HandClock
 
 
 def file(name: bytes, size: int = 1, mtime: int | None = None) -> DirEntry:
     return DirEntry(name, EntryKind.FILE, size, mtime)
 
 
-class Clock:
-    """Time that passes when a test says so."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock() -> HandClock:
+    return HandClock()
 
 
 def make(
@@ -51,7 +43,7 @@ def is_fresh(directories: Directories, path: bytes) -> bool:
 
 @pytest.mark.parametrize(("dir_timeout", "took", "life"), [(20, 9, 20), (None, 0.1, 20), (None, 2, 100)])
 def test_a_listing_is_fresh_for_dir_timeout_or_as_long_as_it_was_expensive(
-    clock: Clock, dir_timeout: float | None, took: float, life: float
+    clock: HandClock, dir_timeout: float | None, took: float, life: float
 ) -> None:
     directories = make(clock, dir_timeout=dir_timeout)
     clock.now = 5
@@ -138,7 +130,7 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
 # --- our own changes
 
 
-def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: Clock) -> None:
+def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: HandClock) -> None:
     directories = make(clock)
     directory = put(directories, b"/")
     clock.now = 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import AsyncIterator
 
 import pytest
@@ -21,6 +20,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, card, read_file, rig
+from tests.support.transfers import content
 
 KIB = 1024
 MIB = 1024 * KIB
@@ -30,10 +30,6 @@ OPEN, READ = Opcode.OPEN_FILE_RO, Opcode.READ_FILE
 LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
 EXPIRED = 21.0
 """Seconds after which neither a listing nor what was known of a file holds."""
-
-
-def content(size: int, seed: int = 7) -> bytes:
-    return random.Random(seed).randbytes(size + -size % 4)[:size]  # shorter ones are prefixes of longer ones
 
 
 DATA = content(300_000)

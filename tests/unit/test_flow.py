@@ -81,6 +81,18 @@ def test_a_queue_ends_the_start() -> None:
     assert 20 <= flow.window <= 40
 
 
+def test_a_start_that_overflows_a_buffer_ends() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1e6, base=0.1)
+    while flow.window < 100:
+        path.round()
+    wide = flow.window
+    path.rounds(2, lost=90)
+    assert flow.window < wide
+    path.rounds(4)
+    assert flow.window <= wide
+
+
 def test_a_starved_round_proves_nothing() -> None:
     flow = Flow()
     path = Path(flow, rate=1000.0, base=0.1)

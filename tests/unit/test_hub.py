@@ -228,13 +228,6 @@ def test_what_comes_back_by_another_way_is_not_passed_on(net: Net) -> None:
     assert net.sides(beat(Address(254, 191), autopilot=8), PORT, AT_ONE) == set()
 
 
-def test_two_stations_with_one_id_both_get_answers_and_start_no_echo(net: Net) -> None:
-    at = ("127.0.0.1", 40)
-    net.send(beat(STATION, autopilot=8), WEST, at)
-    assert net.sides(beat(STATION, autopilot=8), EAST) - {MOUNT, OTHER} == {PORT}
-    assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None), Place(WEST, at)}
-
-
 def test_vehicles_at_endpoints_are_no_business_of_clients(net: Net) -> None:
     assert not net.sides(beat(Address(9, 1)), WEST, ("127.0.0.1", 40)) & {MOUNT, OTHER}
     assert net.sides(ftp(Address(9, 1), Address(1, 1)), WEST, ("127.0.0.1", 40)) == {PORT, MOUNT}

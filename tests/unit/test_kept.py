@@ -19,8 +19,10 @@ from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged
 from tests.support.rigs import Rig, read_file, rig
-from tests.unit.test_files import DATA, LOG, content
+from tests.support.transfers import content
 
+LOG = b"/logs/a.bin"
+DATA = content(300_000)
 NOW = 1_800_000_000.0
 MTIME = 1_700_000_000
 ENOUGH = 2 * SETTLED + 1

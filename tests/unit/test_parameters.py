@@ -6,7 +6,6 @@ What a saved text asks for: tests/sim/test_parameters.py.
 from __future__ import annotations
 
 import math
-import struct
 from itertools import accumulate
 
 import pytest
@@ -161,18 +160,6 @@ A, B = entry(b"A", 1, b"\x01"), entry(b"B", 2, b"\x02\x00")
 def test_files_that_do_not_add_up_are_errors(data: bytes) -> None:
     with pytest.raises(RemoteProtocolError):
         unpack(data)
-
-
-def test_padding_of_any_length_is_skipped() -> None:
-    padded = file_of(b"\0" * 9 + A, B, count=2) + b"\0\0"
-    assert [(one.name, one.value) for one in unpack(padded).parameters] == [("A", 1), ("B", 2)]
-
-
-def test_a_name_of_sixteen_letters_shares_at_most_fifteen() -> None:
-    long = Parameter("ABCDEFGHIJKLMNO1", Kind.INT8, 1), Parameter("ABCDEFGHIJKLMNO2", Kind.INT8, 2)
-    packed = b"".join(pack_upload(long))
-    assert struct.unpack_from("<HHH", packed) == (MAGIC, 2, len(packed))
-    assert unpack(file_of(packed[6:], count=2)).parameters == list(long)
 
 
 # --- lines

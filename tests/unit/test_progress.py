@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from mavftpfs.cli.drawing import bar_width, current, totals
 from mavftpfs.client.progress import Progress
-
-
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.support.clocks import HandClock
 
 
 def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
-    clock = Clock()
+    clock = HandClock(100.0)
     progress = Progress(clock)
     progress.plan(1, 1_000_000)
     progress.begin("/a", 1_000_000, 900_000)
@@ -25,7 +19,7 @@ def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
 
 
 def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it() -> None:
-    clock = Clock()
+    clock = HandClock(100.0)
     progress = Progress(clock)
     progress.plan(1, 1_000_000)
     progress.begin("/a", 1_000_000)
@@ -48,7 +42,7 @@ def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it
 
 
 def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
-    progress = Progress(Clock())
+    progress = Progress(HandClock(100.0))
     progress.plan(1, 1000)
     progress.begin("/a", 1000)
     progress.at(700)
@@ -57,7 +51,7 @@ def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
 
 
 def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
-    progress = Progress(Clock())
+    progress = Progress(HandClock(100.0))
     progress.plan(2, 1000)
     progress.begin("/x\x1b[31m" + "y" * 100 + "/log.ulg", 1000)
     line = current(progress, 40)
@@ -68,7 +62,7 @@ def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
 
 
 def test_the_bar_keeps_its_width() -> None:
-    clock = Clock()
+    clock = HandClock(100.0)
     progress = Progress(clock)
     progress.plan(2, 300_000_000)
     widths, lines = set(), set()
@@ -86,7 +80,7 @@ def test_the_bar_keeps_its_width() -> None:
 
 
 def test_a_second_plan_begins_anew() -> None:
-    progress = Progress(Clock())
+    progress = Progress(HandClock(100.0))
     for _ in range(2):
         progress.plan(1, 1000)
         progress.begin("/a", 1000)

@@ -9,7 +9,6 @@ from mavftpfs.mount.roster import (
     HEARD_LATELY,
     LONGEST_PAUSE,
     MOST,
-    Member,
     Roster,
     State,
     is_component,
@@ -110,16 +109,6 @@ def test_what_the_user_unmounted_stays_so() -> None:
     member.ended(0, "", 1.0)
     assert member.state is State.UNMOUNTED
     assert due(roster, 2.0) == []
-
-
-def test_components_are_mounted_while_their_system_is_heard() -> None:
-    roster = Roster()
-    roster.hear(beat(1), 0.0)
-    camera = roster.add(1, 100)
-    assert isinstance(camera, Member)
-    assert roster.add(1, 100) is camera
-    roster.hear(beat(1), 1.0)
-    assert due(roster, 1.0) == ["1", "1-100"]
 
 
 def test_forged_heartbeats_have_an_end() -> None:

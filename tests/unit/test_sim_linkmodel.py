@@ -78,15 +78,6 @@ def test_loss_has_the_share_it_was_given(fields: dict[str, float], low: float, h
     assert low <= link.counters(UP).lost / 10_000 <= high
 
 
-def test_frames_beyond_a_limit_never_arrive() -> None:
-    link = model(mtu=100)
-    frames = [bytes(99), bytes(100), bytes(101), bytes(1)]
-    for frame in frames:
-        link.push(UP, frame, 0.0)
-    assert [len(frame) for frame in link.pop(UP, 1.0)] == [99, 100, 1]
-    assert link.counters(UP).lost == 1
-
-
 def test_a_cut_loses_what_is_on_the_way() -> None:
     link = model(rate=100.0, delay=1.0)
     for when in (0.0, 3.95, 4.5):

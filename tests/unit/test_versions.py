@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 
 import pytest
@@ -11,6 +10,7 @@ import trio.testing
 
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
+from tests.support.transfers import content
 
 KIB = 1024
 PATIENCE = 30.0
@@ -18,10 +18,6 @@ PATIENCE = 30.0
 
 def make_cache(budget: int = 1024 * KIB) -> BlockCache:
     return BlockCache(budget, clock=trio.current_time, patience=PATIENCE)
-
-
-def content(size: int, seed: int = 7) -> bytes:
-    return random.Random(seed).randbytes(size + -size % 4)[:size]  # shorter ones are prefixes of longer ones
 
 
 def deliver(blocks: Version, offset: int, data: bytes, *, batch: bool = True) -> None:
