@@ -29,9 +29,10 @@ class LateCopies:
     lateness that was seen in the last ten minutes, and a second at least. Where no copy was seen it does not
     rest at all.
 
-    A file that CreateFile made rests for as long before it is compared, but without that least second: a copy
-    that comes even later empties it, which is found when it is compared again under its final name. But
-    copies of its CreateFile and of that rename, both later than all this, would put an empty file there.
+    A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
+    CreateFile that comes even later empties the file, which is found when it is compared again under its
+    final name. Without this rest a link that delivers all requests twice could make an empty file under the
+    old name, by the copy of CreateFile, and put it under the final name, by the copy of the rename.
 
     Names that differ by case alone count as one, as on many cards.
     """
@@ -39,8 +40,8 @@ class LateCopies:
     def __init__(self) -> None:
         self._lateness = 0.0
         self._seen_at = -inf
-        self._changed: dict[bytes, float] = {}
-        self._made: dict[bytes, float] = {}
+        # By name: when a request last concerned it, and until when it rests at least; the oldest in front.
+        self._names: dict[bytes, tuple[float, float]] = {}
 
     def saw(self, lateness: float, now: float) -> None:
         """A copy was answered so many seconds after the request was sent first (0: that is not known)."""
@@ -49,35 +50,32 @@ class LateCopies:
 
     def on_changed(self, path: bytes, now: float) -> None:
         """A request took the file of this name away, or may have done so."""
-        _remember(self._changed, path.lower(), now)
+        self._note(path.lower(), now, now + LEAST_REST)
 
     def on_made(self, path: bytes, now: float) -> None:
         """CreateFile made, or emptied, the file of this name."""
-        _remember(self._made, path.lower(), now)
+        self._note(path.lower(), now, now)
 
     def on_replaced(self, path: bytes) -> None:
         """The name got its file by a rename: a copy of that finds nothing to rename."""
-        self._changed.pop(path.lower(), None)
-        self._made.pop(path.lower(), None)
+        self._names.pop(path.lower(), None)
 
     def rest(self, path: bytes, now: float) -> float:
         """Return for how many seconds more the name is not to be changed."""
         if not self._is_fresh(now):
             return 0.0
-        twice, name = min(MOST_REST, 2 * self._lateness), path.lower()
-        changed = self._changed.get(name, -inf) + max(LEAST_REST, twice)
-        return max(0.0, changed - now, self._made.get(name, -inf) + twice - now)
+        since, until = self._names.get(path.lower(), (-inf, -inf))
+        return max(0.0, until - now, since + min(MOST_REST, 2 * self._lateness) - now)
+
+    def _note(self, name: bytes, now: float, until: float) -> None:
+        """Note a request, and forget those that are too long ago to matter."""
+        _, before = self._names.pop(name, (now, now))
+        self._names[name] = now, max(until, before)
+        while now - next(iter(self._names.values()))[0] > MOST_REST:
+            del self._names[next(iter(self._names))]
 
     def _is_fresh(self, now: float) -> bool:
         return now - self._seen_at <= LASTS
-
-
-def _remember(times: dict[bytes, float], name: bytes, now: float) -> None:
-    """Note when something happened to a name, and forget what is too long ago to matter."""
-    times.pop(name, None)
-    times[name] = now  # the oldest are in front
-    while now - next(iter(times.values())) > MOST_REST:
-        del times[next(iter(times))]
 
 
 class Doubt:

@@ -94,11 +94,6 @@ class FileStream(SessionUser):
         self._wanted.set()
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
-        if self in self._scheduler.users:
-            gone, now = self._scheduler.gone, self._scheduler.clock()
-            gone.append((now, self))
-            while gone[0][0] < now - RECENT:
-                gone.popleft()
         self._scheduler.remove(self)
 
     # --- the scheduler's side

@@ -206,7 +206,7 @@ class Scheduler:
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
-        users: the readers and uploads there are. gone: readers that were closed, with the time when.
+        users: the readers and uploads there are.
         held: the turn that was granted and is not over. serving: set once `serve` runs.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
@@ -227,7 +227,7 @@ class Scheduler:
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
         self.serving = trio.Event()
-        self.gone: deque[tuple[float, SessionUser]] = deque()
+        self._gone: deque[tuple[float, SessionUser]] = deque()  # with the time when they were removed
         self.held: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
@@ -248,7 +248,12 @@ class Scheduler:
 
     def remove(self, user: SessionUser) -> None:
         """It wants no turn any more; harmless if that is known."""
-        self.users.pop(user, None)
+        if user in self.users:
+            del self.users[user]
+            now = self.clock()
+            self._gone.append((now, user))
+            while self._gone[0][0] < now - RECENT:
+                self._gone.popleft()
         self.refuse(user, LocalProtocolError("it was closed"))
 
     def refuse(self, user: SessionUser, error: MavftpfsError) -> None:
@@ -429,7 +434,7 @@ class Scheduler:
 
     def _on_reads_doubted(self, reason: str) -> None:
         """What was read lately may be another file's, also of files that were closed since."""
-        for user in [*self.users, *(user for _, user in self.gone)]:
+        for user in [*self.users, *(user for _, user in self._gone)]:
             user.on_suspect(reason)
 
     def on_armed_changed(self) -> None:
