@@ -34,17 +34,11 @@ from tests.support.transfers import (
 )
 
 EVERY_PROFILE = sorted(PROFILES)
-
 TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].write_only_truncates]
-
 KEEPING = [name for name in EVERY_PROFILE if not PROFILES[name].write_only_truncates]
-
 QUICK = LinkSettings(delay=0.02)
-
 SLOW = LinkSettings(rate=10_000.0, delay=0.05)
-
 OP_DEADLINE = 30.0
-
 OPCODE = 3
 
 
@@ -113,7 +107,7 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
     here = Rig(profile, FILES, SLOW)
-    data = random.Random(4).randbytes(300_000)
+    data = content(300_000, 4)
     async with here.mounted(b"/d") as tree:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(copy, tree, b"big", data)
@@ -132,7 +126,7 @@ async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojum
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
     here = Rig(profile, FILES, SLOW)
-    data = random.Random(4).randbytes(600_000)
+    data = content(600_000, 4)
     waited: list[float] = []
     async with here.mounted(b"/d") as tree:
         faults = here.faults
@@ -180,7 +174,7 @@ async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: M
 async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, autojump: MockClock) -> None:
     """A program without a buffer of its own writes faster than answers come, and slower than the link."""
     here = Rig(profile, FILES, LinkSettings(rate=100_000.0, delay=0.02))
-    data = random.Random(5).randbytes(70_000 + 700 * step)
+    data = content(70_000 + 700 * step, 5)
     async with here.mounted(b"/d") as tree:
         file = await tree.create(b"/d/log", exclusive=True)
         await file.write(0, data[:70_000])
@@ -199,7 +193,6 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, auto
 # --- the Terminate goes out right behind the last requests
 
 LINK = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
-
 BAD = {
     "lossy": replace(LINK, loss=0.1),
     "doubling": replace(LINK, loss=0.03, duplicate=0.2),
@@ -207,7 +200,6 @@ BAD = {
 }
 
 SIZE = 150_000
-
 SMALL = 40_000
 
 
@@ -222,7 +214,7 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
     async with here.connected():
         here.nursery.start_soon(read_now_and_then, here, random.Random(1), 0.0)
         with trio.fail_after(200), pytest.raises(FtpNak):
-            await upload(here, b"new", random.Random(1).randbytes(SIZE))
+            await upload(here, b"new", content(SIZE, 1))
 
 
 @pytest.mark.holds("promise 7")
@@ -243,7 +235,7 @@ async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClo
     async with here.connected():
         here.nursery.start_soon(read_now_and_then, here, random.Random(1), 0.0)
         with trio.fail_after(60), pytest.raises(Armed):
-            await upload(here, b"new", random.Random(1).randbytes(SIZE))
+            await upload(here, b"new", content(SIZE, 1))
 
 
 @pytest.mark.holds("promise 7")
@@ -296,7 +288,7 @@ async def test_uploads_that_alternate_fill_a_short_queue(
     began = trio.current_time()
     async with here.connected(), trio.open_nursery() as nursery:
         for number in range(count):
-            data = random.Random(number).randbytes(60_000)
+            data = content(60_000, number)
             nursery.start_soon(upload, here, b"%d" % number, data)
     assert trio.current_time() - began < most
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -14,13 +13,13 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig
-from tests.support.transfers import put, read_file
+from tests.support.transfers import content, put, read_file
 
 PROFILES = ["px4", "px4-nuttx", "ardupilot", "mavsdk"]
 LIMIT = 20_000
 FRAME = 266
 WIDE = LinkSettings(rate=100_000.0, delay=0.03)
-DATA = random.Random(4).randbytes(150_000)
+DATA = content(150_000, 4)
 
 
 class Meter:

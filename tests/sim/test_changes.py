@@ -27,7 +27,6 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import ROOTS, MemorySource, begin_to_read, content, know, path, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
-
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
 
 
@@ -244,9 +243,7 @@ async def test_no_checksum_is_asked_for_in_flight(
 
 
 LIMIT = CacheOptions().op_deadline + SLACK
-
 RADIO = LinkSettings(rate=5760.0, delay=0.05)
-
 D = b"/d"
 
 

@@ -39,8 +39,7 @@ from tests.support.rigs import Rig
 from tests.support.transfers import content, path, put, read_file
 
 KEY = bytes(range(32))
-
-DATA = random.Random(5).randbytes(30_000)
+DATA = content(30_000, 5)
 
 
 @pytest.mark.holds("promise 10", "rule 14.37")

@@ -30,7 +30,6 @@ from tests.support.transfers import MemorySink, begin_to_read, content, path, pu
 pytestmark = pytest.mark.holds("fault duplicate")
 
 EVERY_PROFILE = sorted(PROFILES)
-
 CLEAN = LinkSettings(delay=0.02)
 
 
@@ -263,9 +262,7 @@ async def test_who_waits_for_a_turn_is_not_timed_out(autojump: MockClock) -> Non
 
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
-
 STRANGER = Address(255, 190)
-
 OPCODE = 3
 
 READY = 0.011
@@ -645,7 +642,6 @@ async def test_doubt_costs_a_new_file_one_comparison(profile: str, autojump: Moc
 # --- and what raises none
 
 USB = LinkSettings(rate=1e6, delay=0.001, queue=100_000)
-
 FILES = 20
 
 

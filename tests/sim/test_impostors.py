@@ -30,16 +30,13 @@ from tests.support.lying import CrowdedLink, LyingVehicle, ftp, heartbeat
 from tests.support.replies import ack
 from tests.support.rigs import Rig
 from tests.support.rigs import read_file as read_through
-from tests.support.transfers import read_file
+from tests.support.transfers import content, read_file
 from tests.support.vehicles import HOST, free_udp_port
 
 HERE = ("10.0.0.1", 14550)
-
 THERE = ("10.0.0.2", 14550)
-
-OURS = random.Random(1).randbytes(20_000)
-
-THEIRS = random.Random(2).randbytes(20_000)
+OURS = content(20_000, 1)
+THEIRS = content(20_000, 2)
 
 
 class Crowd:
@@ -275,14 +272,10 @@ def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Ite
 # --- another vehicle with the same address
 
 SLOW = LinkSettings(rate=20_000.0, delay=0.02, loss=0.05)
-
 FILE = b"/d/f"
-
-OUR_FILE = random.Random(1).randbytes(60_000)
-
-THEIR_FILE = random.Random(2).randbytes(60_000)
-
-NEW = random.Random(3).randbytes(60_000)
+OUR_FILE = content(60_000, 1)
+THEIR_FILE = content(60_000, 2)
+NEW = content(60_000, 3)
 
 
 class Scene:

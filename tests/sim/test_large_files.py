@@ -21,7 +21,6 @@ SIZE = 4 * GIB - 5
 
 STAT = Stat(Kind.FILE, SIZE, DEFAULT_MTIME)
 WIDTH = 8
-
 READS = (
     (0, 1000),
     (2 * GIB - 3000, 1000),

@@ -16,7 +16,7 @@ from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.rigs import Rig
 from tests.support.takingturns import ALIKE
-from tests.support.transfers import ROOTS, MemorySink, MemorySource, read_file
+from tests.support.transfers import ROOTS, MemorySink, MemorySource, content, read_file
 
 SAMPLES = 20
 BEFORE = 3.0
@@ -24,7 +24,6 @@ BEFORE = 3.0
 
 FRAME = 266
 SMALL_FRAME = 40
-
 RADIO = LinkSettings(rate=5760.0, delay=0.03, duplex=Duplex.HALF, queue=8192)
 NEAR = LinkSettings(rate=100_000.0, delay=0.015, queue=50_000)
 SLOW = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
@@ -56,7 +55,7 @@ class Copy:
         self.keeps = not PROFILES[profile].write_only_truncates
         self.root = ROOTS.get(profile, b"") + b"/d"
         self.size = int((samples * 1.35 + BEFORE) * link.rate)
-        self.data = random.Random(2).randbytes(self.size)  # zeros would not be sent
+        self.data = content(self.size, 2)  # zeros would not be sent
         self.rig.card.add(self.root + b"/big", self.data)
         for number in range(samples):
             self.rig.card.add(self.root + b"/fresh%d/f" % number, b"%d" % number * 100)

@@ -34,12 +34,12 @@ from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.rigs import Rig
 from tests.support.takingturns import taking_turns
-from tests.support.trees import content
+from tests.support.transfers import content
 
 State = dict[bytes, bytes | None]
 """What is in the directory: contents of files by name, None for a directory."""
 
-OLD, OTHER, NEW = content("old", 900), content("other", 400), content("new", 700)
+OLD, OTHER, NEW = content(900, 1), content(400, 2), content(700, 3)
 BEFORE: State = {b"file": OLD, b"other": OTHER, b"sub": None}
 QUICK = ConnectOptions(op_deadline=8.0)
 IN_TIME = 60.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -25,6 +24,7 @@ from mavftpfs.shared.model import RENAME_ROOM
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.rigs import RENAMING, Rig, card, read_file, rig, write_file
 from tests.support.takingturns import taking_turns
+from tests.support.transfers import content
 
 EVERY = sorted(PROFILES)
 TELLING_CASE = [name for name in EVERY if not PROFILES[name].case_fold]
@@ -162,7 +162,7 @@ async def test_nor_one_that_others_made_meanwhile(profile: str, autojump: MockCl
 
 # --- rm of an open file where nothing can be renamed
 
-OPENED = random.Random(3).randbytes(6000)
+OPENED = content(6000, 3)
 
 littlefs = card({A: OPENED, B: b"it"}, profiles=("littlefs",))
 
@@ -194,8 +194,8 @@ async def test_what_is_written_here_goes_on_without_a_name(littlefs: Rig) -> Non
 
 # --- paths so long that requests do not carry what short ones do
 
-OLD = random.Random(1).randbytes(700)
-NEW = random.Random(2).randbytes(900)
+OLD = content(700, 1)
+NEW = content(900, 2)
 CHANGING = {
     Opcode.CREATE_FILE,
     Opcode.OPEN_FILE_WO,

@@ -3,8 +3,6 @@ unkind. Virtual time."""
 
 from __future__ import annotations
 
-import random
-
 import pytest
 import trio
 from trio.testing import MockClock
@@ -157,7 +155,7 @@ async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, 
     """Servers share session ids, and of an `@` file no checksum can prove the bytes. It is read once more,
     when the other client is done."""
     here = Rig(profile, link=LinkSettings(rate=5000.0, delay=0.02))
-    data = random.Random(2).randbytes(20_000)
+    data = content(20_000, 2)
     here.card.add(b"/f", data)
     async with here.connected() as connection, trio.open_nursery() as nursery:
 
@@ -226,7 +224,7 @@ async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: MockClock) -> None:
     here = Rig(profile, link=LinkSettings(rate=5000.0, delay=0.02))
-    data = random.Random(2).randbytes(20_000)
+    data = content(20_000, 2)
     here.card.add(b"/f", data)
     async with here.connected() as connection, trio.open_nursery() as nursery:
 
@@ -293,7 +291,7 @@ async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> N
     here = Rig(
         profile, link=LinkSettings(rate=200_000.0, delay=0.02, loss=0.02, duplicate=0.01, reorder=0.02)
     )
-    files = {b"/f": random.Random(3).randbytes(300_000), b"/g": random.Random(4).randbytes(239 * 500)}
+    files = {b"/f": content(300_000, 3), b"/g": content(239 * 500, 4)}
     for path, data in files.items():
         here.card.add(path, data)
     async with here.connected(ConnectOptions(read_mode="burst")) as connection:

@@ -5,7 +5,6 @@ The server's session is closed when nobody wanted bytes for a while, and opened 
 
 from __future__ import annotations
 
-import random
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -18,21 +17,16 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig
+from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("fault replaced file")
 
-OLD = random.Random(1).randbytes(120_000)
-
-NEW = random.Random(2).randbytes(160_000)
-
+OLD = content(120_000, 1)
+NEW = content(160_000, 2)
 STEP = 16_384
-
 THEN = 1_700_000_000
-
 PATH = b"/big"
-
 LINK = LinkSettings(rate=200_000.0, delay=0.01)
-
 SLOW = LinkSettings(rate=12_000.0, delay=0.02)
 
 IDLE = 4.0
@@ -192,7 +186,6 @@ async def test_the_same_file_is_read_on(profile: str, grown: bool, autojump: Moc
 # --- changes of it wait here: what goes to the card is of one file
 
 MID = b"mid"
-
 SUCCESSOR = NEW[: len(OLD)]
 
 

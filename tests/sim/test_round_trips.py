@@ -17,9 +17,7 @@ from tests.support.rigs import Rig
 from tests.support.transfers import ROOTS, content, path, read_file
 
 RTT = 0.3
-
 LONG = LinkSettings(delay=RTT / 2)
-
 PROFILES = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
 
 READY = 0.1
@@ -114,14 +112,12 @@ async def test_the_first_large_file_costs_two_round_trips_more(
 
 
 WIFI = LinkSettings(rate=625_000.0, delay=0.015, queue=300_000)
-
 FTP = 110
 
 OPCODE, REQ_OPCODE = 16, 18
 """Where they are in a frame."""
 
 LONGEST = 0.6
-
 SMALL = 600
 
 

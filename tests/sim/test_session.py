@@ -5,7 +5,6 @@ Against every profile, on virtual time.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -36,7 +35,6 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
-
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
@@ -287,16 +285,11 @@ async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
 # --- a session that is taken
 
 RIVAL = Address(255, 190)
-
 RIVALS_SESSION = 77
-
 LINK = LinkSettings(delay=0.02)
-
 SLOW = LinkSettings(rate=20_000.0, delay=0.02)
-
-DATA = random.Random(1).randbytes(60_000)
-
-OTHER = random.Random(2).randbytes(60_000)
+DATA = content(60_000, 1)
+OTHER = content(60_000, 2)
 
 CHECK_PERIOD = STALL / 2
 """How often a reading looks whether it stalled."""

@@ -5,7 +5,6 @@ Virtual time, bytes compared. The targets are those of docs/benchmarks.md; scrip
 
 from __future__ import annotations
 
-import random
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from statistics import mean
@@ -20,7 +19,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
 from tests.support.rigs import Rig
-from tests.support.transfers import MemorySink, MemorySource, begin_to_read
+from tests.support.transfers import MemorySink, MemorySource, begin_to_read, content
 
 LONG = 60.0
 SHORT = 10.0
@@ -91,7 +90,7 @@ def serial_share(case: Case, seed: int) -> float:
     link = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=SHORT_QUEUE)
     here = Rig(case.profile, link=link, seed=seed, serial=True)
     here.put_directory(b"/d")
-    data = random.Random(1).randbytes(int(case.limit * LONG))
+    data = content(int(case.limit * LONG), 1)
     if case.direction == "read":
         here.put(b"/d/log.bin", data)
 
@@ -259,7 +258,7 @@ async def test_never_more_is_written_than_a_short_queue_holds(
 async def test_a_slow_link_that_becomes_fast_is_used(autojump: MockClock) -> None:
     """The pace of a radio is kept while that is the way; then the cable is plugged in."""
     size = 3_000_000
-    here = Rig("px4", {b"/d/f": random.Random(1).randbytes(size)}, LinkSettings(rate=5760.0, delay=0.05))
+    here = Rig("px4", {b"/d/f": content(size, 1)}, LinkSettings(rate=5760.0, delay=0.05))
     async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, b"/d/f", 0)
         for rate in (100_000.0, 5760.0):
@@ -277,9 +276,7 @@ async def test_a_way_that_becomes_longer_for_good_is_found_out(autojump: MockClo
     """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
     away."""
     loss, size = 0.02, 8 << 20
-    here = Rig(
-        "px4", {b"/d/f": random.Random(1).randbytes(size)}, LinkSettings(rate=3000.0, delay=0.025, loss=loss)
-    )
+    here = Rig("px4", {b"/d/f": content(size, 1)}, LinkSettings(rate=3000.0, delay=0.025, loss=loss))
     async with here.connected() as connection:
         sink = MemorySink(size)
         reader = await connection.store.open_reader(b"/d/f", sink)
@@ -317,7 +314,7 @@ def allowed(case: Case) -> float:
 
 async def last_read(here: Rig) -> float:
     """Return how long the end of a read takes."""
-    data, almost = random.Random(1).randbytes(SIZE), 0.0
+    data, almost = content(SIZE, 1), 0.0
     here.card.add(b"/d/f", data)
 
     class Sink(MemorySink):
@@ -349,7 +346,7 @@ async def last_write(here: Rig) -> float:
                 almost = almost or trio.current_time()
 
     async with here.connected() as connection:
-        source = Source(random.Random(1).randbytes(SIZE))
+        source = Source(content(SIZE, 1))
         upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         took = trio.current_time() - almost

@@ -23,9 +23,7 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySource, content, know, path, read_file, start, under_way
 
 EVERY_PROFILE = sorted(PROFILES)
-
 STRANGER = Address(255, 190)
-
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
