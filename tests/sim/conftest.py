@@ -15,7 +15,7 @@ REAL_TIME = ("test_endpoints", "test_impostors", "test_links")
 
 @pytest.fixture
 def autojump() -> MockClock:
-    """Virtual time: it jumps to whatever is waited for."""
+    """Virtual time for a test of a module with sockets: it jumps to whatever is waited for."""
     return MockClock(autojump_threshold=0)
 
 

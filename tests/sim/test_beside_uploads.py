@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
@@ -86,7 +85,7 @@ async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autojump: MockClock) -> None:
+async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str) -> None:
     here = Rig(profile, FILES, QUICK)
     async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
         nursery.start_soon(trickle, tree, b"/d/log")
@@ -105,7 +104,7 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
+async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str) -> None:
     here = Rig(profile, FILES, SLOW)
     data = content(300_000, 4)
     async with here.mounted(b"/d") as tree:
@@ -123,7 +122,7 @@ async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojum
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
-async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
+async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
     here = Rig(profile, FILES, SLOW)
     data = content(600_000, 4)
@@ -155,7 +154,7 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str,
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: MockClock) -> None:
+async def test_a_log_written_now_and_then_costs_little(profile: str) -> None:
     """The whole file again for each line is more than a link carries."""
     here = Rig(profile, FILES, QUICK)
     async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
@@ -171,7 +170,7 @@ async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: M
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("profile", "step"), [("px4", 1), ("px4-nuttx", 100), ("ardupilot", 100)])
-async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, autojump: MockClock) -> None:
+async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int) -> None:
     """A program without a buffer of its own writes faster than answers come, and slower than the link."""
     here = Rig(profile, FILES, LinkSettings(rate=100_000.0, delay=0.02))
     data = content(70_000 + 700 * step, 5)
@@ -205,9 +204,7 @@ SMALL = 40_000
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_a_full_card_is_told_though_somebody_reads_all_the_time(profile: str) -> None:
     """What was refused behind the Terminate was sent again, and refused again, for ever."""
     here = Rig(profile, FILES, LINK)
     here.card.capacity = here.card.used + 20_400
@@ -219,7 +216,7 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClock) -> None:
+async def test_arming_while_it_is_closed_is_told(profile: str) -> None:
     """Who waits for an upload was told nothing before the vehicle was disarmed (promise 9)."""
     here = Rig(profile, FILES, LINK)
     vehicle, handle = here.vehicle, here.server.handle
@@ -241,7 +238,7 @@ async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClo
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("link", BAD)
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_two_uploads_and_a_reader_over_bad_links(profile: str, link: str, autojump: MockClock) -> None:
+async def test_two_uploads_and_a_reader_over_bad_links(profile: str, link: str) -> None:
     here = Rig(profile, FILES, BAD[link])
     rng = random.Random(1)
     async with here.connected(seed=1):
@@ -253,7 +250,7 @@ async def test_two_uploads_and_a_reader_over_bad_links(profile: str, link: str, 
 
 
 @pytest.mark.holds("promise 7")
-async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
+async def test_of_two_uploads_none_waits_for_ever() -> None:
     """Each wait for the other's late requests to be dead counted as a turn, and began the wait anew after
     which it goes before readers: one of them was sent, the other did not get a byte in ten minutes."""
     here = Rig("ardupilot", FILES, BAD["mixing"])
@@ -281,9 +278,7 @@ async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
         (2, replace(LINK, delay=0.15, loss=0.01), 46),
     ],
 )
-async def test_uploads_that_alternate_fill_a_short_queue(
-    count: int, link: LinkSettings, most: float, autojump: MockClock
-) -> None:
+async def test_uploads_that_alternate_fill_a_short_queue(count: int, link: LinkSettings, most: float) -> None:
     here = Rig("ardupilot", FILES, link)
     began = trio.current_time()
     async with here.connected(), trio.open_nursery() as nursery:
@@ -298,7 +293,7 @@ async def test_uploads_that_alternate_fill_a_short_queue(
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 
-async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: MockClock) -> None:
+async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again() -> None:
     """Not told at once that it waited too long: that was the time before."""
     here = Rig("mavsdk", {b"/d/old": b"hello"}, LinkSettings(rate=5_000.0, delay=0.05))
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -319,7 +314,7 @@ async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: 
 
 
 @pytest.mark.holds("rule 14.24")
-async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
+async def test_path_operations_beside_an_upload_on_nuttx() -> None:
     """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
     data = content(60_000)
     here = Rig("px4-nuttx", {b"/d": None}, PLAIN)
@@ -337,7 +332,7 @@ async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) ->
     assert here.data(b"/d/new") == data
 
 
-async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
+async def test_outside_the_whitelist_stays_refused() -> None:
     here = Rig("px4-nuttx", {b"/d": None})
     here.card.add_directory(b"/etc")
     async with here.connected() as connection:
@@ -350,7 +345,7 @@ async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
     assert here.server.open_sessions == 0
 
 
-async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autojump: MockClock) -> None:
+async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer() -> None:
     data = content(200_000)
     here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.3))
     here.card.add(b"/etc/rc", b"#")
@@ -370,7 +365,7 @@ async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autoju
     assert here.data(b"/d/new") == data
 
 
-async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
+async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
     """Whatever slips in between arming and writing, the upload is not refused for it."""
     data = content(40_000)
     here = Rig("px4-nuttx", link=LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))

@@ -6,7 +6,6 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID
 from mavftpfs.protocol.payload import Opcode
@@ -72,7 +71,7 @@ def check(meter: Meter, limit: float = LIMIT, *, late: float = 0.0) -> None:
 @pytest.mark.parametrize("transfer", [read, write])
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_bulk_keeps_the_limit_and_uses_it(
-    profile: str, transfer: Callable[[Connection, Rig], Awaitable[None]], autojump: MockClock
+    profile: str, transfer: Callable[[Connection, Rig], Awaitable[None]]
 ) -> None:
     here = Rig(profile, {b"/d/f": DATA}, WIDE)
     limit = LIMIT // 2 if profile == "ardupilot" else LIMIT  # its short queue allows no more
@@ -82,7 +81,7 @@ async def test_bulk_keeps_the_limit_and_uses_it(
         check(meter, limit, late=here.server.profile.stall_chance and 0.3)
 
 
-async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
+async def test_a_listing_goes_ahead_of_a_copy() -> None:
     here = Rig("px4", {b"/d/f": DATA}, WIDE)
     async with here.connected(ConnectOptions(bwlimit=LIMIT)) as connection:
         meter = Meter(connection)
@@ -98,7 +97,7 @@ async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
             assert meter.most_within(seconds) <= 1.01 * seconds * LIMIT + 0.1 * LIMIT + FRAME
 
 
-async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) -> None:
+async def test_the_slowest_limit_is_slow_and_no_time_out() -> None:
     here = Rig("px4", {b"/f": DATA[:5000]}, WIDE)
     async with here.connected(ConnectOptions(bwlimit=100)) as connection:
         began = trio.current_time()
@@ -110,7 +109,7 @@ async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) ->
         assert connection.engine.stats.retransmissions == 0
 
 
-async def test_no_bursts_with_a_limit(autojump: MockClock) -> None:
+async def test_no_bursts_with_a_limit() -> None:
     here = Rig("ardupilot", {b"/d/f": DATA}, WIDE)
     async with here.connected(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
         meter = Meter(connection)

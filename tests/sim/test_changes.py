@@ -10,7 +10,6 @@ from typing import Literal
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import SLACK
@@ -36,7 +35,7 @@ def names(here: Rig) -> list[bytes]:
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
+async def test_refusals_are_refusals(profile: str) -> None:
     here = Rig(profile, {b"/d/file": b"content"})
     here.put(b"/d/dir/inner", b"x")
     here.put_directory(b"/d/empty")
@@ -59,7 +58,7 @@ async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_an_existing_directory_is_not_taken_for_ours(profile: str, autojump: MockClock) -> None:
+async def test_an_existing_directory_is_not_taken_for_ours(profile: str) -> None:
     """Its reply lost, mkdir of what was there before must still be refused."""
     here = Rig(profile, {b"/d": None})
     here.put(b"/d/dir/inner", b"x")
@@ -72,7 +71,7 @@ async def test_an_existing_directory_is_not_taken_for_ours(profile: str, autojum
 
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "px4-2026"])
-async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojump: MockClock) -> None:
+async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str) -> None:
     here = Rig(profile, {b"/d/file": b"content"})
     here.put_directory(b"/d/dir")
     faults = here.faults
@@ -103,7 +102,7 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
 
 @pytest.mark.holds("fault refused retry")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_not_answered_is_done_if_a_listing_shows_it(profile: str, autojump: MockClock) -> None:
+async def test_what_was_not_answered_is_done_if_a_listing_shows_it(profile: str) -> None:
     here = Rig(profile, {b"/d/file": b"content"})
     async with here.connected() as connection:
         here.faults.ignore(Opcode.REMOVE_FILE)
@@ -117,7 +116,7 @@ async def test_what_was_not_answered_is_done_if_a_listing_shows_it(profile: str,
 
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
+async def test_our_own_session_is_closed_before_a_path_changes(profile: str) -> None:
     here = Rig(
         profile, {b"/d/file": bytes(60_000), b"/d/other": b"x"}, LinkSettings(rate=20_000.0, delay=0.02)
     )
@@ -137,7 +136,7 @@ async def test_our_own_session_is_closed_before_a_path_changes(profile: str, aut
 
 
 @pytest.mark.parametrize("profile", RENAMING)
-async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> None:
+async def test_readers_follow_a_rename(profile: str) -> None:
     data = content(40_000)
     here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
     here.put(b"/d/dir/file", data)
@@ -154,9 +153,7 @@ async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> Non
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_an_upload_makes_room_for_a_change_of_its_path(
-    profile: str, probed: bool, autojump: MockClock
-) -> None:
+async def test_an_upload_makes_room_for_a_change_of_its_path(profile: str, probed: bool) -> None:
     here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
     faults = here.faults
     open_then: list[list[bytes]] = []
@@ -175,7 +172,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
 
 
 @pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if name != "spec"])
-async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump: MockClock) -> None:
+async def test_what_may_still_be_open_is_closed_first_too(profile: str) -> None:
     """A CreateFile whose ACK never came may have opened the file that is then removed."""
     here = Rig(profile, {b"/d": None})
     faults = here.faults
@@ -197,7 +194,7 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
 @pytest.mark.parametrize("in_root", [False, True])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_who_looks_misses_no_name_because_we_take_others_away(
-    profile: str, in_root: bool, taken: int, autojump: MockClock
+    profile: str, in_root: bool, taken: int
 ) -> None:
     """A page begins where the one before ended, by number: what moved up meanwhile is on neither."""
     names = [b"name of some length %02d" % number for number in range(60)]
@@ -221,9 +218,7 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
 
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("when_armed", ["ro", "ok"])
-async def test_no_checksum_is_asked_for_in_flight(
-    when_armed: Literal["ro", "ok"], autojump: MockClock
-) -> None:
+async def test_no_checksum_is_asked_for_in_flight(when_armed: Literal["ro", "ok"]) -> None:
     """The vehicle reads the whole file for it (promise 9)."""
     here = Rig("px4", {b"/d/file": b"content"})
     faults = here.faults
@@ -256,7 +251,7 @@ def made(profile: str, settings: LinkSettings | None = None) -> Rig:
 
 
 @pytest.mark.holds("promise 4")
-async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> None:
+async def test_nobody_else_waits_for_a_long_delivery() -> None:
     here = made("mavsdk", RADIO)
     here.card.add(D + b"/long", content(300_000))
     async with here.mounted(D) as tree:
@@ -287,7 +282,7 @@ async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> Non
         await file.release()
 
 
-async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
+async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing() -> None:
     here = Rig("mavsdk", {b"/d/file": b"content"})
     faults = here.faults
     async with here.connected() as connection:
@@ -296,7 +291,7 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojum
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
 
 
-async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) -> None:
+async def test_changes_that_concern_one_another_take_turns() -> None:
     here = made("px4", LinkSettings(delay=0.5))
     async with here.mounted(D) as tree:
         async with trio.open_nursery() as nursery:
@@ -309,7 +304,7 @@ async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) 
 
 
 @pytest.mark.parametrize("same", [False, True])
-async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool, autojump: MockClock) -> None:
+async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool) -> None:
     here = made("px4")
     faults = here.faults
     async with here.mounted(D) as tree:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.protocol.chunking import SHORT, SHORT_SECONDS
 from mavftpfs.protocol.payload import MAX_DATA
@@ -29,7 +28,7 @@ def sizes(connection: Connection) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-async def test_a_file_is_read_where_no_full_frame_passes(profile: str, autojump: MockClock) -> None:
+async def test_a_file_is_read_where_no_full_frame_passes(profile: str) -> None:
     data = content(50_000)
     here = Rig(profile, {b"/d/file": data}, replace(RADIO, mtu=LIMIT))
     async with here.connected() as connection:
@@ -38,7 +37,7 @@ async def test_a_file_is_read_where_no_full_frame_passes(profile: str, autojump:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-async def test_a_file_is_written_where_no_full_frame_passes(profile: str, autojump: MockClock) -> None:
+async def test_a_file_is_written_where_no_full_frame_passes(profile: str) -> None:
     data = content(50_000)
     here = Rig(profile, {b"/d": None}, RADIO)
     async with here.connected() as connection:
@@ -50,7 +49,7 @@ async def test_a_file_is_written_where_no_full_frame_passes(profile: str, autoju
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
-async def test_a_link_that_recovers_gets_full_chunks_back(profile: str, autojump: MockClock) -> None:
+async def test_a_link_that_recovers_gets_full_chunks_back(profile: str) -> None:
     data = content(20_000)
     here = Rig(profile, {b"/d/file": data}, replace(RADIO, mtu=LIMIT))
     async with here.connected() as connection:

@@ -12,7 +12,6 @@ from random import Random
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.client import connect as compose
@@ -43,7 +42,7 @@ DATA = content(30_000, 5)
 
 
 @pytest.mark.holds("promise 10", "rule 14.37")
-async def test_signing_both_ways(autojump: MockClock) -> None:
+async def test_signing_both_ways() -> None:
     tree = MemoryTree()
     tree.add(b"/f", DATA)
     vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
@@ -95,7 +94,7 @@ class Diary(dict[Address, Heartbeat]):
 @pytest.mark.holds("fault overflow")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 @pytest.mark.parametrize("what", ["window", "burst", "write"])
-async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump: MockClock) -> None:
+async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str) -> None:
     """A radio that cannot do both at a time, with a short queue: what we send must not starve them."""
     radio = LinkSettings(rate=5760.0, duplex=Duplex.HALF, queue=4096, delay=0.05)
     here = Rig(profile, {b"/d/f": DATA * 2}, radio)
@@ -113,7 +112,7 @@ async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump
     assert max(later - time for time, later in pairwise(heard)) < 2.5
 
 
-async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojump: MockClock) -> None:
+async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way() -> None:
     vehicle = OldFirmware(MemoryTree(), PROFILES["px4"], rng=random.Random(1))
     link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
     async with connected(link, ConnectOptions(), rng=random.Random(3)) as connection:
@@ -134,7 +133,7 @@ async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojum
         (ConnectOptions(heartbeat="none"), None),
     ],
 )
-async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, autojump: MockClock) -> None:
+async def test_what_we_say_we_are(options: ConnectOptions, said: int | None) -> None:
     """A ground station's heartbeat would feed the autopilot's failsafe, and trigger it later (promise 6)."""
     here = Rig("px4", {b"/f": DATA})
     async with here.connected(options) as connection:
@@ -145,7 +144,7 @@ async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, aut
 
 
 @pytest.mark.holds("promise 6")
-async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:
+async def test_a_neighbour_with_our_address_makes_us_move() -> None:
     here = Rig("ardupilot", {b"/f": DATA}, LinkSettings(delay=0.01))
     async with here.connected() as connection:
         own = connection.vehicle.own
@@ -172,7 +171,7 @@ def join(monkeypatch: pytest.MonkeyPatch, here: Rig, folder: Path) -> None:
 
 
 async def test_a_restart_while_leaving_has_nothing_delivered(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     here = Rig("ardupilot", {b"/d/f": content(100)})
     join(monkeypatch, here, tmp_path)
@@ -195,9 +194,7 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
     assert here.card.data(b"/d/f") == content(100)
 
 
-async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the right key, and does not take the time from us."""
     vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
     monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
@@ -208,7 +205,7 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
 
 
 @pytest.mark.parametrize("target", [0, 1])
-async def test_another_vehicle_that_is_heard_is_said(target: int, autojump: MockClock) -> None:
+async def test_another_vehicle_that_is_heard_is_said(target: int) -> None:
     options = Options(target_system=target)
     async with Rig("px4", {b"/d": None}).connected() as connection:
         assert compose.others_heard(connection, options) == ""

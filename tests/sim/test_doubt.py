@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
@@ -82,9 +81,7 @@ def test_few_names_are_remembered() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(
-    profile: str, loss: float, autojump: MockClock
-) -> None:
+async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(profile: str, loss: float) -> None:
     here = Rig(profile, {b"/d/f": content(20_000)}, LinkSettings(delay=0.02, loss=loss))
     async with here.connected() as connection:
         await read_file(connection, path(profile, "f"))
@@ -95,7 +92,7 @@ async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(
         assert loss or not connection.store.in_doubt()
 
 
-async def test_an_answer_that_comes_twice_raises_it(autojump: MockClock) -> None:
+async def test_an_answer_that_comes_twice_raises_it() -> None:
     here = Rig("px4", {b"/d": None}, CLEAN)
     async with here.connected() as connection:
         began = trio.current_time()
@@ -111,7 +108,7 @@ async def test_an_answer_that_comes_twice_raises_it(autojump: MockClock) -> None
 
 
 @pytest.mark.holds("rule 14.12")
-async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autojump: MockClock) -> None:
+async def test_what_another_client_does_decides_whether_bytes_are_in_doubt() -> None:
     """The first that is heard of him, what may use our session, and for a while after that everything: a
     request that took the session may have been missed."""
     data = content(200_000)
@@ -137,7 +134,7 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autoj
         reader.close()
 
 
-async def test_a_session_that_vanished_raises_it(autojump: MockClock) -> None:
+async def test_a_session_that_vanished_raises_it() -> None:
     data = content(200_000)
     here = Rig("px4", {b"/d/f": data}, LinkSettings(rate=50_000.0, delay=0.02))
     async with here.connected() as connection:
@@ -151,7 +148,7 @@ async def test_a_session_that_vanished_raises_it(autojump: MockClock) -> None:
         reader.close()
 
 
-async def test_a_restart_raises_it(autojump: MockClock) -> None:
+async def test_a_restart_raises_it() -> None:
     here = Rig("px4", {b"/d": None}, CLEAN)
     async with here.connected() as connection:
         await trio.sleep(5)
@@ -162,9 +159,7 @@ async def test_a_restart_raises_it(autojump: MockClock) -> None:
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(profile: str) -> None:
     """The same RENAME, carried out once more, would take the next file of the name."""
     if profile == "littlefs":
         return
@@ -181,7 +176,7 @@ async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str, autojump: MockClock) -> None:
+async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
     """A late copy finds nothing under the old name. rsync renames each new file so: a second each."""
     if profile == "littlefs":
         return
@@ -211,9 +206,7 @@ async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) 
 
 @pytest.mark.parametrize("nth", [8, 9, 12])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
-    profile: str, nth: int, autojump: MockClock
-) -> None:
+async def test_a_late_open_of_another_file_gives_no_wrong_bytes(profile: str, nth: int) -> None:
     """MAVSDK closes what is open and opens that one, under the same id; files of one size hide it."""
     one, two = content(1500, 1), content(1500, 2)
     here = Rig(profile, {b"/d/one": one, b"/d/two": two}, CLEAN)
@@ -228,7 +221,7 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
 
 @pytest.mark.holds("fault leaving")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, autojump: MockClock) -> None:
+async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str) -> None:
     here = Rig(profile, {b"/d/one": content(1500, 1), b"/d/two": content(1500, 2)}, CLEAN)
     async with here.connected() as connection:
         copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.TERMINATE_SESSION)
@@ -240,7 +233,7 @@ async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, aut
         assert trio.current_time() - began < 1
 
 
-async def test_who_waits_for_a_turn_is_not_timed_out(autojump: MockClock) -> None:
+async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
     """200 programs read at once over a round trip of 100 ms: the last one waits longer than a read may."""
     files = {b"/f%d" % number: content(2000, number) for number in range(200)}
     ended: list[float] = []
@@ -293,7 +286,7 @@ def come_again(here: Rig, late: float, chosen: Callable[[bytes], bool]) -> None:
 
 
 @pytest.mark.holds("rule 14.12")
-async def test_a_create_that_we_repeated_comes_after_the_file_was_compared(autojump: MockClock) -> None:
+async def test_a_create_that_we_repeated_comes_after_the_file_was_compared() -> None:
     """Our own repetition explains its answer, so there is no doubt; its copy empties what was compared."""
     here = Rig("px4", {b"/d": None}, CLEAN)
     async with here.mounted(b"/d") as tree:
@@ -311,7 +304,7 @@ async def test_a_create_that_we_repeated_comes_after_the_file_was_compared(autoj
 @pytest.mark.parametrize("after", [Opcode.CALC_FILE_CRC32, Opcode.OPEN_FILE_RO, Opcode.TERMINATE_SESSION])
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
 async def test_a_create_that_the_network_repeats_after_the_file_was_compared(
-    profile: str, after: Opcode, verify: str, autojump: MockClock
+    profile: str, after: Opcode, verify: str
 ) -> None:
     """It is the first sign of doubt, and the file is empty when it gets its name."""
     async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
@@ -347,7 +340,7 @@ async def read_all(tree: Tree, target: bytes) -> bytes:
 )
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5"])
 async def test_a_late_rename_or_remove_never_loses_old_and_new(
-    profile: str, what: Opcode, after: Opcode, nth: int, first: bool, known: bool, autojump: MockClock
+    profile: str, what: Opcode, after: Opcode, nth: int, first: bool, known: bool
 ) -> None:
     """The file is replaced, removed and made again; at each moment one of its contents is on the card."""
     async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": b""}, link=CLEAN) as here:
@@ -378,9 +371,7 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
 @pytest.mark.holds("promise 3", "rule 14.12")
 @pytest.mark.parametrize("known", [False, True], ids=["first", "known"])
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
-async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(
-    profile: str, known: bool, autojump: MockClock
-) -> None:
+async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: str, known: bool) -> None:
     """What moved the old file aside takes the new one away 5 s later. No program lists the directory."""
     async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": b""}, link=CLEAN) as here:
         tree = here.mount()
@@ -403,7 +394,7 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(
 
 
 @pytest.mark.holds("promise 3", "rule 14.12")
-async def test_the_old_file_is_removed_only_when_the_new_one_is_seen(autojump: MockClock) -> None:
+async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
     """The copy comes after a listing confirmed the rename. What lay aside was removed then, and was the new
     file by that time."""
     async with rig("px4-nuttx", {b"/d/f": content(500, 1), b"/d/g": content(500, 2)}, link=CLEAN) as here:
@@ -428,9 +419,7 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen(autojump: M
         *((profile, 2, late) for profile in RENAMING for late in (0.1, 0.3, 0.5, 2.0)),
     ],
 )
-async def test_copies_of_a_create_and_of_its_rename_both_late(
-    profile: str, every: int, late: float, autojump: MockClock
-) -> None:
+async def test_copies_of_a_create_and_of_its_rename_both_late(profile: str, every: int, late: float) -> None:
     """Together they would put an empty file under the name: over two radios of which one loses the bytes, or
     where all that concerns a file, or every other one, comes twice."""
     async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
@@ -457,7 +446,7 @@ async def test_copies_of_a_create_and_of_its_rename_both_late(
 @pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 @pytest.mark.parametrize("profile", taking_turns(KINDS))
-async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str, autojump: MockClock) -> None:
+async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str) -> None:
     async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
         tree = here.mount(verify=verify)
         await write_file(tree, b"/d/one", content(200, 1))
@@ -471,7 +460,7 @@ async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str, a
 
 
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
-async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, autojump: MockClock) -> None:
+async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str) -> None:
     here = Rig("px4", {b"/d/k": b"x"}, DOUBLING)
     async with here.mounted(b"/d", verify=verify, verify_max=50_000) as tree:
         came = trio.Event()
@@ -495,7 +484,7 @@ async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, auto
 
 @pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize(("profile", "leaves"), [("px4", False), ("px4-2026", True), ("px4-nuttx", True)])
-async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, autojump: MockClock) -> None:
+async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool) -> None:
     """PX4 has one session, 0, for all clients: our ACKs may be for the other one's file."""
     here = Rig(profile, {b"/d/f": b"x" * 130_000}, CLEAN)
     new = bytes(range(1, 240)) * 500
@@ -535,7 +524,7 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, a
     [("px4", 0.0, 0.0), ("px4-nuttx", 3.0, 0.0), ("ardupilot", 4.0, 0.9), ("px4", 12.0, 0.9)],
 )
 async def test_the_power_went_between_the_last_answer_and_the_close(
-    profile: str, downtime: float, beat_after: float, autojump: MockClock
+    profile: str, downtime: float, beat_after: float
 ) -> None:
     """The last sector was in its memory. Who restarted may ACK the Terminate, too, before we hear of that."""
     async with rig(profile, {b"/d/f": b"x" * 30_000}, link=CLEAN) as here:
@@ -565,9 +554,7 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
     "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))]
 )
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
-async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
-    profile: str, seed: int, autojump: MockClock
-) -> None:
+async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(profile: str, seed: int) -> None:
     """FAT has a sector in memory until the file is closed."""
     rng = random.Random(seed)
     settings = LinkSettings(delay=rng.choice([0.02, 0.1, 0.4]), loss=rng.choice([0.0, 0.05]))
@@ -601,7 +588,7 @@ async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
 
 
 @pytest.mark.holds("promise 2")
-async def test_where_no_checksum_is_told_the_file_is_read_back(autojump: MockClock) -> None:
+async def test_where_no_checksum_is_told_the_file_is_read_back() -> None:
     """A byte that is wrong on the card is noticed, and all of it is sent again."""
     data = bytes(range(1, 240)) * 300
     async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
@@ -621,7 +608,7 @@ async def test_where_no_checksum_is_told_the_file_is_read_back(autojump: MockClo
 
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "littlefs", "mavsdk"])
-async def test_doubt_costs_a_new_file_one_comparison(profile: str, autojump: MockClock) -> None:
+async def test_doubt_costs_a_new_file_one_comparison(profile: str) -> None:
     """The link doubles 2 % of its packets, at once. Forty small files took a second each."""
 
     async def forty(duplicate: float) -> float:
@@ -645,7 +632,7 @@ USB = LinkSettings(rate=1e6, delay=0.001, queue=100_000)
 FILES = 20
 
 
-async def test_small_files_do_not_wait_for_each_other(autojump: MockClock) -> None:
+async def test_small_files_do_not_wait_for_each_other() -> None:
     """A card that pauses makes us ask twice; that is no reason to fear the path."""
     here = Rig("px4-nuttx", {b"/d/log": content(400_000, 1)}, USB)
     async with here.mounted() as tree:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, MavftpfsError, NotFound
@@ -48,7 +47,7 @@ class FirstPageAgain:
 
 @pytest.mark.parametrize("end", [60, 1 << 30])
 async def test_a_server_that_repeats_its_first_page_is_not_believed(
-    end: int, autojump: MockClock, caplog: pytest.LogCaptureFixture
+    end: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with rig(files=SIXTY) as here:
         FirstPageAgain(here, end)
@@ -62,7 +61,7 @@ async def test_a_server_that_repeats_its_first_page_is_not_believed(
     assert "/d" in lines[0].getMessage()
 
 
-async def test_names_that_an_incomplete_listing_lacks_are_asked_for(autojump: MockClock) -> None:
+async def test_names_that_an_incomplete_listing_lacks_are_asked_for() -> None:
     async with rig(files=SIXTY) as here:
         FirstPageAgain(here, 60)
         tree = here.mount()
@@ -82,7 +81,7 @@ async def test_names_that_an_incomplete_listing_lacks_are_asked_for(autojump: Mo
 
 
 @pytest.mark.parametrize("profile", KINDS)
-async def test_a_listing_that_is_refused_midway_is_an_error(profile: str, autojump: MockClock) -> None:
+async def test_a_listing_that_is_refused_midway_is_an_error(profile: str) -> None:
     def refuse(request: Payload, reply: Payload) -> Iterable[Payload]:
         refused = request.opcode in LISTS and request.data.startswith(b"/d\0") and request.offset > 0
         return [nak(request, NakCode.FILE_NOT_FOUND) if refused else reply]
@@ -95,9 +94,7 @@ async def test_a_listing_that_is_refused_midway_is_an_error(profile: str, autoju
 
 @pytest.mark.parametrize("profile", KINDS)
 @pytest.mark.parametrize("size", [0, 30_000, 59_999])
-async def test_an_open_reply_that_tells_too_small_a_size_is_not_believed(
-    profile: str, size: int, autojump: MockClock
-) -> None:
+async def test_an_open_reply_that_tells_too_small_a_size_is_not_believed(profile: str, size: int) -> None:
     def claim(request: Payload, reply: Payload) -> Iterable[Payload]:
         opened = request.opcode == Opcode.OPEN_FILE_RO and reply.opcode == Opcode.ACK
         return [reply._replace(data=size.to_bytes(4, "little")) if opened else reply]
@@ -109,9 +106,7 @@ async def test_an_open_reply_that_tells_too_small_a_size_is_not_believed(
 
 
 @pytest.mark.parametrize("profile", KINDS)
-async def test_a_file_that_became_smaller_since_it_was_listed_is_read(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_a_file_that_became_smaller_since_it_was_listed_is_read(profile: str) -> None:
     async with rig(profile, {F: WHOLE}) as here:
         tree = here.mount()
         await tree.list(b"/d")
@@ -138,7 +133,7 @@ def other_opcode(request: Payload, reply: Payload) -> Payload:
 
 @pytest.mark.holds("promise 1")
 @pytest.mark.parametrize("spoil", [early_end, empty_ack, shifted, other_opcode])
-async def test_a_file_that_cannot_be_completed_is_an_error(spoil: Spoil, autojump: MockClock) -> None:
+async def test_a_file_that_cannot_be_completed_is_an_error(spoil: Spoil) -> None:
     async with rig(files={F: WHOLE[:1000]}) as here:
         here.server.change = lambda request, reply: [
             spoil(request, reply) if request.opcode == Opcode.READ_FILE else reply
@@ -149,7 +144,7 @@ async def test_a_file_that_cannot_be_completed_is_an_error(spoil: Spoil, autojum
         file.close()
 
 
-async def test_with_dir_timeout_0_a_new_file_is_found_by_the_next_open(autojump: MockClock) -> None:
+async def test_with_dir_timeout_0_a_new_file_is_found_by_the_next_open() -> None:
     slow = LinkSettings(rate=5_000, delay=0.1)  # a listing takes long
     async with rig(files={b"/d/old": b"1"}, link=slow) as here:
         tree = here.mount(dir_timeout=0.0)

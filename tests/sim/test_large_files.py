@@ -7,7 +7,6 @@ from contextlib import asynccontextmanager
 from struct import pack
 
 import pytest
-from trio.testing import MockClock
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.errors import FtpNak
@@ -94,7 +93,7 @@ async def huge(profile: str) -> AsyncIterator[OpenFile]:
 
 @pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk"])
-async def test_any_place_of_a_huge_file_can_be_read(profile: str, autojump: MockClock) -> None:
+async def test_any_place_of_a_huge_file_can_be_read(profile: str) -> None:
     async with huge(profile) as file:
         for offset, count in READS:
             assert bytes(await file.read(offset, count)) == expected(offset, count)
@@ -103,7 +102,7 @@ async def test_any_place_of_a_huge_file_can_be_read(profile: str, autojump: Mock
 
 @pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5"])
-async def test_what_ardupilot_cannot_reach_is_an_error(profile: str, autojump: MockClock) -> None:
+async def test_what_ardupilot_cannot_reach_is_an_error(profile: str) -> None:
     """Offsets are signed 32 bits over there (AP_Filesystem::lseek)."""
     async with huge(profile) as file:
         for offset, count in READS:

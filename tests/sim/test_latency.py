@@ -9,7 +9,6 @@ import random
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
@@ -159,9 +158,7 @@ CASES = [
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("profile", "link", "what", "way"), CASES)
-async def test_nobody_waits_long_beside_a_copy(
-    way: str, what: str, profile: str, link: str, autojump: MockClock
-) -> None:
+async def test_nobody_waits_long_beside_a_copy(way: str, what: str, profile: str, link: str) -> None:
     copy = Copy(profile, LINKS[link])
     async with copy.rig.connected() as connection:
         waits = await (copy.waits if way == "download" else copy.waits_beside_upload)(connection, what)
@@ -170,7 +167,7 @@ async def test_nobody_waits_long_beside_a_copy(
 
 
 @pytest.mark.holds("promise 7")
-async def test_nor_beside_a_copy_that_is_interrupted_for_minutes(autojump: MockClock) -> None:
+async def test_nor_beside_a_copy_that_is_interrupted_for_minutes() -> None:
     """The copy never gets more than a window, and must not pass for a light user."""
     copy = Copy("px4-nuttx", NEAR, samples=40)
     async with copy.rig.connected() as connection:
@@ -181,9 +178,7 @@ async def test_nor_beside_a_copy_that_is_interrupted_for_minutes(autojump: MockC
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("link", "what"), [("radio", "ls"), ("far radio", "read")])
 @pytest.mark.parametrize("way", ["download", "upload"])
-async def test_nobody_waits_long_at_a_serial_port(
-    way: str, what: str, link: str, autojump: MockClock
-) -> None:
+async def test_nobody_waits_long_at_a_serial_port(way: str, what: str, link: str) -> None:
     copy = Copy("px4-nuttx", LINKS[link], samples=SAMPLES if link == "radio" else 40, serial=True)
     async with copy.rig.connected() as connection:
         waits = await (copy.waits if way == "download" else copy.waits_beside_upload)(connection, what)
@@ -192,9 +187,7 @@ async def test_nobody_waits_long_at_a_serial_port(
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("profile", "link"), [("px4-nuttx", FAR), ("ardupilot", SLOW)])
-async def test_an_upload_goes_on_beside_endless_small_reads(
-    profile: str, link: LinkSettings, autojump: MockClock
-) -> None:
+async def test_an_upload_goes_on_beside_endless_small_reads(profile: str, link: LinkSettings) -> None:
     """Three readers without a pause: one that used little always waits. The upload once sent nothing."""
     copy = Copy(profile, link)
     root = copy.root

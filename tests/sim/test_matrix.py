@@ -22,7 +22,6 @@ from zlib import crc32
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
@@ -497,18 +496,14 @@ CELLS = [
 
 @pytest.mark.holds("promise 3", "promise 4", "promise 9", "fault power", "fault refused retry")
 @pytest.mark.parametrize(("profile", "operation", "event"), CELLS)
-async def test_all_or_nothing_and_no_lie(
-    profile: str, operation: Call, event: Event, tmp_path: Path, autojump: MockClock
-) -> None:
+async def test_all_or_nothing_and_no_lie(profile: str, operation: Call, event: Event, tmp_path: Path) -> None:
     for count in await sampled(profile, operation, event, tmp_path):
         await meet(profile, operation, event, count, tmp_path / str(count))
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize(("profile", "operation", "event"), CELLS)
-async def test_at_every_request(
-    profile: str, operation: Call, event: Event, tmp_path: Path, autojump: MockClock
-) -> None:
+async def test_at_every_request(profile: str, operation: Call, event: Event, tmp_path: Path) -> None:
     for count in counted(1):
         if len(await meet(profile, operation, event, count, tmp_path / str(count))) < count:
             return

@@ -6,7 +6,6 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
@@ -43,9 +42,7 @@ async def listed(here: Rig) -> Tree:
 
 @pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", RENAMING)
-async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(profile: str) -> None:
     async with rig(profile, {A: b"ours"}) as here:
         tree = await listed(here)
         here.put(B, b"THEIRS")
@@ -57,9 +54,7 @@ async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(
 @pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", RENAMING)
 @pytest.mark.parametrize("was_file", [False, True])
-async def test_nothing_moves_into_what_became_a_directory(
-    profile: str, was_file: bool, autojump: MockClock
-) -> None:
+async def test_nothing_moves_into_what_became_a_directory(profile: str, was_file: bool) -> None:
     async with rig(profile, {A: b"ours"} | ({B: b""} if was_file else {})) as here:
         tree = await listed(here)
         if was_file:
@@ -73,9 +68,7 @@ async def test_nothing_moves_into_what_became_a_directory(
 @pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", EVERY)
 @pytest.mark.parametrize("opened", [False, True])
-async def test_what_became_a_directory_is_not_unlinked(
-    profile: str, opened: bool, autojump: MockClock
-) -> None:
+async def test_what_became_a_directory_is_not_unlinked(profile: str, opened: bool) -> None:
     async with rig(profile, {A: b"ours"}) as here:
         tree = await listed(here)
         file = await tree.open(A) if opened else None
@@ -90,9 +83,7 @@ async def test_what_became_a_directory_is_not_unlinked(
 
 
 @pytest.mark.parametrize("profile", TELLING_CASE)
-async def test_directories_that_differ_by_case_are_two_where_the_card_says_so(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_directories_that_differ_by_case_are_two_where_the_card_says_so(profile: str) -> None:
     """On NuttX those are whose names are long, as one is of small and capital letters."""
     async with rig(profile, {A: b"ours"}) as here:
         here.put_directory(b"/d/test")
@@ -105,7 +96,7 @@ async def test_directories_that_differ_by_case_are_two_where_the_card_says_so(
 
 
 @pytest.mark.parametrize("profile", sorted((set(EVERY) - set(TELLING_CASE)) | NUTTX))
-async def test_they_are_one_elsewhere(profile: str, autojump: MockClock) -> None:
+async def test_they_are_one_elsewhere(profile: str) -> None:
     async with rig(profile, {A: b"ours"}) as here:
         here.put_directory(b"/d/test")
         tree = await listed(here)
@@ -131,7 +122,7 @@ OLD_PAGE, NEW_PAGE = b"old" * 500, b"new" * 400
 
 
 @pytest.mark.parametrize("profile", FATFS)
-async def test_a_new_name_empties_none_that_the_card_takes_for_it(profile: str, autojump: MockClock) -> None:
+async def test_a_new_name_empties_none_that_the_card_takes_for_it(profile: str) -> None:
     async with rig(profile, {ONE: OLD_PAGE, PLAIN: NEW_PAGE}) as here:
         tree = await listed(here)
         with pytest.raises(AlreadyExists):
@@ -144,7 +135,7 @@ async def test_a_new_name_empties_none_that_the_card_takes_for_it(profile: str, 
 
 
 @pytest.mark.parametrize("profile", FATFS)
-async def test_nor_one_that_others_made_meanwhile(profile: str, autojump: MockClock) -> None:
+async def test_nor_one_that_others_made_meanwhile(profile: str) -> None:
     async with rig(profile, {PLAIN: NEW_PAGE}) as here:
         tree = await listed(here)
         file = await tree.create(OTHER, exclusive=True)
@@ -226,9 +217,7 @@ async def append(tree: Tree, path: bytes, data: bytes) -> None:
 @pytest.mark.holds("fault odd listing")
 @pytest.mark.parametrize(("length", "name"), [(118, 40), (119, 40), (200, 198)])
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
-async def test_everything_works_up_to_200_bytes(
-    profile: str, length: int, name: int, autojump: MockClock
-) -> None:
+async def test_everything_works_up_to_200_bytes(profile: str, length: int, name: int) -> None:
     async with rig(profile) as here:
         path, other = long_path(here, length, name=name), long_path(here, length, b"y", name=name)
         here.put_directory(path.rpartition(b"/")[0])
@@ -265,9 +254,7 @@ async def test_everything_works_up_to_200_bytes(
 @pytest.mark.holds("fault odd listing")
 @pytest.mark.parametrize(("length", "name"), [(118, 40), (119, 90), (200, 198)])
 @pytest.mark.parametrize("profile", taking_turns(PROFILES))
-async def test_the_first_change_may_be_an_append(
-    profile: str, length: int, name: int, autojump: MockClock
-) -> None:
+async def test_the_first_change_may_be_an_append(profile: str, length: int, name: int) -> None:
     """What is tried out beforehand needs names of its own."""
     async with rig(profile) as here:
         path = long_path(here, length, name=name)
@@ -277,7 +264,7 @@ async def test_the_first_change_may_be_an_append(
 
 
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
-async def test_a_path_too_long_for_names_beside_it_is_not_written(profile: str, autojump: MockClock) -> None:
+async def test_a_path_too_long_for_names_beside_it_is_not_written(profile: str) -> None:
     async with rig(profile) as here:
         path = long_path(here, 150)
         here.put(path, OLD)
@@ -292,7 +279,7 @@ async def test_a_path_too_long_for_names_beside_it_is_not_written(profile: str, 
 
 @pytest.mark.holds("fault odd listing")
 @pytest.mark.parametrize("profile", EVERY)
-async def test_230_bytes_are_refused_before_anything_is_changed(profile: str, autojump: MockClock) -> None:
+async def test_230_bytes_are_refused_before_anything_is_changed(profile: str) -> None:
     async with rig(profile, {A: NEW}) as here:
         path, new = long_path(here, 230), long_path(here, 230, b"y")
         here.put(path, OLD)
@@ -344,7 +331,7 @@ async def show(tree: Tree) -> None:
 
 @pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("profile", taking_turns(EVERY))
-async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, autojump: MockClock) -> None:
+async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str) -> None:
     """Also before a request has timed out."""
     async with rig(profile) as here:
         tree = await deep(here)
@@ -377,9 +364,7 @@ async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, aut
 
 @pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("profile", taking_turns(EVERY))
-async def test_known_directories_wait_until_the_vehicle_is_lost_and_no_longer(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_known_directories_wait_until_the_vehicle_is_lost_and_no_longer(profile: str) -> None:
     async with rig(profile) as here:
         tree = await deep(here)
         here.link.cut()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
@@ -91,7 +90,7 @@ async def test_what_has_no_size_is_read_to_its_end_over_a_bad_link(profile: str)
             assert profile.startswith("mavsdk")
 
 
-async def test_an_open_reply_without_a_size_is_an_error_at_once(autojump: MockClock) -> None:
+async def test_an_open_reply_without_a_size_is_an_error_at_once() -> None:
     here = Rig("px4", {b"/f": b"hello"}, LinkSettings(delay=0.02))
     async with here.connected() as connection:
         _hide_sizes(connection)
@@ -113,9 +112,7 @@ def _hide_sizes(connection: Connection) -> None:
     connection.engine.receive = hiding  # type: ignore[method-assign]
 
 
-async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_turn(
-    autojump: MockClock,
-) -> None:
+async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_turn() -> None:
     here = Rig("ardupilot", link=LinkSettings(delay=0.02))
     async with here.connected() as connection:
         here.link.cut()
@@ -135,7 +132,7 @@ async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_tu
 
 
 @pytest.mark.holds("rule 14.31")
-async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: MockClock) -> None:
+async def test_a_long_listing_with_times_is_not_taken_for_silence() -> None:
     here = Rig("mavsdk", link=LinkSettings(rate=5760.0, delay=0.1))
     for index in range(200):
         here.card.add(b"/d/file%03d" % index, b"x")
@@ -151,7 +148,7 @@ async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: Mock
 
 @pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, autojump: MockClock) -> None:
+async def test_a_whole_read_beside_another_client_is_not_believed(profile: str) -> None:
     """Servers share session ids, and of an `@` file no checksum can prove the bytes. It is read once more,
     when the other client is done."""
     here = Rig(profile, link=LinkSettings(rate=5000.0, delay=0.02))
@@ -185,7 +182,7 @@ LOADS = request(0, Opcode.READ_FILE, session=0, size=239)
     [("px4", BROWSES), ("ardupilot", BROWSES), ("mavsdk", BROWSES), ("ardupilot5", LOADS)],
 )
 async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
-    profile: str, asks: Payload, autojump: MockClock
+    profile: str, asks: Payload
 ) -> None:
     """A ground station that shows directories all the time, or reads in a session of its own."""
     here = Rig(
@@ -222,7 +219,7 @@ async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
 
 @pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: MockClock) -> None:
+async def test_a_whole_read_survives_a_lost_session(profile: str) -> None:
     here = Rig(profile, link=LinkSettings(rate=5000.0, delay=0.02))
     data = content(20_000, 2)
     here.card.add(b"/f", data)
@@ -244,7 +241,7 @@ async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: Mock
 
 @pytest.mark.parametrize(("pause", "doubted"), [(2.0, True), (11.0, False)])
 async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
-    pause: float, doubted: bool, autojump: MockClock
+    pause: float, doubted: bool
 ) -> None:
     here = Rig("px4", {b"/f": b"hello"}, LinkSettings(delay=0.02))
     async with here.connected() as connection:
@@ -267,7 +264,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
 
 
 @pytest.mark.holds("rule 14.31")
-async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
+async def test_times_that_could_not_be_asked_for_are_not_refused() -> None:
     """While a stale session is waited out nobody may speak: that is our silence, not the server's."""
     here = Rig("ardupilot5", {b"/d/f": b"x"}, LinkSettings(delay=0.02))
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -286,7 +283,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
 
 @pytest.mark.holds("rule 14.15")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> None:
+async def test_bursts_through_the_caches(profile: str) -> None:
     """Whole, in the middle, behind what is there, and two files in turns, over a bad link."""
     here = Rig(
         profile, link=LinkSettings(rate=200_000.0, delay=0.02, loss=0.02, duplicate=0.01, reorder=0.02)
@@ -318,9 +315,7 @@ async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> N
 
 @pytest.mark.holds("rule 14.18")
 @pytest.mark.parametrize("profile", ["mavsdk", "px4", "px4-nuttx"])
-async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(profile: str) -> None:
     """One burst after the other left no room for the answer in a short queue, and nothing was asked again."""
     radio = LinkSettings(rate=5760.0, delay=0.025, duplex=Duplex.HALF, queue=2048)
     data = content(150_000)
@@ -340,9 +335,7 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
 
 
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
-async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(profile: str) -> None:
     """He takes it in mid-read, is heard a little later, and leaves."""
     here = Rig(profile, link=LinkSettings(rate=100_000.0, delay=0.02))
     root = ROOTS.get(profile, b"")

@@ -10,7 +10,6 @@ from contextlib import asynccontextmanager
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.protocol.payload import Opcode
@@ -81,7 +80,7 @@ async def read_head(handle: OpenFile) -> None:
 
 
 @pytest.mark.parametrize("profile", TIMED)
-async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, autojump: MockClock) -> None:
+async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str) -> None:
     """A vehicle may answer before it tells its boot time, and what is left may come in between."""
     async with opened(profile, SLOW) as (here, tree, handle), trio.open_nursery() as nursery:
         blocks = handle._handle._version  # type: ignore[attr-defined]
@@ -109,9 +108,7 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
 @pytest.mark.parametrize(
     ("profile", "size"), [("mavsdk", 120_000), ("ardupilot5", 100_000), ("px4", 160_000), ("px4", None)]
 )
-async def test_a_copy_over_a_reboot_is_of_one_version(
-    profile: str, size: int | None, unasked: bool, autojump: MockClock
-) -> None:
+async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int | None, unasked: bool) -> None:
     """size: of the successor; None = the file stays. unasked: the vehicle tells its boot time so. Where
     listings tell no times, nothing but the size tells a successor."""
     async with mounted(profile, SLOW) as (here, tree), trio.open_nursery() as nursery:
@@ -138,9 +135,7 @@ async def test_a_copy_over_a_reboot_is_of_one_version(
 
 @pytest.mark.parametrize("profile", TIMED)
 @pytest.mark.parametrize("closed", [False, True])
-async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
-    profile: str, closed: bool, autojump: MockClock
-) -> None:
+async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(profile: str, closed: bool) -> None:
     """closed: the program closed the file after it got the head, which is cached."""
     async with opened(profile) as (here, tree, handle):
         await read_head(handle)
@@ -153,7 +148,7 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
 
 
 @pytest.mark.parametrize("profile", TIMED)
-async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockClock) -> None:
+async def test_what_nobody_got_yet_is_read_anew(profile: str) -> None:
     async with opened(profile) as (here, _, handle):
         blocks = handle._handle._version  # type: ignore[attr-defined]
         with trio.move_on_after(0.01):  # a read that is given up
@@ -169,7 +164,7 @@ async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockCloc
 
 @pytest.mark.parametrize("grown", [False, True])
 @pytest.mark.parametrize("profile", EVERY)
-async def test_the_same_file_is_read_on(profile: str, grown: bool, autojump: MockClock) -> None:
+async def test_the_same_file_is_read_on(profile: str, grown: bool) -> None:
     """One that grew, to its opened size. Where listings tell no times none is asked for."""
     async with opened(profile) as (here, tree, handle):
         sweeps = tree.status()["listings_asked"]
@@ -236,9 +231,7 @@ async def cut(here: Rig, tree: Tree, writer: OpenFile) -> None:
 
 @pytest.mark.parametrize("change", [read_and_write, write_only, write_late, write_again, write_and_list, cut])
 @pytest.mark.parametrize("profile", TIMED)
-async def test_a_change_of_the_old_file_does_not_go_into_its_successor(
-    profile: str, change: object, autojump: MockClock
-) -> None:
+async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: str, change: object) -> None:
     """What is written whole does."""
     async with mounted(profile) as (here, tree):
         writer = await tree.open(PATH, write=True)
@@ -254,9 +247,7 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(
 
 
 @pytest.mark.parametrize("successor", [SUCCESSOR, OLD + b"more"], ids=["as long", "grown"])
-async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
-    successor: bytes, autojump: MockClock
-) -> None:
+async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(successor: bytes) -> None:
     async with mounted("mavsdk") as (here, tree):
         faults = here.faults
         writer = await tree.open(PATH, write=True)
@@ -270,9 +261,7 @@ async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
 
 
 @pytest.mark.parametrize("profile", TIMED)
-async def test_what_was_written_is_not_read_among_bytes_of_a_successor(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_what_was_written_is_not_read_among_bytes_of_a_successor(profile: str) -> None:
     """The rest of the file is opened anew after its delivery."""
     async with mounted(profile) as (here, tree):
         writer = await tree.open(PATH, write=True)
@@ -289,9 +278,7 @@ async def test_what_was_written_is_not_read_among_bytes_of_a_successor(
 
 
 @pytest.mark.parametrize("profile", TIMED)
-async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(profile: str) -> None:
     """All of it is held here, but of two sessions of the server, which were not compared yet."""
     async with mounted(profile) as (here, tree):
         reader = await tree.open(PATH)
@@ -309,7 +296,7 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
         await reader.release()
 
 
-async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> None:
+async def test_the_end_of_a_copy_by_turns_is_compared() -> None:
     """Between two comparisons bytes go out unproven, but for the last."""
     async with opened("ardupilot5") as (here, _, handle):
         await read_head(handle)
@@ -320,7 +307,7 @@ async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> No
 
 
 @pytest.mark.parametrize("profile", TIMED)
-async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: MockClock) -> None:
+async def test_turns_of_two_readers_cost_few_listings(profile: str) -> None:
     async with mounted(profile) as (here, tree):
         here.put(b"/second", OLD, THEN)
         here.put(b"/third", OLD, THEN)

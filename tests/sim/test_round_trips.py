@@ -7,7 +7,6 @@ from functools import partial
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.model import split
@@ -25,7 +24,7 @@ READY = 0.1
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-async def test_a_directory_is_listed_in_two_round_trips(profile: str, autojump_clock: MockClock) -> None:
+async def test_a_directory_is_listed_in_two_round_trips(profile: str) -> None:
     """The names, and that there are no more of them: two requests."""
     here = Rig(profile, link=LONG)
     directory = ROOTS.get(profile, b"") + b"/d"
@@ -70,9 +69,7 @@ FIRST_WINDOWS = {"px4": 8, "px4-nuttx": 1, "ardupilot": 4, "ardupilot5": 4, "lit
     ("profile", "chunks"),
     [(profile, chunks) for profile, most in FIRST_WINDOWS.items() for chunks in sorted({1, most})],
 )
-async def test_a_small_file_is_written_and_proven_in_five_round_trips(
-    profile: str, chunks: int, autojump_clock: MockClock
-) -> None:
+async def test_a_small_file_is_written_and_proven_in_five_round_trips(profile: str, chunks: int) -> None:
     """CreateFile, its bytes, Terminate, the CRC32 together with a look whether the name is free, and the
     rename; no matter how full the window is. The first two files also find out what the card can."""
     data = bytes(range(239)) * chunks
@@ -91,9 +88,7 @@ async def test_a_small_file_is_written_and_proven_in_five_round_trips(
 
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "mavsdk"])
-async def test_the_first_large_file_costs_two_round_trips_more(
-    profile: str, autojump_clock: MockClock
-) -> None:
+async def test_the_first_large_file_costs_two_round_trips_more(profile: str) -> None:
     """An empty file is made and closed; that it is renamed and removed costs no round trip of its own."""
     here = Rig(profile, {b"/d": None}, LONG)
     took: list[float] = []
@@ -155,7 +150,7 @@ async def first_steps(profile: str, victim: int) -> tuple[float, int]:
 
 @pytest.mark.holds("rule 14.38")
 @pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
-async def test_no_one_loss_costs_a_second(profile: str, autojump: MockClock) -> None:
+async def test_no_one_loss_costs_a_second(profile: str) -> None:
     """The very first listing, of a server of which no round trip was known, was asked for again after 1 s."""
     usual, frames = await first_steps(profile, -1)
     assert frames > 6
@@ -183,16 +178,14 @@ async def upload(profile: str, victim: int) -> float:
 
 @pytest.mark.holds("rule 14.38")
 @pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
-async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(profile: str) -> None:
     """Question or answer. It was asked for again after 6.3 s, where the whole copy takes one or two."""
     usual = await upload(profile, -1)
     for victim in (0, 1):
         assert await upload(profile, victim) - usual <= 1.0
 
 
-async def test_changing_many_names_of_a_long_directory_seldom_lists_it(autojump: MockClock) -> None:
+async def test_changing_many_names_of_a_long_directory_seldom_lists_it() -> None:
     """Over a slow link each rename, and every seventh removal, listed the directory: five seconds each."""
     count = 100
     here = Rig("px4", {b"/d/a_file_with_a_long_name_%d" % number: b"x" for number in range(count)}, LONG)
@@ -225,7 +218,7 @@ class Swallowing(LinkModel):
 
 @pytest.mark.holds("rule 14.38")
 @pytest.mark.parametrize("profile", PROFILES)
-async def test_a_parser_that_lost_the_thread_costs_no_second(profile: str, autojump: MockClock) -> None:
+async def test_a_parser_that_lost_the_thread_costs_no_second(profile: str) -> None:
     """A dozen short frames had to be lost on it, of which the last came every 3 s."""
     here = Rig(profile, {b"/d/f": content(100), b"/d/g": content(100)}, WIFI)
     here.link = MemoryLink(here.vehicle, model := Swallowing())

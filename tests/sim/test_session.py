@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
@@ -39,7 +38,7 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_small_file_costs_open_transfer_terminate(profile: str, autojump: MockClock) -> None:
+async def test_a_small_file_costs_open_transfer_terminate(profile: str) -> None:
     here = Rig(profile, {b"/d/small": b"hello"})
     async with here.connected() as connection:
         assert await read_file(connection, path(profile, "small")) == b"hello"
@@ -54,7 +53,7 @@ async def test_a_small_file_costs_open_transfer_terminate(profile: str, autojump
 
 @pytest.mark.holds("rule 14.7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_several_files_at_once_share_the_session(profile: str, autojump: MockClock) -> None:
+async def test_several_files_at_once_share_the_session(profile: str) -> None:
     files = {b"/d/f%d" % index: content(20_000, index) for index in range(5)}
     here = Rig(profile, files, BAD)
     got: dict[bytes, bytes] = {}
@@ -75,9 +74,7 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(profile: str) -> None:
     """It may be asked for before the task with the session has seen that nothing is left to do."""
     rtt, step, steps = 0.1, 239, 60
     here = Rig(profile, {b"/d/f": content(steps * step)}, LinkSettings(rate=1e6, delay=rtt / 2))
@@ -93,7 +90,7 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, autojump: MockClock) -> None:
+async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str) -> None:
     small = {b"/d/s%d" % index: bytes([index]) * 100 for index in range(200)}
     here = Rig(profile, {b"/d/big": content(1_200_000), **small}, LinkSettings(rate=60_000.0, delay=0.015))
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -115,7 +112,7 @@ async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, a
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autojump: MockClock) -> None:
+async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str) -> None:
     here = Rig(profile, {b"/d/small": b"hello"})
     async with here.connected() as connection:
         await trio.sleep(8)
@@ -133,7 +130,7 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
 
 @pytest.mark.holds("fault stale session", "rule 14.10")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
+async def test_a_session_left_by_a_killed_client_is_got_over(profile: str) -> None:
     data = content(50_000)
     here = Rig(profile, {b"/d/big": data}, LinkSettings(rate=100_000.0, delay=0.02))
     with trio.CancelScope():
@@ -146,7 +143,7 @@ async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autoj
         assert connection.engine.stats.by_opcode[Opcode.RESET_SESSIONS] == 0
 
 
-async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: MockClock) -> None:
+async def test_a_close_that_goes_unheard_does_not_fail_the_next_open() -> None:
     here = Rig("px4", {b"/d/first": b"one", b"/d/second": b"two"}, LinkSettings(delay=0.01))
     async with here.connected() as connection:
         assert await read_file(connection, path("px4", "first")) == b"one"
@@ -162,7 +159,7 @@ async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: M
 
 
 @pytest.mark.holds("promise 4", "rule 14.36")
-async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockClock) -> None:
+async def test_silence_fails_one_request_and_then_all_at_once() -> None:
     here = Rig("px4", {b"/d/small": b"hello"})
     async with here.connected() as connection:
         here.link.cut()
@@ -182,7 +179,7 @@ async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockCloc
         assert await read_file(connection, b"/d/small") == b"hello"
 
 
-async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
+async def test_no_vehicle_says_what_was_heard() -> None:
     here = Rig("px4", {b"/d": None})
     with pytest.raises(VehicleLost, match=r"heard only 1/1 \(PX4 quadrotor, disarmed\); check target_system"):
         async with here.connected(ConnectOptions(target_system=9)):
@@ -195,9 +192,7 @@ ROUNDS = 10_000
 
 
 @pytest.mark.holds("fault overlap")
-async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     here = Rig("px4", {b"/big": content(20_000), b"/changing": b"old"}, LinkSettings(rate=5760.0, delay=0.02))
     rounds = 0
     choose = Scheduler.first
@@ -219,9 +214,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(profile: str) -> None:
     """In the queue, between its call and its first step, while it opens, reads or closes."""
     here = Rig(profile, {b"/d/f": content(3000), b"/d/g": b"g"}, LinkSettings(delay=0.02))
     async with here.connected() as connection:
@@ -237,7 +230,7 @@ async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(
         assert here.server.open_sessions == 0
 
 
-async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn(autojump: MockClock) -> None:
+async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> None:
     """It would wait for itself: a change waits until the session is off its path."""
     here = Rig("px4", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
@@ -252,9 +245,7 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn(autoju
 
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
-async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
-    autojump: MockClock, profile: str
-) -> None:
+async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(profile: str) -> None:
     """Another file is open and has to be closed first; once more, where the answer to that is lost."""
     old, new = content(5000, 1), content(5000, 2)
     for lost in (False, True):
@@ -336,7 +327,7 @@ def rival_asks(here: Rig, opcode: Opcode, data: bytes = b"", *, seq: int, heard:
 
 
 @pytest.mark.holds("fault stale session", "rule 14.10")
-async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: MockClock) -> None:
+async def test_a_killed_clients_session_is_got_over_by_saying_nothing() -> None:
     """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
     here = Rig("ardupilot", {b"/d/f": DATA, b"/d/stale": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -374,7 +365,7 @@ ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
 
 @pytest.mark.holds("promise 6", "rule 14.39")
 @pytest.mark.parametrize("profile", ONE_SESSION)
-async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
+async def test_another_clients_session_is_left_alone(profile: str) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -402,9 +393,7 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ONE_SESSION)
 @pytest.mark.parametrize("closes", [True, False])
-async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(
-    closes: bool, profile: str, autojump: MockClock
-) -> None:
+async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(closes: bool, profile: str) -> None:
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection:
         log = Log(here)
@@ -423,9 +412,7 @@ async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ONE_SESSION)
 @pytest.mark.parametrize("reads", [True, False])
-async def test_another_clients_open_of_nothing_leaves_what_was_open(
-    reads: bool, profile: str, autojump: MockClock
-) -> None:
+async def test_another_clients_open_of_nothing_leaves_what_was_open(reads: bool, profile: str) -> None:
     """Programs ask so whether a name is free: nobody waits for them, but for the file that they read."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection:
@@ -442,9 +429,7 @@ async def test_another_clients_open_of_nothing_leaves_what_was_open(
 @pytest.mark.holds("promise 1", "promise 6")
 @pytest.mark.parametrize("ours", ["reading", "writing"])
 @pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
-async def test_a_session_that_another_client_took_is_its_own(
-    profile: str, ours: str, autojump: MockClock
-) -> None:
+async def test_a_session_that_another_client_took_is_its_own(profile: str, ours: str) -> None:
     """Only what was on its way goes into its file, which stays open, and ours is whole in the end."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, SLOW)
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -468,9 +453,7 @@ async def test_a_session_that_another_client_took_is_its_own(
 
 @pytest.mark.holds("rule 14.9")
 @pytest.mark.parametrize("outage", [3.2, 6.0])
-async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_again(
-    outage: float, autojump: MockClock
-) -> None:
+async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_again(outage: float) -> None:
     """Meanwhile the session of a PX4, which all share, may have become another client's."""
     here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, SLOW)
     async with here.connected() as connection:
@@ -489,7 +472,7 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
 
 
 @pytest.mark.holds("fault idle close")
-async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump: MockClock) -> None:
+async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end() -> None:
     here = Rig("px4", {b"/d/f": DATA}, LINK)
 
     def close_at_once(opcode: int) -> None:
@@ -505,9 +488,7 @@ async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump:
 
 @pytest.mark.holds("promise 5", "fault idle close")
 @pytest.mark.parametrize(("profile", "outage"), [("px4", 12.0), ("ardupilot5", 23.0)])
-async def test_a_server_that_closed_an_idle_session_during_an_outage(
-    profile: str, outage: float, autojump: MockClock
-) -> None:
+async def test_a_server_that_closed_an_idle_session_during_an_outage(profile: str, outage: float) -> None:
     here = Rig(profile, {b"/d/f": DATA}, SLOW)
     async with here.connected() as connection:
         log = Log(here)
@@ -526,9 +507,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(
 @pytest.mark.holds("rule 14.12", "fault growing file")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 @pytest.mark.parametrize("shrinks", [False, True])
-async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
-    shrinks: bool, profile: str, autojump: MockClock
-) -> None:
+async def test_a_session_is_closed_within_two_seconds_of_its_last_use(shrinks: bool, profile: str) -> None:
     """It is opened again for more. What is smaller then is another file."""
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
@@ -559,9 +538,7 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
 
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(profile: str) -> None:
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         log = Log(here)
@@ -577,7 +554,7 @@ async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(
 
 
 @pytest.mark.holds("rule 14.31")
-async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
+async def test_two_silences_prove_that_listings_show_no_times() -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
     here = Rig("mavsdk-old", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
@@ -594,7 +571,7 @@ async def test_two_silences_prove_that_listings_show_no_times(autojump: MockCloc
 
 
 @pytest.mark.holds("rule 14.31")
-async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None:
+async def test_an_answer_after_one_silence_is_taken() -> None:
     here = Rig("ardupilot5", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         here.link.cut()
@@ -634,7 +611,7 @@ async def open_elsewhere(connection: Connection) -> None:
     )
 
 
-async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:
+async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often() -> None:
     here = ardupilot()
     options = ConnectOptions(op_deadline=20.0)
     async with here.connected(options) as connection, trio.open_nursery() as nursery:
@@ -654,7 +631,7 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autoj
         nursery.cancel_scope.cancel()
 
 
-async def test_a_change_outlasts_it_too(autojump_clock: MockClock) -> None:
+async def test_a_change_outlasts_it_too() -> None:
     here = ardupilot()
     async with here.connected() as connection:
         await open_elsewhere(connection)

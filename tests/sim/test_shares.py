@@ -240,9 +240,7 @@ def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
 
 @pytest.mark.holds("rule 14.24")
 @pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5", "littlefs"])
-async def test_never_more_is_written_than_a_short_queue_holds(
-    profile: str, autojump_clock: MockClock
-) -> None:
+async def test_never_more_is_written_than_a_short_queue_holds(profile: str) -> None:
     here = Rig(profile, link=LinkSettings(rate=1e6, delay=0.005))
     here.card.add_directory(b"/d")
     source = MemorySource(bytes(range(256)) * 400)
@@ -255,7 +253,7 @@ async def test_never_more_is_written_than_a_short_queue_holds(
     assert connection.engine.stats.retransmissions == 0
 
 
-async def test_a_slow_link_that_becomes_fast_is_used(autojump: MockClock) -> None:
+async def test_a_slow_link_that_becomes_fast_is_used() -> None:
     """The pace of a radio is kept while that is the way; then the cable is plugged in."""
     size = 3_000_000
     here = Rig("px4", {b"/d/f": content(size, 1)}, LinkSettings(rate=5760.0, delay=0.05))
@@ -272,7 +270,7 @@ async def test_a_slow_link_that_becomes_fast_is_used(autojump: MockClock) -> Non
 
 
 @pytest.mark.soak
-async def test_a_way_that_becomes_longer_for_good_is_found_out(autojump: MockClock) -> None:
+async def test_a_way_that_becomes_longer_for_good_is_found_out() -> None:
     """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
     away."""
     loss, size = 0.02, 8 << 20

@@ -7,7 +7,6 @@ from functools import partial
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.delivery import SENT_TWICE
 from mavftpfs.link.messages import Address
@@ -28,9 +27,7 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 
 
 @pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
-async def test_little_of_the_first_large_file_is_sent_twice_where_the_card_cannot_rename(
-    size: int, autojump: MockClock
-) -> None:
+async def test_little_of_the_first_large_file_is_sent_twice_where_the_card_cannot_rename(size: int) -> None:
     """It begins while the refusal of the trial is on its way: that is one round trip, whatever its size."""
     here = Rig("littlefs", {b"/d": None})
     target, data = path("littlefs", "new"), content(size)
@@ -82,9 +79,7 @@ INTERRUPTIONS: dict[str, Callable[[Rig, Connection], Awaitable[None]]] = {
 @pytest.mark.parametrize("interruption", INTERRUPTIONS)
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_interrupts_it_is_bridged(
-    profile: str, probed: bool, interruption: str, autojump: MockClock
-) -> None:
+async def test_what_interrupts_it_is_bridged(profile: str, probed: bool, interruption: str) -> None:
     data = content(60_000)
     here = Rig(profile, {b"/d": None}, PLAIN)
     async with here.connected() as connection:
@@ -105,9 +100,7 @@ async def test_what_interrupts_it_is_bridged(
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
-    profile: str, autojump: MockClock
-) -> None:
+async def test_what_was_opened_before_the_news_of_a_restart_is_closed(profile: str) -> None:
     """The upload goes on at once, in a session that is forgotten when the boot time tells of the restart."""
     data = content(80_000)
     here = Rig(profile, {b"/d": None}, PLAIN)
@@ -123,7 +116,7 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
     assert here.server.open_sessions == 0
 
 
-async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(autojump: MockClock) -> None:
+async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session() -> None:
     """PX4 says NAK 2 with errno 0 to a write whose session another ground station reset meanwhile."""
     data = content(60_000)
     here = Rig("px4", {b"/d": None}, PLAIN)
@@ -151,7 +144,7 @@ async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(aut
 
 @pytest.mark.holds("rule 14.23")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
+async def test_a_full_card_is_told(profile: str) -> None:
     here = Rig(profile, {b"/d": None}, PLAIN)
     here.card.capacity = 5_000
     faults = here.faults
@@ -188,7 +181,7 @@ class FailingSource(MemorySource):
 @pytest.mark.parametrize("bad", [0, 5_000])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
-    profile: str, bad: int, probed: bool, autojump: MockClock
+    profile: str, bad: int, probed: bool
 ) -> None:
     here = Rig(profile, {b"/d/other": b"of another file"}, PLAIN)
     async with here.connected() as connection:
@@ -214,7 +207,7 @@ async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
 
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump: MockClock) -> None:
+async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
     data = content(60_000)
     here = Rig(profile, {b"/d": None}, PLAIN)
     async with here.connected() as connection:
@@ -269,9 +262,7 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
 
 @pytest.mark.parametrize("more", [b"", b"more"])
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
-async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
-    profile: str, more: bytes, autojump: MockClock
-) -> None:
+async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: str, more: bytes) -> None:
     """Nothing was under way just then, and nothing is sent before it is known who is at the other end."""
     here = Rig(profile, {b"/d": None}, PLAIN)
     here.link.is_stream = True
@@ -294,7 +285,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
             await upload.finish()
 
 
-async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
+async def test_an_error_at_close_is_the_callers() -> None:
     """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
     here = Rig("ardupilot5", {b"/d": None}, PLAIN)
     faults = here.faults
@@ -322,7 +313,7 @@ async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
     assert here.card.data(b"/d/new") == bytes(source.content)
 
 
-async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: MockClock) -> None:
+async def test_a_long_upload_proves_what_it_has_from_time_to_time() -> None:
     data = content(200_000)
     here = Rig("px4", {b"/d": None}, LinkSettings(rate=1_000.0, delay=0.05))
     async with here.connected() as connection:
@@ -336,7 +327,7 @@ async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: Mock
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-async def test_with_another_client_about_silence_is_not_survived(probed: bool, autojump: MockClock) -> None:
+async def test_with_another_client_about_silence_is_not_survived(probed: bool) -> None:
     """After a gap the one session may be the other client's: writing on would damage its file."""
     data = content(60_000)
     here = Rig("mavsdk", {b"/d": None}, PLAIN)
@@ -358,7 +349,7 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool, a
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, autojump: MockClock) -> None:
+async def test_a_server_that_always_loses_the_session_is_given_up(profile: str) -> None:
     """A write that is refused wherever it is tried ends in its refusal, after few attempts."""
     here = Rig(profile, {b"/d": None}, PLAIN)
     faults = here.faults
@@ -383,9 +374,7 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_finish_again_after_success_sends_only_what_is_new(
-    profile: str, probed: bool, autojump: MockClock
-) -> None:
+async def test_finish_again_after_success_sends_only_what_is_new(profile: str, probed: bool) -> None:
     """Unless opening the file anew empties it, as is found out then at the latest."""
     here = Rig(profile, {b"/d": None}, PLAIN)
     faults, empties = here.faults, PROFILES[profile].write_only_truncates
@@ -412,7 +401,7 @@ async def test_finish_again_after_success_sends_only_what_is_new(
     assert here.server.open_sessions == 0
 
 
-async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock) -> None:
+async def test_each_finish_waits_for_what_it_was_called_for() -> None:
     """Bytes that come while another caller's Terminate is under way are not covered by it."""
     here = Rig("px4", {b"/d": None}, LinkSettings(rate=60_000.0, delay=0.3))
     faults = here.faults
@@ -436,7 +425,7 @@ async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock)
     assert here.card.data(b"/d/new") == b"first second"
 
 
-async def test_nothing_is_created_before_there_is_something(autojump: MockClock) -> None:
+async def test_nothing_is_created_before_there_is_something() -> None:
     here = Rig("px4", {b"/d": None})
     async with here.connected() as connection:
         source = MemorySource()
@@ -447,7 +436,7 @@ async def test_nothing_is_created_before_there_is_something(autojump: MockClock)
         assert here.card.data(b"/d/new") == b""
 
 
-async def test_a_file_that_shrank_between_two_openings_is_sent_again(autojump: MockClock) -> None:
+async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
     here = Rig("px4", {b"/d": None}, PLAIN)
     async with here.connected() as connection:
         know(connection, "px4")
@@ -463,7 +452,7 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again(autojump: M
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, autojump: MockClock) -> None:
+async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) -> None:
     here = Rig("px4", {b"/d": None}, PLAIN)
     faults = here.faults
     async with here.connected() as connection:
@@ -478,7 +467,7 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, au
         assert source.all_proven
 
 
-async def test_a_terminate_done_twice_is_done(autojump: MockClock) -> None:
+async def test_a_terminate_done_twice_is_done() -> None:
     """The first one's reply is lost, and a listing in between ends PX4's replay: NAK 4 to the second."""
     here = Rig("px4", {b"/d": None}, PLAIN)
     faults = here.faults
@@ -499,7 +488,7 @@ async def test_a_terminate_done_twice_is_done(autojump: MockClock) -> None:
         assert source.all_proven
 
 
-async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
+async def test_only_what_was_not_proven_goes_again() -> None:
     here = Rig("px4", {b"/d": None}, PLAIN)
     faults = here.faults
     async with here.connected() as connection:
@@ -522,9 +511,7 @@ async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
 
 @pytest.mark.parametrize("pause", [0.02, 1.0], ids=["while it is opened", "while it is sent"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_abort_leaves_nothing_open_and_asks_for_nothing(
-    profile: str, pause: float, autojump: MockClock
-) -> None:
+async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, pause: float) -> None:
     here = Rig(profile, {b"/d": None}, PLAIN)
     async with here.connected() as connection:
         source = MemorySource(content(60_000))
@@ -544,7 +531,7 @@ async def test_abort_leaves_nothing_open_and_asks_for_nothing(
 @pytest.mark.parametrize("leaves", [False, True])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_who_stops_waiting_does_not_stop_the_upload_and_who_leaves_terminates_it(
-    profile: str, leaves: bool, autojump: MockClock
+    profile: str, leaves: bool
 ) -> None:
     data = content(40_000)
     here = Rig(profile, {b"/d": None}, PLAIN)
