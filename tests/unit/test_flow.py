@@ -186,6 +186,17 @@ def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
     assert flow._reserve() < 0.5 * usual
 
 
+def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
+    flow = Flow()
+    path = Path(flow, rate=400.0, base=0.1)
+    path.rounds(40)
+    flow.on_starved()
+    path.now += 0.3
+    path.rounds(3)
+    assert beyond(flow, path.now) <= 0
+    assert flow.starved or flow.pause == 0.0
+
+
 def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
     flow, path = paused()
     path.rounds(10)
