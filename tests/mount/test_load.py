@@ -49,7 +49,7 @@ def test_ls_overtakes_a_large_copy(field: Field, tmp_path: Path, kind: str) -> N
     vehicle: UdpVehicle = field.mavsdk(card) if kind == "mavsdk-server" else field.sim(card, kind, link)
     mount = field.mount(vehicle.source)
     fresh, beside = iter(range(FRESH_DIRECTORIES)), 0
-    for attempt in range(COPIES_AT_MOST):  # whoever is kept from working for seconds needs a second one
+    for attempt in range(COPIES_AT_MOST):  # a program kept from working for seconds needs a second one
         with mount.started("cp", mount.path / f"large{attempt}.bin", tmp_path / "copy") as copy:
             for number in fresh:
                 time.sleep(0.1)

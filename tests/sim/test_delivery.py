@@ -564,7 +564,7 @@ async def test_bytes_travel_while_the_program_still_writes(here: Rig) -> None:
         await trio.sleep(10)
     await file.release()
     assert here.data(FRESH) == bytes(50_000) + b"again 2" + bytes(49_993)
-    assert here.count(Opcode.CREATE_FILE) <= 3, "who changes what was sent does so again: by the close"
+    assert here.count(Opcode.CREATE_FILE) <= 3, "a file whose sent bytes change is sent by the close"
 
 
 SLOW = LinkSettings(rate=20_000.0, delay=0.02)

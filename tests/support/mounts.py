@@ -83,7 +83,7 @@ def _is_served(path: Path) -> bool:
 
 
 def abort_mount(path: Path) -> None:
-    """Free whoever waits in the mount, and take it away; harmless if nothing is mounted."""
+    """Free the programs that wait in the mount, and take it away; harmless if nothing is mounted."""
     for command in (["umount", "-f"], ["umount", "-l"], ["fusermount3", "-uz"]):
         if mounted_at(path):
             subprocess.run([*command, str(path)], capture_output=True, timeout=20, check=False)
