@@ -270,25 +270,31 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
     assert lines[0] == f"{mounts.path}: 2 vehicles of {fleet.source}"
 
 
-def test_a_busy_one_refuses_the_unmount_of_all(fleet: Fleet) -> None:
-    fleet.launch(1)
+def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Fleet) -> None:
+    for system in (1, 2):
+        fleet.launch(system)
     mounts = mount_all(fleet)
-    mounts.await_up("1")
+    mounts.await_up("1", "2")
+    nothing_can_be_made_beside_the_vehicles(mounts)
     with mounts.started("sleep", "100", cwd=mounts.path / "1") as holder:
         said = mavftpfs("umount", mounts.path, code=3)[1]
         assert "in use" in said
         assert mounted_at(mounts.path / "1")
         holder.kill()
-    assert mounts.unmount() == 0
-
-
-def test_a_signal_ends_all(fleet: Fleet) -> None:
-    for system in (1, 2):
-        fleet.launch(system)
-    mounts = mount_all(fleet)
-    mounts.await_up("1", "2")
     assert mounts.end_by(signal.SIGTERM) == 0
     assert not mounted_at(mounts.path)
+
+
+def nothing_can_be_made_beside_the_vehicles(mounts: Mounts) -> None:
+    """Check what the directory of the vehicles refuses."""
+    for code in (
+        "os.mkdir(sys.argv[1] + '/new')",
+        "open(sys.argv[1] + '/new', 'w')",
+        "os.symlink('x', sys.argv[1] + '/new')",
+        "os.rename(sys.argv[1] + '/1', sys.argv[1] + '/2')",
+    ):
+        assert mounts.errno_of(code, mounts.path) in ("EROFS", "EBUSY")
+    assert mounts.run("df", mounts.path).stdout
 
 
 def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
@@ -316,20 +322,6 @@ def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
         stop.set()
         thread.join()
     assert "give each a system id of its own" in mounts.alive().text()
-
-
-def test_nothing_can_be_made_beside_the_vehicles(fleet: Fleet) -> None:
-    fleet.launch(1)
-    mounts = mount_all(fleet)
-    mounts.await_up("1")
-    for code in (
-        "os.mkdir(sys.argv[1] + '/new')",
-        "open(sys.argv[1] + '/new', 'w')",
-        "os.symlink('x', sys.argv[1] + '/new')",
-        "os.rename(sys.argv[1] + '/1', sys.argv[1] + '/2')",
-    ):
-        assert mounts.errno_of(code, mounts.path) in ("EROFS", "EBUSY")
-    assert mounts.run("df", mounts.path).stdout
 
 
 def test_all_and_a_target_exclude_each_other(fleet: Fleet) -> None:

@@ -52,10 +52,21 @@ def reads_right(mount: Mount, root: Path) -> bool:
     return mount.read_bytes(mount.path / "log.bin") == (root / "log.bin").read_bytes()
 
 
-def test_two_mounts_and_a_command_share_a_port_that_nobody_configured(field: Field) -> None:
+def knock_and_leave(source: str) -> None:
+    """Want the port as a program does that ends before it is let in."""
+    hello = {"protocol": PROTOCOL, "join": source, "own": [254, 191], "forward": []}
+    sock = knock(port_name(parse_source(source)))
+    assert sock is not None
+    sock.send(pack_facts(hello))
+    sock.close()
+
+
+def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Field) -> None:
     cards, source = two_vehicles(field)
     one = field.mount(source, "target_system=1")
     assert hub_of(source) is None, "a mount alone has its port itself"
+    found = json.loads(command(one, "scan", "--json", source))
+    assert {entry["system"] for entry in found if entry["answers"]} == {1, 2}
     two = field.mount(source, "target_system=2")
     listed = command(one, "ls", source, "/", "-o", "target_system=2")
     assert "log.bin" in listed
@@ -65,16 +76,17 @@ def test_two_mounts_and_a_command_share_a_port_that_nobody_configured(field: Fie
         assert reads_right(mount, root)
         mount.run("cp", root / "log.bin", mount.path / "copy.bin")
         assert (root / "copy.bin").read_bytes() == (root / "log.bin").read_bytes()
+    the_hub_is_the_users_alone()
+    for _ in range(5):
+        knock_and_leave(source)
     assert one.unmount() == 0
     assert reads_right(two, cards[1]), "the hub goes on for the other one"
     assert two.unmount() == 0
     wait_until("the hub ended with its last client", lambda: hub_of(source) is None)
 
 
-def test_the_hub_is_the_users_alone(field: Field) -> None:
-    _, source = two_vehicles(field)
-    field.mount(source, "target_system=1")
-    field.mount(source, "target_system=2")
+def the_hub_is_the_users_alone() -> None:
+    """Check who may reach the hubs."""
     doors = hubs()
     assert doors
     for door in doors:
@@ -155,24 +167,3 @@ def test_streams_are_handed_over_too(field: Field, link: str) -> None:
 
 def reading_again(mount: Mount, root: Path) -> Callable[[], bool]:
     return lambda: reads_right(mount, root)
-
-
-def test_scan_shows_all_vehicles_of_a_port_that_is_mounted(field: Field) -> None:
-    _, source = two_vehicles(field)
-    one = field.mount(source, "target_system=1")
-    found = json.loads(command(one, "scan", "--json", source))
-    assert {entry["system"] for entry in found if entry["answers"]} == {1, 2}
-
-
-def test_a_client_that_is_gone_before_it_is_let_in_keeps_no_hub_up(field: Field) -> None:
-    _, source = two_vehicles(field)
-    one = field.mount(source, "target_system=1")
-    two = field.mount(source, "target_system=2")
-    hello = {"protocol": PROTOCOL, "join": source, "own": [254, 191], "forward": []}
-    for _ in range(5):
-        sock = knock(port_name(parse_source(source)))
-        assert sock is not None
-        sock.send(pack_facts(hello))
-        sock.close()
-    assert [one.unmount(), two.unmount()] == [0, 0]
-    wait_until("the hub ended", lambda: hub_of(source) is None)
