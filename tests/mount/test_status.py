@@ -114,24 +114,9 @@ def test_status_is_for_programs_too(field: Field, small_tree: Path) -> None:
         assert "\x1b" not in text
 
 
-def test_a_dead_mount_is_said_to_be_dead(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree)
-    vehicle.left_alone = True
-    mount = field.mount(vehicle.source)
-    mount.kill()
-    try:
-        line = f"{mount.path}: DEAD: its program is gone; run: mavftpfs umount {mount.path}"
-        assert mount.run(*STATUS, mount.path, code=ExitCode.MOUNT_FAILED).stdout == f"{line}\n"
-        assert line in mount.run(*STATUS).stdout.splitlines()
-        facts = json.loads(mount.run(*STATUS, "--json", mount.path).stdout)
-        assert (facts["state"], facts["source"]) == ("dead", vehicle.source)
-        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
-        assert str(mount.path) not in mount.run(*STATUS).stdout
-    finally:
-        abort_mount(mount.path)
-
-
-def test_watching_a_mount_that_is_killed_and_cleared_ends_in_a_line(field: Field, small_tree: Path) -> None:
+def test_a_dead_mount_is_said_to_be_dead_and_watching_it_ends_when_it_is_cleared(
+    field: Field, small_tree: Path
+) -> None:
     vehicle = field.sim(small_tree)
     vehicle.left_alone = True
     mount = field.mount(vehicle.source)
@@ -143,6 +128,13 @@ def test_watching_a_mount_that_is_killed_and_cleared_ends_in_a_line(field: Field
         mount.kill()
         try:
             assert any("DEAD: its program is gone" in line for line in watch.stdout)
+            line = f"{mount.path}: DEAD: its program is gone; run: mavftpfs umount {mount.path}"
+            assert mount.run(*STATUS, mount.path, code=ExitCode.MOUNT_FAILED).stdout == f"{line}\n"
+            assert line in mount.run(*STATUS).stdout.splitlines()
+            facts = json.loads(mount.run(*STATUS, "--json", mount.path).stdout)
+            assert (facts["state"], facts["source"]) == ("dead", vehicle.source)
+            mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
+            assert str(mount.path) not in mount.run(*STATUS).stdout
         finally:
             abort_mount(mount.path)
         assert watch.wait(COMMAND_TIMEOUT) == ExitCode.MOUNT_FAILED
@@ -190,19 +182,14 @@ def test_another_user_is_told_in_a_line(
     shown = by_nobody(mount, "cat", mount.path / "README.txt").stdout
     assert shown == (small_tree / "README.txt").read_text()
     assert str(mount.path) in by_nobody(mount, *STATUS).stdout
+    own = (sys.executable, "-m", "mavftpfs")  # he cannot join its port, and a second program cannot have it
+    said = by_nobody(mount, *own, "ls", "-o", "target_system=7", mount.source, code=2).stderr
+    assert f"belongs to the mount on {mount.path}, of vehicle 1/1" in said
+    assert "another program" not in said
+    assert f"mounted on {mount.path}" in by_nobody(mount, *own, "scan", mount.source).stdout
 
 
 def test_another_user_does_not_see_what_he_may_not_read(field: Field, small_tree: Path) -> None:
     mount = field.mount(field.sim(small_tree).source)
     assert str(mount.path) not in by_nobody(mount, *STATUS).stdout
     by_nobody(mount, *STATUS, mount.path, code=ExitCode.MOUNT_FAILED)
-
-
-def test_a_port_that_another_users_mount_has_is_said_by_its_name(field: Field, small_tree: Path) -> None:
-    """He cannot join it, and a second program cannot have it."""
-    mount = field.mount(field.sim(small_tree).source, "allow_other")
-    own = (sys.executable, "-m", "mavftpfs")
-    said = by_nobody(mount, *own, "ls", "-o", "target_system=7", mount.source, code=2).stderr
-    assert f"belongs to the mount on {mount.path}, of vehicle 1/1" in said
-    assert "another program" not in said
-    assert f"mounted on {mount.path}" in by_nobody(mount, *own, "scan", mount.source).stdout

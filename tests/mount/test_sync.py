@@ -382,12 +382,12 @@ def test_a_vehicle_that_is_lost_under_a_mount_is_waited_for_on_the_screen(
     field: Field, tmp_path: Path, command: str
 ) -> None:
     vehicle = field.sim(field.local("card"), "px4", ("--rate", "10000"))
-    write_log(vehicle.root / "log" / "a.ulg", 100_000, 1, 1)
+    write_log(vehicle.root / "log" / "a.ulg", 50_000, 1, 1)
     mount = field.mount(vehicle.source, "op_deadline=3600")
     words = (
         [mount.path, tmp_path / "logs"] if command == "sync" else [mount.path, tmp_path / "a.bin", "/a.bin"]
     )
-    write_log(tmp_path / "a.bin", 100_000, 2, 1)
+    write_log(tmp_path / "a.bin", 50_000, 2, 1)
     screen = terminal.mavftpfs(command, *words, columns=100, rows=8)
     screen.read_until(lambda shown: "kB/s" in shown.raw)
     vehicle.send_signal(signal.SIGUSR2)  # the link is cut
