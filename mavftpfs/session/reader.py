@@ -73,13 +73,13 @@ class FileStream(SessionUser):
         self._server.wake()
 
     def drop_readahead(self) -> None:
-        """Forget what nobody waits for."""
+        """Forget wants for which no program waits."""
         self._ahead = ExtentSet()
         if self._transfer is not None:
             self._transfer.drop_readahead()
 
     def drop_wants(self) -> None:
-        """Nobody waits for anything any more: ask for nothing else. What is on its way still comes."""
+        """No program waits any more: ask for nothing else. What is on its way still comes."""
         self._demand = ExtentSet()
         self.drop_readahead()
         if self._transfer is not None:
@@ -112,7 +112,7 @@ class FileStream(SessionUser):
         self._sink.on_queued()
 
     def on_removed(self) -> None:
-        """Nothing more of this file can be had, and of its successor nothing may."""
+        """The file lost its name: no more of it can be read, and nothing of the next file of that name."""
         self._removed = True
         self._fail(FileChanged(f"{self.path!r} was removed or replaced"))
 

@@ -11,6 +11,8 @@ from itertools import pairwise
 import pytest
 import trio
 
+from mavftpfs.client.connect import _list_root
+from mavftpfs.client.options import Options
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import Opcode, decode_request, request
@@ -22,6 +24,7 @@ from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
     FileChanged,
     MavftpfsError,
+    NoFtp,
     RequestTimeout,
     SessionBusy,
     SessionLost,
@@ -628,6 +631,8 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often() -> 
         with pytest.raises(SessionBusy):
             await connection.store.list_directory(b"/d")
         assert 10 < trio.current_time() - began < 20
+        with pytest.raises(NoFtp, match="another client keeps the only FTP session of vehicle 1/1"):
+            await _list_root(connection, here.mount(), trio.current_time() + 30, Options())
         nursery.cancel_scope.cancel()
 
 
