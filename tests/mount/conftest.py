@@ -18,7 +18,7 @@ from tests.support.lying import LyingVehicle
 from tests.support.mounts import Mount
 from tests.support.requests import CountedVehicle
 from tests.support.trees import SMALL_SIZES, build_tree
-from tests.support.vehicles import HOST, MavsdkVehicle, SimVehicle, UdpVehicle, free_udp_port
+from tests.support.vehicles import HOST, MavsdkVehicle, Process, SimVehicle, UdpVehicle, free_udp_port
 
 V = TypeVar("V", bound=UdpVehicle)
 
@@ -62,6 +62,10 @@ class Field:
         mount = Mount(source, path, folder, options, argv)
         self._stack.callback(mount.finish)
         return mount
+
+    def own(self, process: Process) -> None:
+        """End a process after the mounts that are made from now on: without their vehicle these wait."""
+        self._stack.callback(process.kill)
 
     def local(self, name: str) -> Path:
         """Return a new directory on the local disk."""

@@ -11,8 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +40,7 @@ class Flown(Process):
         words = ["--link", link, "--record", str(self.record), "--telemetry", "1000", *options]
         argv = [sys.executable, "-m", "tests.support.flown", str(root), *words]
         super().__init__("flown", argv, folder)
+        field.own(self)
         wait_until("the vehicle speaks", lambda: bool(self.output.read_text()))
         self.source = self.output.read_text().split()[1]
 
@@ -55,23 +55,13 @@ class Station(Process):
         if program == "station":
             argv += ["--record", str(self.record)]
         super().__init__(program, argv, folder)
+        field.own(self)
         wait_until("the station listens", lambda: "ready" in self.output.read_text())
 
     def results(self) -> Any:
         """Wait for its end; return what it got."""
         assert self.wait(200) == 0, self.text()
         return json.loads(self.output.read_text().splitlines()[-1])
-
-
-@contextmanager
-def ended(*processes: Process) -> Iterator[None]:
-    """End processes after the body."""
-    try:
-        yield
-    finally:
-        for process in processes:
-            if process.running:
-                process.kill()
 
 
 def recorded(path: Path, mark: str) -> list[Frame]:
@@ -122,36 +112,34 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
     link = "pty" if kind == "pty" else f"udpout:{HOST}:{free_udp_port()}"
     station = Station(field, "station", port, "/log.bin")
     flown = Flown(field, root, link, *rate)
-    with ended(flown, station):
-        mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
-        work_on(mount, root, station)
-        (results,) = station.results()
-        assert results["parameters"] == PARAMETERS
-        assert results["mission_result"] == 0
-        assert len(results["mission"]) == 12
-        assert bytes.fromhex(results["file"]) in (b"", CONTENT), "the vehicle has one session for both"
-        assert mount.unmount() == 0
-        assert flown.stop() == 0
-        heard = recorded(station.record, "<")
-        sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
-        assert_passed_on(sent, heard, 50)
-        said = recorded(station.record, ">")
-        came = [frame for frame in recorded(flown.record, "<") if frame.source.system != OURS]
-        assert [frame.data for frame in said] == [frame.data for frame in came]
-        assert [frame.target.system for frame in heard].count(OURS) == 0
+    mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
+    work_on(mount, root, station)
+    (results,) = station.results()
+    assert results["parameters"] == PARAMETERS
+    assert results["mission_result"] == 0
+    assert len(results["mission"]) == 12
+    assert bytes.fromhex(results["file"]) in (b"", CONTENT), "the vehicle has one session for both"
+    assert mount.unmount() == 0
+    assert flown.stop() == 0
+    heard = recorded(station.record, "<")
+    sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
+    assert_passed_on(sent, heard, 50)
+    said = recorded(station.record, ">")
+    came = [frame for frame in recorded(flown.record, "<") if frame.source.system != OURS]
+    assert [frame.data for frame in said] == [frame.data for frame in came]
+    assert [frame.target.system for frame in heard].count(OURS) == 0
 
 
 def test_mavsdk_works_beside_the_mount(field: Field) -> None:
     root, port = flown_card(field), free_udp_port()
     station = Station(field, "mavsdk_station", port)
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
-    with ended(flown, station):
-        mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
-        work_on(mount, root, station)
-        results = station.results()
-        assert results["parameters"] == PARAMETERS
-        assert results["attitudes"] >= 10
-        assert mount.unmount() == 0
+    mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
+    work_on(mount, root, station)
+    results = station.results()
+    assert results["parameters"] == PARAMETERS
+    assert results["attitudes"] >= 10
+    assert mount.unmount() == 0
 
 
 def test_signed_frames_pass_unchanged(field: Field) -> None:
@@ -161,21 +149,20 @@ def test_signed_frames_pass_unchanged(field: Field) -> None:
     key.chmod(0o600)
     station = Station(field, "station", port, "--key", KEY.hex())
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--key", KEY.hex())
-    with ended(flown, station):
-        mount = field.mount(flown.source, forwarded(port), f"signing_key={key}", "dir_timeout=0")
-        second = field.mount(flown.source, f"signing_key={key}", "dir_timeout=0")
-        work_on(mount, root, station)
-        (results,) = station.results()
-        assert results["parameters"] == PARAMETERS
-        assert second.read_bytes(second.path / "log.bin") == CONTENT
-        assert [one.unmount() for one in (mount, second)] == [0, 0]
-        assert flown.stop() == 0
-        signed = [frame for frame in recorded(flown.record, "<") if frame.source.system == OURS]
-        links = {frame.source.component: frame.data[-13] for frame in signed}
-        assert len(links) == 2
-        assert len(set(links.values())) == 2, "each of ours has a link id of its own"
-        sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
-        assert_passed_on(sent, recorded(station.record, "<"), 50)
+    mount = field.mount(flown.source, forwarded(port), f"signing_key={key}", "dir_timeout=0")
+    second = field.mount(flown.source, f"signing_key={key}", "dir_timeout=0")
+    work_on(mount, root, station)
+    (results,) = station.results()
+    assert results["parameters"] == PARAMETERS
+    assert second.read_bytes(second.path / "log.bin") == CONTENT
+    assert [one.unmount() for one in (mount, second)] == [0, 0]
+    assert flown.stop() == 0
+    signed = [frame for frame in recorded(flown.record, "<") if frame.source.system == OURS]
+    links = {frame.source.component: frame.data[-13] for frame in signed}
+    assert len(links) == 2
+    assert len(set(links.values())) == 2, "each of ours has a link id of its own"
+    sent = [frame for frame in recorded(flown.record, ">") if frame.target.system != OURS]
+    assert_passed_on(sent, recorded(station.record, "<"), 50)
 
 
 # -- stations that do harm --------------------------------------------------------------------------
@@ -235,7 +222,7 @@ def test_endpoints_that_flood_harm_nobody(field: Field) -> None:
     ports = [free_udp_port() for _ in floods]
     work = Station(field, "station", other)
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
-    with ended(flown, work), ExitStack() as stack:
+    with ExitStack() as stack:
         pests = [stack.enter_context(Pest(*pest)) for pest in zip(ports, floods, strict=True)]
         mount = field.mount(flown.source, *map(forwarded, [*ports, other]), "dir_timeout=0")
         harms_nothing(field, mount, root)
@@ -284,27 +271,26 @@ def test_a_flood_of_one_vehicle_does_not_reach_the_mount_of_another(field: Field
     """The hub leaves it out. What the mount receives is counted: how long it takes depends on the machine."""
     port = free_udp_port()
     root, source = flown_card(field), f"udpin:{HOST}:{port}"
-    flown = Flown(field, root, f"udpout:{HOST}:{port}", "--system", "1", "--loss", "0.03")
-    with ended(flown):
-        mount = field.mount(source, "target_system=1", "dir_timeout=0")
-        second = field.mount(source, "target_system=1", "dir_timeout=0")  # a plain mount hears all of it
+    Flown(field, root, f"udpout:{HOST}:{port}", "--system", "1", "--loss", "0.03")
+    mount = field.mount(source, "target_system=1", "dir_timeout=0")
+    second = field.mount(source, "target_system=1", "dir_timeout=0")  # a plain mount hears all of it
 
-        def received() -> int:
-            return int(mount.status()["link"]["received_bytes"])
+    def received() -> int:
+        return int(mount.status()["link"]["received_bytes"])
 
+    before = received()
+    harms_nothing(field, mount, root)
+    quiet = received() - before
+    with Flood(9, port) as flood:
         before = received()
         harms_nothing(field, mount, root)
-        quiet = received() - before
-        with Flood(9, port) as flood:
-            before = received()
-            harms_nothing(field, mount, root)
-            assert second.read_bytes(second.path / "log.bin") == CONTENT
-            wait_until("there was a flood", lambda: flood.sent > 2 * Flood.RATE)
-            flooded = received() - before
-            facts = hub_of(source)
-        assert facts is not None
-        assert [client["dropped"] for client in facts["clients"]] == [0, 0]
-        assert flooded - quiet < 4 * flood.sent  # a tenth of its bytes
+        assert second.read_bytes(second.path / "log.bin") == CONTENT
+        wait_until("there was a flood", lambda: flood.sent > 2 * Flood.RATE)
+        flooded = received() - before
+        facts = hub_of(source)
+    assert facts is not None
+    assert [client["dropped"] for client in facts["clients"]] == [0, 0]
+    assert flooded - quiet < 4 * flood.sent  # a tenth of its bytes
 
 
 class Mirror:
@@ -337,9 +323,9 @@ class Mirror:
 
 def test_dead_endpoints_and_loops_harm_nobody(field: Field) -> None:
     root, port, mirror = flown_card(field), free_udp_port(), free_udp_port()
-    flown = Flown(field, root, f"udpout:{HOST}:{port}")
+    Flown(field, root, f"udpout:{HOST}:{port}")
     dead = [forwarded(free_udp_port()), f"forward=tcp:{HOST}:{free_udp_port()}", forwarded(mirror)]
-    with ended(flown), Mirror(mirror, port) as loop:
+    with Mirror(mirror, port) as loop:
         mount = field.mount(f"udpin:{HOST}:{port}", *dead, "dir_timeout=0")
         mount.allowed_log = (r"says that it is 1/1, too",)
         harms_nothing(field, mount, root)
@@ -352,11 +338,10 @@ def test_two_stations_with_one_id_both_work(field: Field) -> None:
     root, ports = flown_card(field), [free_udp_port(), free_udp_port()]
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
     stations = [Station(field, "station", port) for port in ports]
-    with ended(flown, *stations):
-        mount = field.mount(flown.source, *map(forwarded, ports), "dir_timeout=0")
-        harms_nothing(field, mount, root)
-        for station in stations:
-            assert station.results()[0]["parameters"] == PARAMETERS
+    mount = field.mount(flown.source, *map(forwarded, ports), "dir_timeout=0")
+    harms_nothing(field, mount, root)
+    for station in stations:
+        assert station.results()[0]["parameters"] == PARAMETERS
 
 
 # -- the end of the mount ---------------------------------------------------------------------------
@@ -401,37 +386,36 @@ class Listener:
 def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) -> None:
     root, port = flown_card(field), free_udp_port()
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--armed")
-    with ended(flown):
-        with Listener(port) as listener:
-            mount = field.mount(flown.source, forwarded(port))
-            wait_until("the station hears the vehicle", lambda: len(listener.beats) > 2)
-            if way == "umount":
-                assert mount.unmount() == 0
-            else:
-                mount.kill()
-                mavftpfs("umount", mount.path)
-            until = len(listener.beats) + 4
-            wait_until("the station hears it on", lambda: len(listener.beats) >= until)
-            facts = hub_of(flown.source)
-            assert facts is not None
-            assert facts["armed"] == [1]
-            said, _ = mavftpfs("hub", "--stop", flown.source, code=1)
-            assert "ARMED" in said
-            assert f"udpout:{HOST}:{port}" in said
-            again = field.mount(flown.source)
-            assert again.read_bytes(again.path / "log.bin") == CONTENT
-            assert again.unmount() == 0
-            gaps = [after - before for before, after in zip(listener.beats, listener.beats[1:], strict=False)]
-            assert len(gaps) >= 6
-            assert sorted(gaps)[len(gaps) // 2] < 2, gaps
-            mavftpfs("hub", "--stop", "--force", flown.source)
-        wait_until("the hub is gone", lambda: hub_of(flown.source) is None)
+    with Listener(port) as listener:
+        mount = field.mount(flown.source, forwarded(port))
+        wait_until("the station hears the vehicle", lambda: len(listener.beats) > 2)
+        if way == "umount":
+            assert mount.unmount() == 0
+        else:
+            mount.kill()
+            mavftpfs("umount", mount.path)
+        until = len(listener.beats) + 4
+        wait_until("the station hears it on", lambda: len(listener.beats) >= until)
+        facts = hub_of(flown.source)
+        assert facts is not None
+        assert facts["armed"] == [1]
+        said, _ = mavftpfs("hub", "--stop", flown.source, code=1)
+        assert "ARMED" in said
+        assert f"udpout:{HOST}:{port}" in said
+        again = field.mount(flown.source)
+        assert again.read_bytes(again.path / "log.bin") == CONTENT
+        assert again.unmount() == 0
+        gaps = [after - before for before, after in zip(listener.beats, listener.beats[1:], strict=False)]
+        assert len(gaps) >= 6
+        assert sorted(gaps)[len(gaps) // 2] < 2, gaps
+        mavftpfs("hub", "--stop", "--force", flown.source)
+    wait_until("the hub is gone", lambda: hub_of(flown.source) is None)
 
 
 def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
     root, port = flown_card(field), free_udp_port()
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
-    with ended(flown), Listener(port) as listener:
+    with Listener(port) as listener:
         mount = field.mount(flown.source, forwarded(port))
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
         assert mount.unmount() == 0
@@ -441,7 +425,7 @@ def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
 def test_a_killed_hub_comes_back_with_its_endpoints(field: Field) -> None:
     root, port = flown_card(field), free_udp_port()
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
-    with ended(flown), Listener(port) as listener:
+    with Listener(port) as listener:
         mount = field.mount(flown.source, forwarded(port))
         mount.allowed_log = (r"the hub of .* is gone",)
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
@@ -461,7 +445,7 @@ def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
     flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
     place = field.local("place")
     taken = free_udp_port()
-    with ended(flown), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind((HOST, taken))
         for option, code, said in (
             (f"forward={flown.source}", 1, "is SOURCE itself"),
