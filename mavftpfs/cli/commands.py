@@ -149,7 +149,9 @@ def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> N
         else:
             daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
     except OSError as exc:
-        raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
+        raise UsageError(
+            f"cannot write the log {exc.filename}: {exc.strerror}; name another place by log_file="
+        ) from exc
 
 
 def _control_path(place: str) -> Path | None:

@@ -34,6 +34,9 @@ log = logging.getLogger("mavftpfs.link")
 GRACE = 2.0
 """Seconds to wait for a port that is taken, because a hub may be just closing it."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
+_NO_PLACE = (
+    "no private directory for the hub's socket; set XDG_RUNTIME_DIR to a directory that only you can read"
+)
 _PAUSE = 0.1
 _LONG_PAUSE = 1.0
 _START_PATIENCE = 60.0
@@ -152,7 +155,7 @@ class SharedLink:
         """
         if door is None:
             if self._needs_hub() and self._inner is not link:
-                raise LinkClosed("no private directory for the hub's socket")
+                raise LinkClosed(_NO_PLACE)
             await trio.sleep_forever()
         assert door is not None
         alone = self._inner is link
