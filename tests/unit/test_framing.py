@@ -225,6 +225,16 @@ def test_reset_forgets_half_a_frame() -> None:
     assert framer.stats.garbage_bytes == 60
 
 
+def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    framer = Framer(US, stream=True)
+
+    def refuse(*_: object) -> None:
+        raise dialect.MAVError("no")
+
+    monkeypatch.setattr(framer._decoder, "decode", refuse)
+    assert feed(framer, heartbeat() + ftp()) == [FTP]
+
+
 # ---------------------------------------------------------------------- a length that is far too large
 
 

@@ -6,6 +6,7 @@ What a saved text asks for: tests/sim/test_parameters.py.
 from __future__ import annotations
 
 import math
+import struct
 from itertools import accumulate
 
 import pytest
@@ -160,6 +161,13 @@ A, B = entry(b"A", 1, b"\x01"), entry(b"B", 2, b"\x02\x00")
 def test_files_that_do_not_add_up_are_errors(data: bytes) -> None:
     with pytest.raises(RemoteProtocolError):
         unpack(data)
+
+
+def test_a_name_of_sixteen_letters_shares_at_most_fifteen() -> None:
+    long = Parameter("ABCDEFGHIJKLMNO1", Kind.INT8, 1), Parameter("ABCDEFGHIJKLMNO2", Kind.INT8, 2)
+    packed = b"".join(pack_upload(long))
+    assert struct.unpack_from("<HHH", packed) == (MAGIC, 2, len(packed))
+    assert unpack(file_of(packed[6:], count=2)).parameters == list(long)
 
 
 # --- lines
