@@ -235,6 +235,13 @@ def test_on_a_fast_path_the_window_is_no_wider_than_keeps_the_server_busy(best: 
     assert sum(rates) / len(rates) >= 0.5 * computer.rate(best)
 
 
+@pytest.mark.parametrize("window", [1, 2, 4])
+def test_bulk_goes_on_beside_what_is_waited_for_even_in_a_small_window(window: int) -> None:
+    flow = Flow(limit=window)
+    flow.room(0, 100.0, paced=True, urgent=True)
+    assert flow.room(0, 100.0, paced=True) >= 1
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_random_losses_at_the_start_are_not_taken_for_an_overflow(seed: int) -> None:
     """One request or answer in five is lost, as at 10 % each way; a false ceiling would last for minutes."""
