@@ -103,13 +103,6 @@ async def undated(tmp_path: Path) -> AsyncIterator[Mounts]:
         yield Mounts(here, tmp_path / "cache")
 
 
-async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts) -> None:
-    await mounts.read_and_settle()
-    tree = mounts.mount()
-    assert await read_file(tree, LOG) == DATA
-    assert mounts.asked() == (0, 0)
-
-
 @pytest.mark.parametrize("change", ["size", "mtime", "vehicle", "unknown vehicle", "growing", "young"])
 async def test_anything_else_is_read_again(mounts: Mounts, change: str) -> None:
     await mounts.read_and_settle()

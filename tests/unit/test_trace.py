@@ -30,7 +30,6 @@ def test_json_lines(tmp_path: Path) -> None:
     with JsonTrace(tmp_path / "trace", wall_clock=lambda: WALL) as trace:
         trace.payload(1.5, "request", READ)
         trace.payload(2.25, REPLY, DATA)
-        trace.payload(3.0, "request", OPEN)
         trace.payload(4.0, REPLY, b"short")
     lines = [json.loads(line) for line in (tmp_path / "trace").read_text().splitlines()]
     assert {line.pop("time") for line in lines} == {"2026-11-23T09:30:00.250000+00:00"}
@@ -55,16 +54,6 @@ def test_json_lines(tmp_path: Path) -> None:
             "burst_complete": 1,
             "data": b"abcd".hex(),
             **common,
-        },
-        {
-            "t": 3.0,
-            "dir": "request",
-            "seq": 8,
-            "session": 0,
-            "opcode": "OPEN_FILE_RO",
-            "size": 17,
-            "offset": 0,
-            "data": b"/fs/microsd/a.bin".hex(),
         },
         {"t": 4.0, "dir": "reply", "malformed": b"short".hex()},
     ]
