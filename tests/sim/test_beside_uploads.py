@@ -128,8 +128,7 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str)
     data = content(600_000, 4)
     waited: list[float] = []
     async with here.mounted(b"/d") as tree:
-        faults = here.faults
-        faults.requests.clear()
+        here.faults.requests.clear()
         async with trio.open_nursery() as nursery:
             nursery.start_soon(copy, tree, b"big", data)
             await trio.sleep(10)
@@ -148,7 +147,7 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str)
         await trio.sleep(60)
         assert here.data(b"/d/small") == b"b" * 1000, "brought later"
         # big twice, small, and an empty file that shows whether the card can rename
-        assert faults.requests.count(Opcode.CREATE_FILE) <= 2 + 1 + 1
+        assert here.count(Opcode.CREATE_FILE) <= 2 + 1 + 1
     assert here.data(b"/d/big") == data
 
 
@@ -158,14 +157,13 @@ async def test_a_log_written_now_and_then_costs_little(profile: str) -> None:
     """The whole file again for each line is more than a link carries."""
     here = Rig(profile, FILES, QUICK)
     async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
-        faults = here.faults
-        faults.requests.clear()
+        here.faults.requests.clear()
         nursery.start_soon(trickle, tree, b"/d/log", 3.0)
         await trio.sleep(300)
         nursery.cancel_scope.cancel()
     needed = (70_000 + 100 * 500) // 239
-    assert faults.requests.count(Opcode.CREATE_FILE) <= 16
-    assert faults.requests.count(Opcode.WRITE_FILE) <= (10 if profile in TRUNCATING else 2) * needed
+    assert here.count(Opcode.CREATE_FILE) <= 16
+    assert here.count(Opcode.WRITE_FILE) <= (10 if profile in TRUNCATING else 2) * needed
 
 
 @pytest.mark.holds("promise 7")
@@ -178,14 +176,13 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int) -> N
         file = await tree.create(b"/d/log", exclusive=True)
         await file.write(0, data[:70_000])
         await trio.sleep(10)  # it is on its way, and all there is was sent
-        faults = here.faults
-        faults.requests.clear()
+        here.faults.requests.clear()
         for at in range(70_000, len(data), step):
             await file.write(at, data[at : at + step])
             await trio.sleep(0.004)
         await file.flush()
         await file.release()
-    assert faults.requests.count(Opcode.WRITE_FILE) <= 1.1 * (700 * step // 239) + 3
+    assert here.count(Opcode.WRITE_FILE) <= 1.1 * (700 * step // 239) + 3
     assert here.data(b"/d/log") == data
 
 
@@ -319,7 +316,6 @@ async def test_path_operations_beside_an_upload_on_nuttx() -> None:
     data = content(60_000)
     here = Rig("px4-nuttx", {b"/d": None}, PLAIN)
     here.card.add(b"/etc/init.d/rcS", b"#")
-    faults = here.faults
     async with here.connected() as connection:
         async with under_way(connection, "px4-nuttx", data, seconds=0.5) as source:
             for _ in range(8):
@@ -327,7 +323,7 @@ async def test_path_operations_beside_an_upload_on_nuttx() -> None:
                 await trio.sleep(0.3)
         assert source.all_proven
         assert source.rollbacks == []
-        refused = faults.refused.count(Opcode.WRITE_FILE)
+        refused = here.faults.refused.count(Opcode.WRITE_FILE)
         assert 1 <= refused < 30  # the first window only: after that, each knows its turn
     assert here.data(b"/d/new") == data
 
@@ -349,17 +345,16 @@ async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer() -> N
     data = content(200_000)
     here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.3))
     here.card.add(b"/etc/rc", b"#")
-    faults = here.faults
     async with here.connected() as connection:
         async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
             await connection.store.list_directory(b"/etc")
             await trio.sleep(5)
-            asked = faults.requests.count(Opcode.LIST_DIRECTORY)
+            asked = here.count(Opcode.LIST_DIRECTORY)
             with trio.move_on_after(0.05) as impatience:
                 await connection.store.list_directory(b"/etc")
             await trio.sleep(1)
             assert impatience.cancelled_caught
-            assert faults.requests.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
+            assert here.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
         assert source.all_proven
         assert source.rollbacks == []
     assert here.data(b"/d/new") == data

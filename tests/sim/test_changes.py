@@ -34,6 +34,13 @@ def names(here: Rig) -> list[bytes]:
     return sorted(name for name in found if name not in (b".", b".."))
 
 
+def open_at(here: Rig, opcode: Opcode) -> list[list[bytes]]:
+    """Return a list that will have the paths that are open when such a request comes."""
+    found: list[list[bytes]] = []
+    here.faults.at(opcode, lambda: found.append(here.server.open_paths))
+    return found
+
+
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_refusals_are_refusals(profile: str) -> None:
     here = Rig(profile, {b"/d/file": b"content"})
@@ -62,9 +69,8 @@ async def test_an_existing_directory_is_not_taken_for_ours(profile: str) -> None
     """Its reply lost, mkdir of what was there before must still be refused."""
     here = Rig(profile, {b"/d": None})
     here.put(b"/d/dir/inner", b"x")
-    faults = here.faults
     async with here.connected() as connection:
-        faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
+        here.faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
         with pytest.raises(FtpNak) as refusal:
             await connection.store.make_directory(path(profile, "dir"))
         assert refusal.value.code == 8
@@ -74,7 +80,6 @@ async def test_an_existing_directory_is_not_taken_for_ours(profile: str) -> None
 async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str) -> None:
     here = Rig(profile, {b"/d/file": b"content"})
     here.put_directory(b"/d/dir")
-    faults = here.faults
 
     async def spoil(connection: Connection) -> None:
         request = Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir"))
@@ -93,7 +98,7 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str) -> None
         upload = await connection.store.open_upload(path(profile, "new"), source)
         await upload.finish()
         await spoil(connection)
-        faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+        here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
         source.add(b" world")
         upload.wake()
         await upload.finish()
@@ -120,11 +125,9 @@ async def test_our_own_session_is_closed_before_a_path_changes(profile: str) -> 
     here = Rig(
         profile, {b"/d/file": bytes(60_000), b"/d/other": b"x"}, LinkSettings(rate=20_000.0, delay=0.02)
     )
-    faults = here.faults
-    open_then: list[list[bytes]] = []
     async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, path(profile, "file"), 1000)
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
+        open_then = open_at(here, Opcode.REMOVE_FILE)
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
         with pytest.raises(FileChanged):
@@ -140,11 +143,9 @@ async def test_readers_follow_a_rename(profile: str) -> None:
     data = content(40_000)
     here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
     here.put(b"/d/dir/file", data)
-    faults = here.faults
-    open_then: list[list[bytes]] = []
     async with here.connected() as connection:
         _, sink = await begin_to_read(connection, path(profile, "dir/file"), 1000)
-        faults.at(Opcode.RENAME, lambda: open_then.append(here.server.open_paths))
+        open_then = open_at(here, Opcode.RENAME)
         await connection.store.rename(path(profile, "dir"), path(profile, "moved"))
         assert open_then == [[]]
         assert await sink.wait_for(0, 40_000) == data
@@ -155,15 +156,13 @@ async def test_readers_follow_a_rename(profile: str) -> None:
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_an_upload_makes_room_for_a_change_of_its_path(profile: str, probed: bool) -> None:
     here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
-    faults = here.faults
-    open_then: list[list[bytes]] = []
     async with here.connected() as connection:
         if probed:
             know(connection, profile)
         source = MemorySource(bytes(300_000))
         upload = await connection.store.open_upload(path(profile, "file"), source)
         await trio.sleep(1)
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
+        open_then = open_at(here, Opcode.REMOVE_FILE)
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
         assert not source.todo.empty  # it did not wait for the upload's end
@@ -175,17 +174,15 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(profile: str, probe
 async def test_what_may_still_be_open_is_closed_first_too(profile: str) -> None:
     """A CreateFile whose ACK never came may have opened the file that is then removed."""
     here = Rig(profile, {b"/d": None})
-    faults = here.faults
-    open_then: list[list[bytes]] = []
     async with here.connected(ConnectOptions(op_deadline=5.0)) as connection:
-        faults.cut_after(1)
+        here.faults.cut_after(1)
         upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"))
         with pytest.raises(RequestTimeout):
             await upload.finish()
         await upload.end()
-        faults.cut_after(None)
+        here.faults.cut_after(None)
         assert here.server.open_sessions == 1
-        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.server.open_paths))
+        open_then = open_at(here, Opcode.REMOVE_FILE)
         await connection.store.remove(path(profile, "new"))
         assert open_then == [[]]
 
@@ -221,7 +218,6 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
 async def test_no_checksum_is_asked_for_in_flight(when_armed: Literal["ro", "ok"]) -> None:
     """The vehicle reads the whole file for it (promise 9)."""
     here = Rig("px4", {b"/d/file": b"content"})
-    faults = here.faults
 
     async def fly(armed: bool) -> None:
         (here.vehicle.arm if armed else here.vehicle.disarm)()
@@ -232,7 +228,7 @@ async def test_no_checksum_is_asked_for_in_flight(when_armed: Literal["ro", "ok"
         await fly(True)
         with pytest.raises(Armed):
             await connection.store.crc32(b"/d/file")
-        assert Opcode.CALC_FILE_CRC32 not in faults.requests
+        assert Opcode.CALC_FILE_CRC32 not in here.faults.requests
         await fly(False)
         assert await connection.store.crc32(b"/d/file") == crc32(b"content")
 
@@ -284,11 +280,10 @@ async def test_nobody_else_waits_for_a_long_delivery() -> None:
 
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing() -> None:
     here = Rig("mavsdk", {b"/d/file": b"content"})
-    faults = here.faults
     async with here.connected() as connection:
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
-    assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
+    assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(here.faults.requests)
 
 
 async def test_changes_that_concern_one_another_take_turns() -> None:
@@ -306,9 +301,8 @@ async def test_changes_that_concern_one_another_take_turns() -> None:
 @pytest.mark.parametrize("same", [False, True])
 async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool) -> None:
     here = made("px4")
-    faults = here.faults
     async with here.mounted(D) as tree:
-        faults.cut_after(0)
+        here.faults.cut_after(0)
 
         async def one(number: int) -> None:
             await trio.sleep(3 * number)

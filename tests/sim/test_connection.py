@@ -175,7 +175,6 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
 ) -> None:
     here = Rig("ardupilot", {b"/d/f": content(100)})
     join(monkeypatch, here, tmp_path)
-    faults = here.faults
     async with compose.attached(parse_source("udpin:127.0.0.1:1"), Options(), writing=True) as up:
         await trio.sleep(60.0)
         file = await up.tree.open(b"/d/f", write=True)
@@ -184,11 +183,11 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
         assert up.connection.scheduler.server.session is not None
 
         def restart() -> None:
-            faults.ignore(Opcode.TERMINATE_SESSION)
+            here.faults.ignore(Opcode.TERMINATE_SESSION)
             here.vehicle.reboot(trio.current_time(), 1.0)
             here.link.kick()
 
-        faults.at(Opcode.TERMINATE_SESSION, restart)
+        here.faults.at(Opcode.TERMINATE_SESSION, restart)
     assert up.connection.vehicle.reboots == 1
     assert up.tree.undelivered() == [b"/d/f"]
     assert here.card.data(b"/d/f") == content(100)

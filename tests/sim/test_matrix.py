@@ -402,19 +402,18 @@ async def meet(profile: str, operation: Call, event: Event, count: int, place: P
     """Have the event come at request `count` of an operation; return the opcodes of its requests."""
     here = Rig(profile, {D + b"/" + name: data for name, data in BEFORE.items() if data is not None})
     here.put_directory(D + b"/sub")
-    faults = here.faults
     async with mounted(here, place, 3) as tree:
         await tree.list(D)
         await trio.sleep(3.0)
-        began, done = len(faults.requests), False
+        began, done = len(here.faults.requests), False
         with trio.CancelScope() as caller:
             event(Scene(here, tree, operation, caller), count)
             done = await attempt(operation, tree)
-        faults.call_off()
+        here.faults.call_off()
         assert done or event not in UNNOTICED
         if done:
             assert_done(here, OPERATIONS[operation])
-        requests = faults.requests[began:]
+        requests = here.faults.requests[began:]
         if event is power_off:
             here.link.cut()  # or leaving would tidy up
         else:

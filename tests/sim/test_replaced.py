@@ -249,10 +249,9 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: 
 @pytest.mark.parametrize("successor", [SUCCESSOR, OLD + b"more"], ids=["as long", "grown"])
 async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(successor: bytes) -> None:
     async with mounted("mavsdk") as (here, tree):
-        faults = here.faults
         writer = await tree.open(PATH, write=True)
         await writer.write(100, MID)
-        faults.at(Opcode.WRITE_FILE, lambda: faults.after(100, lambda: replace(here, successor)))
+        here.faults.at(Opcode.WRITE_FILE, lambda: here.faults.after(100, lambda: replace(here, successor)))
         with pytest.raises(FileChanged):
             await writer.fsync()
         assert here.data(PATH) == successor

@@ -260,10 +260,9 @@ async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(profile:
                 store, sink = connection.store, MemorySink(5000)
                 assert await read_file(connection, b"/other") == new
                 reader = await store.open_reader(b"/a", sink, expected_size=5000)
-                faults = here.faults
-                faults.requests.clear()
+                here.faults.requests.clear()
                 if lost:
-                    faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+                    here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
 
                 async def change(connection: Connection = connection, later: int = later) -> None:
                     await trio.sleep(later * 0.02)

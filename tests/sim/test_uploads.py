@@ -147,7 +147,6 @@ async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session() -
 async def test_a_full_card_is_told(profile: str) -> None:
     here = Rig(profile, {b"/d": None}, PLAIN)
     here.card.capacity = 5_000
-    faults = here.faults
     async with here.connected() as connection:
         source = MemorySource(content(9_000))
         upload = await start(connection, profile, source)
@@ -156,7 +155,7 @@ async def test_a_full_card_is_told(profile: str) -> None:
             await upload.finish()
         assert refusal.value.opcode == Opcode.WRITE_FILE
         assert errno_for(refusal.value) in (5, 28)
-        assert faults.requests.count(Opcode.CREATE_FILE) <= 2
+        assert here.count(Opcode.CREATE_FILE) <= 2
         assert not source.all_proven
         assert source.proven.end <= 5_000 + (238 if silent else 0) + 239
         here.card.capacity = None
@@ -288,7 +287,6 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: s
 async def test_an_error_at_close_is_the_callers() -> None:
     """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
     here = Rig("ardupilot5", {b"/d": None}, PLAIN)
-    faults = here.faults
     async with here.connected() as connection:
         source = MemorySource(content(3000))
         upload = await start(connection, "ardupilot5", source)
@@ -303,7 +301,7 @@ async def test_an_error_at_close_is_the_callers() -> None:
 
             opened.close = close
 
-        faults.at(Opcode.TERMINATE_SESSION, break_close)
+        here.faults.at(Opcode.TERMINATE_SESSION, break_close)
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert refusal.value.opcode == Opcode.TERMINATE_SESSION
@@ -352,7 +350,6 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool) -
 async def test_a_server_that_always_loses_the_session_is_given_up(profile: str) -> None:
     """A write that is refused wherever it is tried ends in its refusal, after few attempts."""
     here = Rig(profile, {b"/d": None}, PLAIN)
-    faults = here.faults
     async with here.connected() as connection:
 
         async def steal_always() -> None:
@@ -367,7 +364,7 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str) 
             with pytest.raises(MavftpfsError):
                 await upload.finish()
             nursery.cancel_scope.cancel()
-        assert faults.requests.count(Opcode.CREATE_FILE) < 30
+        assert here.count(Opcode.CREATE_FILE) < 30
         await upload.end()
 
 
@@ -377,25 +374,25 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str) 
 async def test_finish_again_after_success_sends_only_what_is_new(profile: str, probed: bool) -> None:
     """Unless opening the file anew empties it, as is found out then at the latest."""
     here = Rig(profile, {b"/d": None}, PLAIN)
-    faults, empties = here.faults, PROFILES[profile].write_only_truncates
+    empties = PROFILES[profile].write_only_truncates
     async with here.connected() as connection:
         if probed:
             know(connection, profile)
         source = MemorySource(content(1000))
         upload = await start(connection, profile, source)
         await upload.finish()
-        faults.requests.clear()
+        here.faults.requests.clear()
         await upload.finish()
         upload.wake()
         await upload.finish()
-        assert faults.requests == []
+        assert here.faults.requests == []
         source.add(b"more")
         upload.wake()
         await upload.finish()
         assert connection.store.traits.wo_truncates is empties
         assert source.rollbacks == ([True] if empties else [])
-        assert faults.requests.count(Opcode.CREATE_FILE) == empties
-        assert faults.requests.count(Opcode.WRITE_FILE) <= (5 if empties else 1)
+        assert here.count(Opcode.CREATE_FILE) == empties
+        assert here.count(Opcode.WRITE_FILE) <= (5 if empties else 1)
         assert source.all_proven
     assert here.data(b"/d/new") == bytes(source.content)
     assert here.server.open_sessions == 0
@@ -404,7 +401,6 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, p
 async def test_each_finish_waits_for_what_it_was_called_for() -> None:
     """Bytes that come while another caller's Terminate is under way are not covered by it."""
     here = Rig("px4", {b"/d": None}, LinkSettings(rate=60_000.0, delay=0.3))
-    faults = here.faults
     proven: list[int] = []
     async with here.connected() as connection:
         know(connection, "px4")
@@ -418,7 +414,7 @@ async def test_each_finish_waits_for_what_it_was_called_for() -> None:
             proven.append(source.proven.total)
 
         async with trio.open_nursery() as nursery:
-            faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(late))
+            here.faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(late))
             await upload.finish()
             proven.append(source.proven.total)
     assert proven == [5, 12]
@@ -454,13 +450,12 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) -> None:
     here = Rig("px4", {b"/d": None}, PLAIN)
-    faults = here.faults
     async with here.connected() as connection:
         if probed:
             know(connection, "px4")
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
-        faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, connection))
+        here.faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, connection))
         await upload.finish()
         assert source.rollbacks == [True]
         assert source.checkpoints == 1
@@ -470,27 +465,25 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) ->
 async def test_a_terminate_done_twice_is_done() -> None:
     """The first one's reply is lost, and a listing in between ends PX4's replay: NAK 4 to the second."""
     here = Rig("px4", {b"/d": None}, PLAIN)
-    faults = here.faults
     async with here.connected() as connection:
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
-        faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+        here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
 
         async def list_soon() -> None:
             await trio.sleep(0.01)
             await connection.store.list_directory(b"/d")
 
         async with trio.open_nursery() as nursery:
-            faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(list_soon))
+            here.faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(list_soon))
             await upload.finish()
-        assert Opcode.TERMINATE_SESSION in faults.refused
+        assert Opcode.TERMINATE_SESSION in here.faults.refused
         assert source.rollbacks == []
         assert source.all_proven
 
 
 async def test_only_what_was_not_proven_goes_again() -> None:
     here = Rig("px4", {b"/d": None}, PLAIN)
-    faults = here.faults
     async with here.connected() as connection:
         know(connection, "px4")
         source = MemorySource(content(20_000))
@@ -498,14 +491,14 @@ async def test_only_what_was_not_proven_goes_again() -> None:
         await upload.finish()
         source.add(content(40_000, 1))
         upload.wake()
-        faults.requests.clear()
+        here.faults.requests.clear()
         async with trio.open_nursery() as nursery:
             nursery.start_soon(upload.finish)
             await trio.sleep(1.5)
             steal(here, connection)
         assert source.rollbacks == [False]
         assert source.all_proven
-        assert faults.requests.count(Opcode.CREATE_FILE) == 0
+        assert here.count(Opcode.CREATE_FILE) == 0
     assert here.card.data(b"/d/new") == bytes(source.content)
 
 
