@@ -234,10 +234,10 @@ async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str) -> 
 
 
 async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
-    """200 programs read at once over a round trip of 100 ms: the last one waits longer than a read may."""
-    files = {b"/f%d" % number: content(2000, number) for number in range(200)}
+    """120 programs read at once over a round trip of 150 ms: the last one waits longer than a read may."""
+    files = {b"/f%d" % number: content(2000, number) for number in range(120)}
     ended: list[float] = []
-    async with Rig("px4", files, LinkSettings(delay=0.05)).mounted(b"/") as tree:
+    async with Rig("px4", files, LinkSettings(delay=0.075)).mounted(b"/") as tree:
         opened = {path: await tree.open(path) for path in files}
 
         async def read(path: bytes) -> None:
@@ -247,7 +247,7 @@ async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
         async with trio.open_nursery() as readers:
             for path in files:
                 readers.start_soon(read, path)
-    assert len(ended) == 200
+    assert len(ended) == 120
     assert ended[-1] - ended[0] > ConnectOptions().op_deadline
 
 
@@ -550,9 +550,7 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
 
 
 @pytest.mark.holds("promise 2", "fault killed program")
-@pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))]
-)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 60))])
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
 async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(profile: str, seed: int) -> None:
     """FAT has a sector in memory until the file is closed."""
@@ -634,12 +632,12 @@ FILES = 20
 
 async def test_small_files_do_not_wait_for_each_other() -> None:
     """A card that pauses makes us ask twice; that is no reason to fear the path."""
-    here = Rig("px4-nuttx", {b"/d/log": content(400_000, 1)}, USB)
+    here = Rig("px4-nuttx", {b"/d/log": content(200_000, 1)}, USB)
     async with here.mounted() as tree:
         file = await tree.open(b"/d/log")
-        assert await file.read(0, 400_000) == content(400_000, 1)
+        assert await file.read(0, 200_000) == content(200_000, 1)
         file.close()
-        await write_file(tree, b"/d/large", content(400_000, 2))
+        await write_file(tree, b"/d/large", content(200_000, 2))
         stats = here.connection.engine.stats
         assert stats.unknown + stats.spurious > 0
         assert stats.unexplained == 0

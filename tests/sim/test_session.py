@@ -252,7 +252,7 @@ async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(profile:
     """Another file is open and has to be closed first; once more, where the answer to that is lost."""
     old, new = content(5000, 1), content(5000, 2)
     for lost in (False, True):
-        for later in range(0, 60, 3):
+        for later in range(0, 60, 5):
             here = Rig(profile, link=LinkSettings(delay=0.1))
             for name, data in ((b"/a", old), (b"/b", new), (b"/other", new)):
                 here.card.add(name, data)
