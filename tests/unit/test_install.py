@@ -24,11 +24,28 @@ def pieces(tmp_path: Path) -> dict[str, install.Piece]:
     return {piece.path.relative_to(tmp_path).as_posix(): piece for piece in found}
 
 
+def run_install(*words: str) -> int:
+    """Run the command."""
+    return cli.main(["install", *words])
+
+
 def checked(*command: str | Path) -> str:
     """Run a checker and return what it says; it must be content."""
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 0, result.stderr
     return result.stdout + result.stderr
+
+
+def test_what_is_written_is_removed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_install("--root", str(tmp_path)) == 0
+    written = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if not path.is_dir()}
+    said = capsys.readouterr().out
+    assert len(written) >= 8
+    assert all(str(tmp_path / path) in said for path in written)
+    assert run_install("--root", str(tmp_path)) == 0, "twice is fine"
+    assert run_install("--root", str(tmp_path), "--remove") == 0
+    assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
+    assert run_install("--root", str(tmp_path), "--remove") == 0, "nothing is there any more"
 
 
 def test_a_user_needs_no_root(tmp_path: Path) -> None:
