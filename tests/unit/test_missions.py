@@ -118,6 +118,16 @@ def test_the_simulated_vehicle_refuses_a_height_that_is_none() -> None:
         assert missions.packed(b"mission.dat") == before
 
 
+@given(st.binary(min_size=38, max_size=200))
+def test_the_simulated_vehicle_outlives_any_bytes(data: bytes) -> None:
+    items = data[: len(data) // 38 * 38]
+    for kind, name in enumerate((b"mission.dat", b"fence.dat", b"rally.dat")):
+        missions = Missions()
+        missions.replace(name, data)
+        missions.replace(name, HEADER.pack(0x763D, kind, 0, 0, len(items) // 38) + items)
+        unpack(missions.packed(name), kind)
+
+
 # --- text
 
 
