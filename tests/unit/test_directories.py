@@ -19,6 +19,10 @@ def file(name: bytes, size: int = 1, mtime: int | None = None) -> DirEntry:
     return DirEntry(name, EntryKind.FILE, size, mtime)
 
 
+def folder(name: bytes) -> DirEntry:
+    return DirEntry(name, EntryKind.DIRECTORY)
+
+
 @pytest.fixture
 def clock() -> HandClock:
     return HandClock()
@@ -39,6 +43,11 @@ def put(directories: Directories, path: bytes, *entries: DirEntry, took: float =
 def is_fresh(directories: Directories, path: bytes) -> bool:
     directory = directories.known(path)
     return directory is not None and directories.clock() < directory.fresh_until
+
+
+def names(directories: Directories, path: bytes) -> set[bytes]:
+    directory = directories.known(path)
+    return set(directory.entries) if directory else {b"(unknown)"}
 
 
 @pytest.mark.parametrize(("dir_timeout", "took", "life"), [(20, 9, 20), (None, 0.1, 20), (None, 2, 100)])
@@ -128,6 +137,25 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
 
 
 # --- our own changes
+
+
+def test_what_we_changed_shows_at_once() -> None:
+    directories = make()
+    put(directories, b"/", file(b"a", 1, 50))
+    put(directories, b"/b", file(b"x"))
+    directories.learn_size(b"/a", 2)
+    directories.put(b"/a", file(b"a", 9))
+    directories.put(b"/b", folder(b"another name"))
+    directory = directories.known(b"/")
+    assert directory is not None
+    assert directory.entries == {b"a": file(b"a", 9), b"b": folder(b"b")}
+    assert directory.size_of(b"a") == 9
+    assert directories.known(b"/b") is None
+    assert directories.entry(b"/b") == folder(b"b")
+    directories.put(b"/a", None)
+    directories.put(b"/never", None)
+    assert names(directories, b"/") == {b"b"}
+    assert directories.entry(b"/a") is None
 
 
 def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: HandClock) -> None:
