@@ -200,7 +200,7 @@ class Drone:
 
     async def refresh(self) -> None:
         """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
-        self._files.forget_caches()
+        await self._files.refresh()
 
     # --- parameters
 

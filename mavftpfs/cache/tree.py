@@ -414,6 +414,10 @@ class Tree:
 
     # --- news and housekeeping
 
+    async def refresh(self) -> None:
+        """As forget_caches; a mount may have to be waited for (client/mounted.py)."""
+        self.forget_caches()
+
     def forget_caches(self) -> None:
         """Drop everything that no open file uses."""
         self._directories.forget(ROOT)

@@ -332,7 +332,7 @@ class Fetcher:
         try:
             size, proof = await self._attempt(wanted, part)
         except DataUnproven:
-            self.session.files.forget_caches()
+            await self.session.files.refresh()
             part.cut(0)
             resumed = 0
             size, proof = await self._attempt(wanted, part)

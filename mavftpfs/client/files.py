@@ -100,7 +100,7 @@ class Files(Protocol):
     async def rename(self, old: bytes, new: bytes) -> None:
         """Rename, over an existing file or directory as far as rename(2) allows."""
 
-    def forget_caches(self) -> None:
+    async def refresh(self) -> None:
         """Forget what is known of the vehicle, so that it is asked again."""
 
 
@@ -187,7 +187,7 @@ class Session:
 
     async def size_now(self, path: bytes) -> int:
         """Ask the vehicle for a file's size, even if one is known."""
-        self.files.forget_caches()
+        await self.files.refresh()
         if self.mountpoint is not None:  # only an open makes the kernel ask again
             async with reading(self.files, path):
                 pass

@@ -251,10 +251,11 @@ class MountedFiles:
         except _ABOUT_TARGET as exc:
             raise type(exc)(_sentence(type(exc), new)) from exc
 
-    def forget_caches(self) -> None:
+    async def refresh(self) -> None:
         """Make the mount ask the vehicle again. Another user's mount may go on with what it knows."""
+        ask = partial(self._ask, {"command": "forget"}, timeout=STATUS_PATIENCE)
         with suppress(errors.MavftpfsError):
-            self._ask({"command": "forget"}, timeout=STATUS_PATIENCE)
+            await trio.to_thread.run_sync(ask, abandon_on_cancel=True)
 
     def _ask(self, request: control.Reply, *, timeout: float) -> control.Reply:
         socket = control.find_socket(os.fsdecode(self._mountpoint), control.own_directories())

@@ -243,7 +243,7 @@ class Watch:
         name = self._names[system] = await contact.identity() or f"system-{system}"
         local = self._local / (str(system) if self._wish.by_system else name)
         self._complain(f"name of {system}", f"vehicle {system} is {name}; its logs go into {local}")
-        session.files.forget_caches()
+        await session.files.refresh()
         self._logs[system] = {}
         failed = False
         try:

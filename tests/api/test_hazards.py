@@ -389,3 +389,26 @@ async def test_trio_cancels_a_call(sim: SimVehicle) -> None:
                 return
             await trio.sleep(0.1)
         raise AssertionError("it does not answer any more")
+
+
+@pytest.mark.mount
+async def test_a_mount_that_does_not_answer_stops_no_other_task(sim: SimVehicle, field: Field) -> None:
+    mount = field.mount(sim.source)
+    assert mount.process is not None
+    turns = 0
+
+    async def work() -> None:
+        nonlocal turns
+        while True:
+            await trio.sleep(0.01)
+            turns += 1
+
+    async with mavftpfs.trio.connect(str(mount.path)) as drone, trio.open_nursery() as nursery:
+        mount.process.popen.send_signal(signal.SIGSTOP)
+        try:
+            nursery.start_soon(work)
+            await drone.refresh()
+        finally:
+            mount.process.popen.send_signal(signal.SIGCONT)
+        nursery.cancel_scope.cancel()
+    assert turns > 0

@@ -63,7 +63,7 @@ class SpoiltTree(FakeTree):
             raise self.crc_error
         return await super().crc32(path)
 
-    def forget_caches(self) -> None:
+    async def refresh(self) -> None:
         self.forgotten += 1
 
 
