@@ -94,31 +94,36 @@ class Deliverer:
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        context = self._context
-        while (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
-            async with node.lock:
-                if node.claims:  # the name or the content goes first
-                    continue
-                async with context.paths.steady(node, lasting=True):
-                    draft = node.draft
-                    if draft is None or not node.undelivered:
-                        await self.abandon(node)
-                        return
-                    with trio.CancelScope() as node.delivery:  # if cancelled, it begins again
-                        try:
-                            if not context.unfinished.lacks_file(node.path):  # else it is mended in flight
-                                context.require_disarmed()
-                            await self._try(node, draft)
-                            node.error, node.start_after = None, float("-inf")
+        try:
+            while (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
+                async with node.lock:
+                    if node.claims:  # the name or the content goes first: the lock is fair
+                        continue
+                    async with self._context.paths.steady(node, lasting=True):
+                        draft = node.draft
+                        if draft is None or not node.undelivered:
+                            await self.abandon(node)
                             return
-                        except MavftpfsError as error:
-                            self._note_failure(node, draft, error)
-                            raise
-                        finally:
-                            node.delivery = None
-                            self._throttle.waiting.unpark_all()
-                            if node.undelivered:  # also if the caller was cancelled
-                                context.retry_later()
+                        with trio.CancelScope() as node.delivery:  # if a claim cancels it, the loop goes on
+                            await self._deliver(node, draft)
+                            return
+        finally:
+            if node.undelivered:  # also if the caller was cancelled
+                self._context.retry_later()
+
+    async def _deliver(self, node: Node, draft: Draft) -> None:
+        context = self._context
+        try:
+            if not context.unfinished.lacks_file(node.path):  # else it is mended in flight
+                context.require_disarmed()
+            await self._try(node, draft)
+            node.error, node.start_after = None, float("-inf")
+        except MavftpfsError as error:
+            self._note_failure(node, draft, error)
+            raise
+        finally:
+            node.delivery = None
+            self._throttle.waiting.unpark_all()
 
     async def push(self, node: Node) -> None:
         """Begin to send a draft that changed, or go on, while the program writes. The caller has the node's
@@ -288,8 +293,7 @@ class Deliverer:
         await self._context.store.settle(attempt.path)
         if attempt.in_place:
             crc32 = await self._compare(draft, attempt)
-            node.attempt = None
-            await attempt.upload.end()
+            await self._end(node, draft, attempt)
         else:
             crc32 = await self._compare_and_look(node, draft, attempt)
             await self._commit(node, draft, attempt, summed=crc32 is not None)
@@ -403,9 +407,8 @@ class Deliverer:
         """
         own, store, path = self._context.own, self._context.store, node.path
         unfinished = self._context.unfinished
-        node.attempt = None
         try:
-            await attempt.upload.end()
+            await self._end(node, draft, attempt)
             self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
             compared = summed or store.in_doubt()  # as quick as a listing, and tells more
@@ -414,7 +417,6 @@ class Deliverer:
             else:
                 await self._names.replace(attempt.path, path, compared=compared)
         except BaseException as error:
-            draft.give_up()  # does nothing if it commits already
             if draft.state is State.COMMITTING:
                 unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
                 if unknown or unfinished.is_unknown(path):
@@ -427,6 +429,17 @@ class Deliverer:
         finally:
             own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         await self._confirm(node, draft, attempt)
+
+    @staticmethod
+    async def _end(node: Node, draft: Draft, attempt: Attempt) -> None:
+        """End the task of an upload that sent everything. If the caller is cancelled meanwhile, the draft is
+        sent again."""
+        node.attempt = None
+        try:
+            await attempt.upload.end()
+        except BaseException:
+            draft.give_up()
+            raise
 
     async def _confirm(self, node: Node, draft: Draft, attempt: Attempt) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.

@@ -19,6 +19,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, crc32
 from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
@@ -68,6 +69,30 @@ async def test_a_new_file_gets_its_name_when_it_is_whole(each: Rig, data: bytes)
     assert await read_file(tree, FRESH) == data
     assert not data or each.count(Opcode.OPEN_FILE_RO) == opened, "what was just written is known"
     assert each.litter() == []
+
+
+@pytest.mark.holds("promise 3")
+async def test_a_caller_that_is_cancelled_after_the_last_byte_leaves_a_file_that_can_be_sent(
+    each: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between what was compared and its rename, or the end of a delivery that needs none."""
+    tree, end = each.mount(), Upload.end
+    await write_file(tree, b"/d/first", NEW)  # shows whether the card can rename
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, NEW)
+    with trio.CancelScope() as caller:
+
+        async def cancelled(upload: Upload) -> None:
+            caller.cancel()
+            await end(upload)
+
+        monkeypatch.setattr(Upload, "end", cancelled)
+        await file.flush()
+    monkeypatch.undo()
+    assert caller.cancelled_caught
+    await file.flush()
+    await file.release()
+    assert each.data(FRESH) == NEW
 
 
 async def test_whether_the_card_can_rename_is_found_out_once(each: Rig) -> None:
@@ -384,6 +409,20 @@ async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> 
     assert here.data(path) == b"x" * 5000
     assert here.count(Opcode.WRITE_FILE) == sent
     assert here.litter() == []
+
+
+@pytest.mark.holds("promise 3")
+async def test_a_close_that_waits_too_long_for_a_change_of_its_path_is_delivered_later(here: Rig) -> None:
+    tree = here.mount()
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, NEW)
+    async with tree._files.paths.hold(FRESH, lasting=True):
+        with pytest.raises(RequestTimeout):
+            await file.flush()
+        with suppress(RequestTimeout):
+            await file.release()
+    await trio.sleep(BACK_IN)
+    assert here.data(FRESH) == NEW
 
 
 @pytest.mark.holds("promise 2")
