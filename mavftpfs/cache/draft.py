@@ -31,8 +31,8 @@ class State(Enum):
     """How far the vehicle has a draft.
 
     CLEAN: it has all of it. DIRTY: it does not, and nothing is under way. SENDING: a new file is written
-    under a reserved name. COMMITTING: that file is verified and being renamed into place. STALE: the base is
-    another file now.
+    under a reserved name, or under its own if the card cannot rename. COMMITTING: that file is verified and
+    being renamed into place. STALE: the base is another file now.
 
     After interrupted renames it is DIRTY although the vehicle may have it: `replacements` tells.
     """

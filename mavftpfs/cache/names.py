@@ -314,7 +314,8 @@ class Names:
 
     async def _discard_old(self, target: bytes, aside: bytes) -> None:
         """Remove the file that a new one replaced. In doubt a listing has to show the new one first: a late
-        copy of the first rename may have moved it over the old one. `Cleaner.finish` sees to that."""
+        copy of the first rename may have moved it over the old one. `Cleaner.finish` sees to that. Removed or
+        not, the record stays for some seconds: a late copy may bring the old file back."""
         context = self._context
         if not context.store.in_doubt():
             await self.discard(aside)

@@ -98,7 +98,7 @@ class Node:
         self.claims += 1
         try:
             committing = self.draft is not None and self.draft.state is State.COMMITTING
-            if self.delivery is not None and not committing:  # cancelled, its outcome is unknown
+            if self.delivery is not None and not committing:  # else its outcome would not be known
                 self.delivery.cancel()
             await self.lock.acquire()
         finally:

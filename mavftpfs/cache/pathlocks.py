@@ -1,8 +1,8 @@
 """Which paths are being changed: the second of three locks. Layer: cache.
 
 In the order in which they are taken:
-1. The *file lock*, `nodes.Node.lock`. A writer or a delivery of a file has it, and a call that takes its name
-   or content away (`Node.claim`).
+1. The *node's lock*, `nodes.Node.lock`. A writer or a delivery of a file has it, and a call that takes its
+   name or content away (`Node.claim`).
 2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
    Opening or delivering a file holds its path `shared`: beside others that share it, but not during a change
    of its name: then it would find neither the old file nor the new one.

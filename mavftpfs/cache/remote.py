@@ -156,7 +156,8 @@ class Upload(Protocol):
         It may be called again: after an error to go on where it stopped, after success if there is more.
 
         Raises:
-            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed, FileChanged.
+            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed. SessionLost: the session was lost again
+            and again without progress. LocalProtocolError: it was ended meanwhile. Else as the source.
         """
         ...
 

@@ -112,7 +112,7 @@ class Cleaner:
                         context.unfinished.end(path)
 
     async def mend(self, node: Node) -> None:
-        """Mend the name of one file by a listing. The caller has the file's lock."""
+        """Mend the name of one file by a listing. The caller has the node's lock."""
         self._being_delivered.add(node)
         try:
             await self._list(split(node.path)[0])

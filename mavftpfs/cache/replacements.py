@@ -2,14 +2,17 @@
 
 A file is replaced by one rename, or by three requests: the old file moves aside, the new one gets the name,
 and the old one is removed. If they are interrupted, one record says what is known of the name. `names` or
-`delivery`, which notices the interruption, makes the record. The cleaner (`repair`) ends it. A delivery looks
-at it first.
+`delivery`, which notices the interruption, makes the record. The cleaner (`repair`) ends it, or the delivery
+that compared the file, or the next change of the name. A delivery looks at it first.
+
+A replacement that was not interrupted has a record, too, for some seconds (placed: True): a late copy of a
+request could bring the old file back.
 
   aside   placed   the name has
   none    None     the new file, the old one, or nothing: a single rename was interrupted
   set     None     the new file or nothing: the old one was moved aside
   set     False    the old file or nothing: it was perhaps moved aside, and perhaps back
-  set     True     the new file; the old one lies aside for some seconds more
+  set     True     the new file; in doubt the old one still lies aside
 """
 
 from __future__ import annotations
