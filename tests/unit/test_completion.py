@@ -92,3 +92,9 @@ def test_what_tab_offers(ask: Ask, line: str, offered: list[str], absent: list[s
         assert text in answer, answer
     for text in absent:
         assert text not in answer, answer
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_every_command_is_offered(shell: str) -> None:
+    text = completion(cli.whole_parser(), shell)
+    assert [name for name in cli._COMMANDS if name not in text] == []
