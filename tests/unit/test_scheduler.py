@@ -113,3 +113,13 @@ def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> Non
         sink.have = ExtentSet()  # evicted
         assert stream._demand.empty
     assert stream.idle
+
+
+def test_only_what_the_cache_lacks_is_wanted() -> None:
+    sink = MemorySink(1000)
+    stream = FileStream(b"/f", sink, 1000, scheduler())
+    sink.on_data(100, bytes(100))
+    stream.want(100, 200, demand=True)
+    assert stream._demand.empty
+    stream.want(0, 300, demand=True)
+    assert list(stream._demand) == [(0, 100), (200, 300)]
