@@ -191,7 +191,8 @@ class Deliverer:
                 return not node.removed
             if node.writers > 1:
                 return None
-            there: bool | None = False
+            # Where a part was delivered meanwhile, the vehicle has neither the old file nor the new one.
+            there: bool | None = False if node.generation == node.opened_at else None
             try:
                 if context.unfinished.is_unknown(node.path):
                     await self._mend(node, draft)

@@ -50,15 +50,16 @@ class Attempt:
 class Node:
     """One file.
 
-    path: its name, or the reserved name that it was hidden under. draft: its content here, if it was written.
-    handles: how many are open; writers: how many of them are for writing. generation: counts how often we
-    changed its content on the vehicle. removed: it has no name any more. hidden: it was unlinked while it was
-    open, and is still on the vehicle under a reserved name. error: why the last delivery failed. attempt: the
-    present attempt to deliver it. base: a handle on the vehicle's file. start_after: no upload begins by
-    itself before that time (infinite: only a close sends the file). proven_at: when the vehicle was last
-    proven to have what the draft says it has. lock: a program writes the file, a delivery is under way, or a
-    call takes its name away. delivery: the scope of the delivery under way. claims: how many calls wait for
-    the lock to take its name or content away; they go before deliveries.
+    path: its name, or the reserved name that it was hidden under. draft: its content here, if it was
+    written. handles: how many are open; writers: how many of them are for writing. generation: counts how
+    often we changed its content on the vehicle; opened_at: that count when its first writer opened it.
+    removed: it has no name any more. hidden: it was unlinked while it was open, and is still on the vehicle
+    under a reserved name. error: why the last delivery failed. attempt: the present attempt to deliver it.
+    base: a handle on the vehicle's file. start_after: no upload begins by itself before that time
+    (infinite: only a close sends the file). proven_at: when the vehicle was last proven to have what the
+    draft says it has. lock: a program writes the file, a delivery is under way, or a call takes its name
+    away. delivery: the scope of the delivery under way. claims: how many calls wait for the lock to take
+    its name or content away; they go before deliveries.
     """
 
     path: bytes
@@ -66,6 +67,7 @@ class Node:
     handles: int = 0
     writers: int = 0
     generation: int = 0
+    opened_at: int = 0
     removed: bool = False
     hidden: bool = False
     error: MavftpfsError | None = None

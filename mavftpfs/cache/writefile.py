@@ -187,6 +187,8 @@ class WriteFile(ReadFile):
         """`made`: there was no such file before."""
         super().__init__(parts, node)
         self._made = made
+        if not node.writers:
+            node.opened_at = node.generation
         node.writers += 1
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:

@@ -183,6 +183,24 @@ except mavftpfs.NotDelivered as error:
     assert ("None" in done.stdout) == (end == "close")
 
 
+@pytest.mark.mount
+def test_after_a_part_was_delivered_nobody_claims_that_the_old_file_is_there(
+    sim: SimVehicle, field: Field
+) -> None:
+    mount = field.mount(sim.source, "op_deadline=2")
+    with mavftpfs.connect(str(mount.path)) as drone:
+        file = drone.open("/f", "wb", buffering=0)
+        file.write(b"half")
+        subprocess.run(["true"], check=True)
+        wait_until("the part is there", lambda: on_card(sim) == {"f": b"half"})
+        file.write(NEW)
+        with silent(sim), pytest.raises(mavftpfs.NotDelivered, match="look before you use it") as caught:
+            file.close()
+        assert caught.value.on_vehicle is None
+        settle(drone)
+        assert on_card(sim) == {"f": b"half"}
+
+
 # -- Ctrl-C ---------------------------------------------------------------------------------------
 
 
