@@ -40,14 +40,14 @@ THEIRS = content(20_000, 2)
 
 
 class Crowd:
-    """A vehicle at HERE. other: another one with a file of that name."""
+    """A vehicle at HERE: this component of it (1: the autopilot). other: another vehicle with such a file."""
 
-    def __init__(self) -> None:
-        self.rig = Rig("px4", link=LinkSettings(delay=0.02))
-        self.rig.card.add(b"/f", OURS)
-        self.link = CrowdedLink(self.rig.vehicle, self.rig.model, HERE)
-        self.rig.link = self.link
-        self.ours = self.rig.vehicle
+    def __init__(self, profile: str = "px4", component: int = 1) -> None:
+        self.rig = Rig(profile, {b"/f": OURS}, LinkSettings(delay=0.02))
+        self.rig.vehicle = self.ours = SimVehicle(
+            self.rig.card, PROFILES[profile], rng=random.Random(1), address=Address(1, component)
+        )
+        self.rig.link = self.link = CrowdedLink(self.ours, self.rig.model, HERE)
         tree = MemoryTree()
         tree.add(b"/f", THEIRS)
         self.other = SimVehicle(tree, PROFILES["px4"], rng=random.Random(99))
@@ -58,11 +58,11 @@ class Crowd:
         self.link.address = address
         self.link.kick()
 
-    async def beat(self, address: tuple[str, int]) -> None:
-        """Send ten heartbeats a second in the vehicle's name, for ever."""
+    async def beat(self, address: tuple[str, int] | None, pause: float = 0.1, armed: bool = False) -> None:
+        """Send heartbeats in the autopilot's name, for ever. address: None for where the vehicle is then."""
         for seq in range(1 << 20):
-            self.link.intrude(address, heartbeat(seq))
-            await trio.sleep(0.1)
+            self.link.intrude(address or self.link.address, heartbeat(seq, armed=armed))
+            await trio.sleep(pause)
 
 
 async def told(connection: Connection) -> None:
@@ -155,19 +155,9 @@ async def test_a_companion_has_an_address_of_its_own(
 ) -> None:
     """Our target is not the autopilot, whose heartbeats come from elsewhere and say whether it is armed."""
     monkeypatch.setitem(sim_vehicle._AUTOPILOT_TYPE, Family.MAVSDK, MAV_AUTOPILOT_INVALID)
-    scene = Crowd()
-    scene.rig.vehicle = SimVehicle(
-        scene.rig.card, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
-    )
-    link = scene.rig.link = CrowdedLink(scene.rig.vehicle, scene.rig.model, HERE)
+    scene = Crowd("mavsdk", component=191)
     async with trio.open_nursery() as nursery:
-
-        async def autopilot() -> None:
-            for seq in range(1 << 20):
-                link.intrude(THERE, heartbeat(seq, armed=True))
-                await trio.sleep(1.0)
-
-        nursery.start_soon(autopilot)
+        nursery.start_soon(scene.beat, THERE, 1.0, True)
         async with scene.rig.connected(ConnectOptions(target_component=191)) as connection:
             await trio.sleep(2.0)
             assert await read_file(connection, b"/f") == OURS
@@ -397,27 +387,15 @@ async def test_ours_is_known_again_though_nobody_was_silent(
 async def test_a_target_without_heartbeats_moves_with_its_autopilot(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = Crowd()
-    scene.rig.vehicle = SimVehicle(
-        scene.rig.card, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
-    )
+    scene = Crowd("mavsdk", component=191)
     monkeypatch.setattr(
-        scene.rig.vehicle,
-        "_beat",
-        lambda frames, now: scene.rig.vehicle.__setattr__("_next_beat", now + 1),
+        scene.ours, "_beat", lambda frames, now: scene.ours.__setattr__("_next_beat", now + 1)
     )
-    link = scene.rig.link = CrowdedLink(scene.rig.vehicle, scene.rig.model, HERE)
     async with trio.open_nursery() as nursery:
-
-        async def autopilot() -> None:
-            for seq in range(1 << 20):
-                link.intrude(link.address, heartbeat(seq))
-                await trio.sleep(1.0)
-
-        nursery.start_soon(autopilot)
+        nursery.start_soon(scene.beat, None, 1.0)
         async with scene.rig.connected(ConnectOptions(target_component=191)) as connection:
             assert await read_file(connection, b"/f") == OURS
-            link.address = THERE
+            scene.link.address = THERE
             await trio.sleep(20.0)
             assert await read_file(connection, b"/f") == OURS
             assert connection.status()["link"]["address"] == "10.0.0.2:14550"
