@@ -123,3 +123,11 @@ def test_only_what_the_cache_lacks_is_wanted() -> None:
     assert stream._demand.empty
     stream.want(0, 300, demand=True)
     assert list(stream._demand) == [(0, 100), (200, 300)]
+
+
+def test_a_closed_stream_wants_nothing() -> None:
+    stream = FileStream(b"/f", MemorySink(1000), 1000, scheduler())
+    stream.want(0, 100, demand=True)
+    stream.close()
+    stream.want(0, 100, demand=True)
+    assert stream._demand.empty
