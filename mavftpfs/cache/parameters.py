@@ -25,7 +25,7 @@ from mavftpfs.cache.texts import (
 from mavftpfs.cache.virtual import PARAM_FILE
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import Download, pack_upload, unpack
-from mavftpfs.parameters.saving import Values, Verdict, judge, make_plan, pick_base, unchanged
+from mavftpfs.parameters.saving import Base, Values, Verdict, judge, make_plan, pick_base, unchanged
 from mavftpfs.parameters.text import (
     Line,
     Problem,
@@ -60,7 +60,7 @@ class Snapshot:
     since_ns: int
 
 
-class Parameters(Texts[Values]):
+class Parameters(Texts[Base]):
     """The texts of `@PARAM`."""
 
     directory = split(PARAM_FILE)[0]
@@ -69,7 +69,7 @@ class Parameters(Texts[Values]):
     def __init__(self, access: Access) -> None:
         super().__init__(access)
         self._snapshot: Snapshot | None = None
-        self._rendered: dict[bytes, Shown[Values]] = {}
+        self._rendered: dict[bytes, Shown[Base]] = {}
         self._defaults: dict[str, Number] | None = None
         self._tells_defaults: bool | None = None
 
@@ -82,7 +82,7 @@ class Parameters(Texts[Values]):
 
     # --- reading
 
-    async def show(self, name: bytes, *, reread: bool) -> Shown[Values]:
+    async def show(self, name: bytes, *, reread: bool) -> Shown[Base]:
         """See Texts."""
         snapshot = await self._read(reread=reread)
         differing = await self._differing(snapshot) if name == CHANGED else None
@@ -91,9 +91,7 @@ class Parameters(Texts[Values]):
             shown = self._rendered[name] = self._render(name, snapshot, differing)
         return shown
 
-    def _render(
-        self, name: bytes, snapshot: Snapshot, differing: Sequence[Parameter] | None
-    ) -> Shown[Values]:
+    def _render(self, name: bytes, snapshot: Snapshot, differing: Sequence[Parameter] | None) -> Shown[Base]:
         if name == CHANGED:
             differing = require_found(differing, name)
             values = {one.name: one for one in differing}
@@ -161,13 +159,13 @@ class Parameters(Texts[Values]):
 
     # --- saving
 
-    async def carry_out(self, save: Save[Values]) -> Saved[Values]:
+    async def carry_out(self, save: Save[Base]) -> Saved[Base]:
         """See Texts."""
         lines, notes = self._parse(save)
         base = pick_base(lines, save.bases, rereads=save.rereads)
         changed = [line for line in lines if base is None or not unchanged(line, base)]
         if not changed:
-            return Saved(notes=notes)
+            return Saved(None if base is None else [base], notes=notes)
         before = (await self._read(reread=True)).values
         plan = make_plan(changed, base, before, meant=save.appended)
         if plan.problems:
@@ -175,13 +173,14 @@ class Parameters(Texts[Values]):
         if plan.conflicts:
             raise Refused(NotTaken(plan.conflicts[0]), [*plan.conflicts, "nothing was set"])
         # From now on each line that the program changed itself counts, also if it is changed back.
-        names = {line.name for line in changed}
-        known = [{name: one for name, one in read.items() if name not in names} for read in save.bases]
+        counting = dict.fromkeys(line.name for line in changed)
         if plan.wanted:
+            known = [{**read, **counting} for read in save.bases]
             notes += (await self._set(save.name, plan.wanted, known)).notes
-        return Saved(known, bool(plan.wanted), notes + plan.notes)
+        known = [] if base is None else [{**base, **counting}]
+        return Saved(known or None, bool(plan.wanted), notes + plan.notes)
 
-    def _parse(self, save: Save[Values]) -> tuple[list[Line], list[str]]:
+    def _parse(self, save: Save[Base]) -> tuple[list[Line], list[str]]:
         """Return a text's lines, and notes.
 
         Raises:
@@ -199,7 +198,7 @@ class Parameters(Texts[Values]):
         others = sorted({line.system for line in lines if line.system not in (None, system)} - {None})
         return lines, [f"the lines are of system {other}, this is system {system}" for other in others]
 
-    async def _set(self, name: bytes, wanted: Sequence[Parameter], known: Sequence[Values]) -> Verdict:
+    async def _set(self, name: bytes, wanted: Sequence[Parameter], known: Sequence[Base]) -> Verdict:
         """Set values, and read back whether they hold. known: for Refused.
 
         Raises:

@@ -250,7 +250,8 @@ class Texts(ABC, Generic[B]):
         if text not in reads.texts:
             reads.texts = [*reads.texts, text][-MAX_PROGRAM_READS:]
         if not any(known is base for known in reads.bases):
-            reads.bases = [*reads.bases, base][-MAX_PROGRAM_READS:]
+            # The oldest stays: an editor made its text from that.
+            reads.bases = [*reads.bases[:1], *[*reads.bases[1:], base][1 - MAX_PROGRAM_READS :]]
             self._bound_reads()
 
     def _bound_reads(self) -> None:
@@ -297,8 +298,8 @@ class Texts(ABC, Generic[B]):
             finally:
                 self._upload = None
             self._failed = None
-            self._know(program, done.known)
-            if not puts_back:
+            if not puts_back:  # else it still has the text that it could not save
+                self._know(program, done.known)
                 self._tell(name, done.notes)
             elif done.sent:
                 self._tell(name, ["the program put back what it had read", *done.notes], more=True)

@@ -18,7 +18,11 @@ Values = Mapping[str, Parameter]
 """Parameters by name."""
 
 
-def unchanged(line: Line, base: Values) -> bool:
+Base = Mapping[str, Parameter | None]
+"""What a program read, by names. None: it has saved another value since, so its line counts in any case."""
+
+
+def unchanged(line: Line, base: Base) -> bool:
     """Return whether a line says what the base says."""
     known = base.get(line.name)
     if known is None:
@@ -29,7 +33,7 @@ def unchanged(line: Line, base: Values) -> bool:
         return False
 
 
-def pick_base(lines: Sequence[Line], bases: Sequence[Values], *, rereads: bool) -> Values | None:
+def pick_base(lines: Sequence[Line], bases: Sequence[Base], *, rereads: bool) -> Base | None:
     """Return the base that a text was made from: the one with which it shares the most lines, of several the
     last.
 
@@ -39,7 +43,9 @@ def pick_base(lines: Sequence[Line], bases: Sequence[Values], *, rereads: bool) 
     """
     if len(bases) < 2:
         return bases[0] if bases else None
-    shared = [sum(unchanged(line, base) for line in lines) for base in bases]
+    shared = [
+        sum(base.get(line.name, line) is None or unchanged(line, base) for line in lines) for base in bases
+    ]
     best = max(range(len(bases)), key=lambda place: (shared[place], place))
     if shared[best] == len(lines) and not rereads:
         best = len(bases) - 1
@@ -61,7 +67,7 @@ class Plan:
     notes: list[str] = field(default_factory=list)
 
 
-def make_plan(lines: Sequence[Line], base: Values | None, current: Values, *, meant: bool) -> Plan:
+def make_plan(lines: Sequence[Line], base: Base | None, current: Values, *, meant: bool) -> Plan:
     """Compare a text with what the vehicle has.
 
     meant: each line was written by itself (`>>`), so even a parameter that the vehicle sets by itself is set.

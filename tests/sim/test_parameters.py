@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -12,7 +12,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.texts import MAX_READS
+from mavftpfs.cache.texts import MAX_PROGRAM_READS, MAX_READS
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session
@@ -262,6 +262,44 @@ async def test_an_editor_that_reads_again_for_its_backup(profile: str) -> None:
 
 
 @MARKS
+async def test_many_refused_saves_take_no_editor_its_base(profile: str) -> None:
+    async with vehicle(profile, parameters=many(drifting=5)) as (here, tree):
+        editor = await Editor(tree).read()
+        for value in (*["rubbish"] * (MAX_PROGRAM_READS + 2), "77"):
+            await trio.sleep(20)
+            with pytest.raises(ReadOnly):
+                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
+            edited = editor.lines
+            await editor.read()
+            editor.lines = edited
+            before = [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")]
+            with pytest.raises(InvalidText) if value == "rubbish" else nullcontext():
+                await editor.edit("MODE_001", value).save()
+        assert number(here, "MODE_001") == 77
+        assert [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")] >= before
+
+
+@MARKS
+async def test_several_saves_of_one_editor_write_nothing_back(profile: str) -> None:
+    """What the user changed in the first save does not make the text less like what was read first."""
+    async with vehicle(profile, parameters=many(drifting=1)) as (here, tree):
+        editor = await Editor(tree).read()
+        for round_ in range(3):
+            await trio.sleep(20)
+            with pytest.raises(ReadOnly):
+                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
+            edited = editor.lines
+            await editor.read()
+            editor.lines = edited
+            for number_ in range(5 * round_, 5 * round_ + 5):
+                editor.edit(f"MODE_{number_:03}", "77")
+            before = [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")]
+            await editor.save()
+            assert number(here, f"MODE_{5 * round_ + 4:03}") == 77
+            assert [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")] >= before
+
+
+@MARKS
 @pytest.mark.parametrize("bad", ["MODE_002,rubbish", "CLAMPED,70"])
 async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: str, bad: str) -> None:
     """vim does: what failed stays said, and nothing else is set than what the failed save had set."""
@@ -286,7 +324,16 @@ async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: 
         assert (number(here, "MODE_001"), number(here, "CLAMPED")) == (1, 1)
         assert (await errors(tree)).startswith(said)
         assert ("put back" in await errors(tree)) is (bad == "CLAMPED,70")
-        await editor.save()
+        await trio.sleep(20)
+        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
+        with pytest.raises(ReadOnly):
+            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
+        await editor.read()
+        editor.lines = edited
+        await editor.edit("MODE_002", "2").edit("CLAMPED", "1").save()
+        for one in table_of(here).visible(here.server.firmware.now):
+            assert one.number >= before[one.name], one.name
+        assert number(here, "MODE_001") == 5
         assert await errors(tree) == ""
 
 
