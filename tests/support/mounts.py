@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from base64 import b64decode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -226,8 +227,7 @@ class Mount:
 
     def read_bytes(self, path: str | Path, timeout: float = COMMAND_TIMEOUT) -> bytes:
         """Return a file's content, read by a process of its own."""
-        code = "import sys; print(open(sys.argv[1], 'rb').read().hex())"
-        return bytes.fromhex(self.python(code, path, timeout=timeout))
+        return b64decode(self.run("base64", path, timeout=timeout).stdout)
 
     def errno_of(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
         """Return the name of the errno of the OSError that a snippet ends with, '' if it succeeds."""
