@@ -84,6 +84,7 @@ def test_what_cannot_be_is_one_line_and_sets_nothing(source: str) -> None:
     assert param(source, "RTL_ALT") == ["RTL_ALT,1500"]
 
 
+@THROUGH_A_MOUNT
 def test_saving_comparing_and_loading(source: str, tmp_path: Path) -> None:
     saved, qgc = tmp_path / "a.parm", tmp_path / "a.params"
     param(source, "--save", saved)
