@@ -122,7 +122,7 @@ def test_editing(home: Home, field: Field) -> None:
     home.mountpoint.mkdir()
     home.run(with_vehicle(MOUNTS[0], home, field, "ardupilot"))
     vim, cp, cat = block("Editing")
-    home.run(vim.replace("vim ", "vim -es -u NONE -c 's/1/2/' -c wq "))
+    home.run(vim.replace("vim ", "vim -es -V1 -u NONE -c 's/1/2/' -c wq "))
     assert (home.card / "APM/scripts/hover.lua").read_text() == "return 2\n"
     home.run(cp)
     assert (home.card / "fs/microsd/etc/params.txt").read_text() == (home.path / "params.txt").read_text()
@@ -135,7 +135,7 @@ def test_parameters(home: Home, field: Field) -> None:
     home.run(with_vehicle(MOUNTS[0], home, field, "ardupilot"))
     vim, save, diff = block("Parameters")
     home.run(save)
-    home.run(vim.replace("vim ", "vim -es -u NONE -c '%s/^RTL_ALT,.*/RTL_ALT,3000/' -c wq "))
+    home.run(vim.replace("vim ", "vim -es -V1 -u NONE -c '%s/^RTL_ALT,.*/RTL_ALT,3000/' -c wq "))
     assert home.run("grep ^RTL_ALT, ~/drone/@PARAM/params.parm") == "RTL_ALT,3000\n"
     assert home.run(f"{diff} || test $? = 1").split()[-3:] == ["RTL_ALT", "3000", "1500"]
     home.run(diff.replace("--diff", "--load"))
