@@ -1,8 +1,8 @@
 """The pump between link and engine. Layer: session; the only task that reads the link.
 
-Everything but `pump` and `run` is synchronous: an operation started by any task is on the wire before
-that task next awaits. Tasks that wait are woken once per batch of input, never once per packet: a trio
-event and a time-out per request cost more than the rest of a chunk together.
+An operation that a task starts (`start`, `run`) is on the wire before that task next awaits, unless a taken
+session asks for silence (`be_silent`). Tasks that wait are woken once per batch of input, never once per
+packet: a trio event and a time-out per request cost more than the rest of a chunk together.
 """
 
 from __future__ import annotations

@@ -94,7 +94,8 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        asked_at: since when it waits for its turn; None if that is for readahead alone. It stays set in it.
+        asked_at: since when it waits for its turn; None if that is for readahead alone. It stays set during
+            the turn.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -120,7 +121,8 @@ class SessionUser:
         return False
 
     def on_queued(self) -> None:
-        """It waits, and the vehicle answered in another user's turn, so this is no silence of the vehicle."""
+        """The vehicle answered in another user's turn, while this one waited: that is no silence of the
+        vehicle."""
 
     def on_removed(self) -> None:
         """The file of its path was removed or replaced."""
@@ -178,7 +180,7 @@ class Turn:
 
     async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
         """Close what is open and open another file; raises what ServerSession.open does."""
-        assert self._scheduler.held is self
+        assert self._scheduler.holder is self
         return await self._scheduler.server.open(path, opcode)
 
     @property
@@ -207,7 +209,7 @@ class Scheduler:
 
     Attributes:
         users: the readers and uploads there are.
-        held: the turn that was granted and is not over. serving: set once `serve` runs.
+        holder: the turn that was granted and is not over. serving: set once `serve` runs.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
 
@@ -228,7 +230,7 @@ class Scheduler:
         self.users: dict[SessionUser, None] = {}
         self.serving = trio.Event()
         self._gone: deque[tuple[float, SessionUser]] = deque()  # with the time when they were removed
-        self.held: Turn | None = None
+        self.holder: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
         self._patience = 1.02 * op_deadline  # if no request is answered, that is news before
@@ -264,8 +266,10 @@ class Scheduler:
         self.server.wake()
 
     def renew(self, user: SessionUser) -> None:
-        """A caller begins to wait for it now; its patience begins anew."""
-        user.asked_at = self.clock()
+        """A caller begins to wait for it now: its patience begins anew. If it waits already, it keeps its
+        place."""
+        if user.asked_at is None:
+            user.asked_at = self.clock()
         if user in self._queue:
             self._be_patient(self._queue[user])
 
@@ -290,27 +294,27 @@ class Scheduler:
             self._be_patient(turn)
             with turn.patience:
                 await turn.granted.wait()
-            if self.held is not turn:
-                raise SessionBusy(_OTHERS) if self.clock() < self.held_until else RequestTimeout(_KEPT)
+            if self.holder is not turn:
+                raise SessionBusy(_OTHERS) if self.clock() < self.others_until else RequestTimeout(_KEPT)
             self.server.vehicle.require(self.clock(), writing=user.writing)
             yield turn
         finally:
             if self._queue.get(user) is turn:
                 del self._queue[user]
-            if self.held is turn:
+            if self.holder is turn:
                 self._hold(None)
             turn.ended.set()
 
     def _hold(self, turn: Turn | None) -> None:
-        self.held = turn
+        self.holder = turn
         self.server.changed.unpark_all()
 
     def assert_no_turn(self) -> None:
         """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
-        assert self.held is None or self.held.task is not trio.lowlevel.current_task(), "not in a turn"
+        assert self.holder is None or self.holder.task is not trio.lowlevel.current_task(), "not in a turn"
 
     def waiting(self, now: float) -> list[SessionUser]:
-        """Return the users that somebody waits for, and that could use the session now."""
+        """Return the users that want more than readahead, and could use the session now."""
         return [user for user in self._queue if user.asked_at is not None and self._may_use(user, now)]
 
     def first(self) -> SessionUser | None:
@@ -333,10 +337,10 @@ class Scheduler:
         if self.is_excluded(user.path):
             return False
         session = self.server.session
-        return now >= self.held_until or (session is not None and user.goes_on(session))
+        return now >= self.others_until or (session is not None and user.goes_on(session))
 
     @property
-    def held_until(self) -> float:
+    def others_until(self) -> float:
         """Before this nothing is opened: that might end another client's session."""
         several = self._driver.engine.traits.several_sessions
         return -inf if several else self.server.others.file_open_until
@@ -374,8 +378,8 @@ class Scheduler:
         used = list(self.server.maybe_open.values())
         if self.server.session is not None:
             used.append(self.server.session.path)
-        if self.held is not None:
-            used.append(self.held.user.path)
+        if self.holder is not None:
+            used.append(self.holder.user.path)
         return used
 
     async def _close_excluded(self) -> None:
@@ -482,18 +486,19 @@ class Scheduler:
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
         server, news_in = self.server, inf
-        if self._queue and now < self.held_until:
+        if self._queue and now < self.others_until:
             await server.find_out_sessions()
             for user in self._queue:
                 user.on_queued()
-            news_in = max(0.0, self.held_until - now)
+            news_in = max(0.0, self.others_until - now)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(server.session.path) else 0.0
             if not await server.sleep(min(left, news_in)) and self.first() is None:
                 await server.close_quietly()
         elif server.state is State.MAYBE_OPEN and not server.vehicle.lost(now):
-            # An open or a Terminate that was never answered: leave no orphan over there.
+            # An open or a Terminate that was never answered: leave no orphan over there. Any news begins this
+            # wait anew.
             if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)):
                 await server.close_maybe_open()
         else:

@@ -1,6 +1,7 @@
 """The server's one session: its states, opening and closing, and what to do when it is taken. Layer: session.
 
-One task, the scheduler's, opens, uses and closes it.
+The task that has the turn opens, uses and closes it. Between turns the scheduler's task (`serve`) closes it.
+The task that reads the link may abandon it.
 
 Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
 (ArduPilot, the same id). ArduPilot refuses all other requests with 4, too (docs/servers.md 1). Asking again
@@ -78,8 +79,8 @@ class State(Enum):
 
 
 SESSION_NEXT: dict[State, frozenset[State]] = {
-    # Opening closes first what may be open; a refusal of the open itself proves that nothing is open.
     State.CLOSED: frozenset((State.OPENING,)),
+    # Opening closes first what may be open; a refusal of the open itself proves that nothing is open.
     State.OPENING: frozenset((State.OPEN, State.CLOSED, State.MAYBE_OPEN)),
     # Lost, or not believed any more after a silence, a restart, or an answer that nothing explains.
     State.OPEN: frozenset((State.CLOSING, State.MAYBE_OPEN)),
@@ -199,16 +200,17 @@ class ServerSession:
         self.changed = trio.lowlevel.ParkingLot()
 
     def _enter(self, state: State, session: OpenSession | None = None) -> None:
-        """Go on to a state; to CLOSED only if nothing may be open by our doing, else to MAYBE_OPEN."""
         if self.session is not None:  # it is open over there until Terminate is ACKed
             self.maybe_open[self.session.id] = self.session.path
             self.engine.session = self.engine.home_session
-        if state is State.CLOSED and self.maybe_open:
-            state = State.MAYBE_OPEN
         assert state in SESSION_NEXT[self.state], f"{self.state} does not become {state}"
         assert (session is not None) == (state is State.OPEN)
         self.state, self.session = state, session
         self.changed.unpark_all()
+
+    def _enter_closed(self) -> None:
+        """Go on to CLOSED, or to MAYBE_OPEN if something may be open by our doing."""
+        self._enter(State.MAYBE_OPEN if self.maybe_open else State.CLOSED)
 
     # --- waiting
 
@@ -240,7 +242,7 @@ class ServerSession:
                 await self._close_what_may_be_ours()
             session = await self._open_past_others(path, opcode)
         except BaseException:
-            self._enter(State.CLOSED)
+            self._enter_closed()
             raise
         finally:
             if opcode == Opcode.CREATE_FILE:
@@ -317,7 +319,7 @@ class ServerSession:
                 raise
             return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
         finally:
-            self._enter(State.CLOSED)
+            self._enter_closed()
 
     async def close_quietly(self) -> None:
         """Close where no caller is to be told of a failure."""
@@ -333,7 +335,7 @@ class ServerSession:
             with suppress(MavftpfsError):
                 await self._close_what_may_be_ours()
         finally:
-            self._enter(State.CLOSED)
+            self._enter_closed()
 
     async def _close_what_may_be_ours(self) -> bool:
         """Close what may be open by our doing, but not what another client may own; return whether something

@@ -94,7 +94,7 @@ class Upload(SessionUser):
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
-        self._held = False  # only `finish` goes on: it was refused, or all is to be sent again
+        self._parked = False  # nothing is sent before the next `finish`: refused, or all would go again
         self._ended = False  # given up by its owner
         self._over = trio.Event()  # and its task has seen that
         self._retry_at = 0.0  # not to be touched before
@@ -102,7 +102,7 @@ class Upload(SessionUser):
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
         self._reboots = scheduler.server.vehicle.reboots  # when its file was opened last
         self._refused_at: int | None = None  # where a write was refused last as if the session were lost
-        self._failures = 0
+        self._failures = 0  # of the link, and losses of the session without progress
         self._furthest = 0  # in the file, when the session was lost the last time
 
     # --- the owner's side
@@ -119,7 +119,7 @@ class Upload(SessionUser):
         if self._ended:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._held, self._refused_at, self._failures, self._retry_at = False, None, 0, 0.0
+        self._parked, self._refused_at, self._failures, self._retry_at = False, None, 0, 0.0
         first, finisher = not self.awaited, Future()
         self._finishers.append(finisher)
         if first:
@@ -189,7 +189,7 @@ class Upload(SessionUser):
         """Return in how many seconds it wants a turn, unless it is woken before. A vehicle that is lost is
         tried only while a caller waits."""
         now = self._clock()
-        wanted = self.awaited or (not self._held and self._has_work())
+        wanted = self.awaited or (not self._parked and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
         silent = not self.awaited and self._vehicle.lost(now)
@@ -205,7 +205,7 @@ class Upload(SessionUser):
         for finisher in self._finishers:
             finisher.end(error)
         self._failures += 1
-        self._held = isinstance(error, REFUSALS)
+        self._parked = isinstance(error, REFUSALS)
         self._retry_at = self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5))
 
     async def _use(self, turn: Turn) -> None:
@@ -258,11 +258,11 @@ class Upload(SessionUser):
         Raises:
             MavftpfsError: the source fails.
         """
-        self._source.has_more()
+        self._source.has_more()  # raises what the source failed with
         for finisher in finishers:
             finisher.end()
         self._failures = 0
-        self._held = self._source.closed and not self._resumable()
+        self._parked = self._source.closed and not self._resumable()
 
     # --- opening
 
@@ -332,8 +332,8 @@ class Upload(SessionUser):
         gate.shut = traits.paths_disarm
         try:
             while True:
-                # While a light user waits, a short queue is half filled: the Terminate finds a place in it,
-                # and is not behind as many writes.
+                # If a light user waits already, a short queue is half filled: the Terminate finds a place in
+                # it, and is not behind as many writes.
                 rival = turn.rival
                 queue = traits.queue_limit
                 most = queue // 2 if queue and rival is not None and rival < LIGHT_USE else None
@@ -346,7 +346,7 @@ class Upload(SessionUser):
                     await self._driver.start(transfer, server.wake, self._on_batch)
                     stop = await self._watch(turn, session, transfer)
                 finally:
-                    if not transfer.trailing:
+                    if not transfer.trailing:  # else its last answers come while `_close` waits for its own
                         self._end_transfer()
                 if transfer.acked_bytes and rearmed:
                     traits.paths_disarm, rearmed = True, False
@@ -380,12 +380,12 @@ class Upload(SessionUser):
             if not transfer.starved:
                 fed_at = clock()
             rival = turn.rival
-            stop = stop or self._reason_to_stop(session, transfer, fed_at, rival)
+            stop = self._reason_to_stop(session, transfer, fed_at, rival) or stop
             if server.is_stalled(transfer):
                 # Another client may have taken the session (servers.md 14.9). Where closing would cost the
                 # whole file, only if another client was heard; else the server will tell.
-                rivals = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
-                stop = Stop.DOUBT if rivals else stop
+                closes = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
+                stop = Stop.DOUBT if closes else stop
             if stop is not None:
                 transfer.paused = True
                 if transfer.idle or stop in _ABRUPT or self._let_trail(stop, transfer):

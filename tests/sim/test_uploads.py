@@ -259,6 +259,28 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
     assert here.data(b"/d/new") == data
 
 
+@pytest.mark.holds("promise 9")
+async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
+    """What is in flight is not answered, so the reader that is to go first still waits."""
+    here = Rig("px4", {b"/d/f": content(1000)}, PLAIN)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        upload = await start(connection, "px4", MemorySource(content(60_000)))
+
+        async def finish() -> None:
+            with pytest.raises(Armed):
+                await upload.finish()
+
+        nursery.start_soon(finish)
+        await trio.sleep(1.5)
+        here.faults.ignore(Opcode.WRITE_FILE)
+        nursery.start_soon(read_file, connection, path("px4", "f"))
+        await trio.sleep(1.0)
+        here.vehicle.arm()
+        here.link.kick()
+        await trio.sleep(0.2)
+        assert connection.scheduler.server.session is None
+
+
 @pytest.mark.parametrize("more", [b"", b"more"])
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
 async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: str, more: bytes) -> None:
