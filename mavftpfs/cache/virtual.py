@@ -55,6 +55,10 @@ LIVE_TIME = 1.0
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
+PROBE_PAUSE = 15.0
+"""Seconds between two probes for which no program asked. A session that a killed program left may be in the
+way, and PX4 ends that only after 10 s without requests."""
+
 MAX_SEEN = 4096
 """Of so many files it is remembered what reading them showed."""
 
@@ -122,7 +126,8 @@ class VirtualTrees:
         self._invalidate = invalidate
         self._reading: SingleFlight[bytes, bytes] = SingleFlight(nursery)
         self._seen: OrderedDict[bytes, Seen] = OrderedDict()
-        self._probing: SingleFlight[None, None] = SingleFlight(nursery)
+        self._probing: SingleFlight[None, None] = SingleFlight()  # it ends with the caller's patience
+        self._probe_at = -math.inf
         self._has_parameters: bool | None = None
 
     @property
@@ -149,7 +154,8 @@ class VirtualTrees:
             return
         if asked_for:
             await self._probing.run(None, self._probe_once)
-        elif not self._store.others_heard():
+        elif not self._store.others_heard() and self._clock() >= self._probe_at:
+            self._probe_at = self._clock() + PROBE_PAUSE
             with (
                 suppress(RequestTimeout, LinkError, SessionBusy),
                 trio.move_on_after(self._options.probe_time),
@@ -270,7 +276,7 @@ class VirtualTrees:
     def forget(self) -> None:
         """Forget all snapshots, and what opened or did not."""
         self._seen.clear()
-        self._has_parameters = None
+        self._has_parameters, self._probe_at = None, -math.inf
 
     # --- finding
 

@@ -8,7 +8,8 @@ import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32, request
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
@@ -52,6 +53,7 @@ async def here() -> AsyncIterator[Rig]:
 
 
 px4 = card({b"/fs/a": b"a"})
+nuttx = card({b"/fs/a": b"a"}, profiles=("px4-nuttx",))
 px4_2026 = card({b"/fs/a": b"a"}, profiles=("px4-2026",))
 
 
@@ -103,6 +105,23 @@ async def test_beside_another_client_a_server_is_probed_only_if_somebody_asks(px
     assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
     assert px4_2026.count(OPEN) == 1
     assert await names(tree, b"/") == {b"fs", b"@PARAM"}
+
+
+async def test_the_probe_waits_for_no_session_that_a_killed_program_left(nuttx: Rig) -> None:
+    """That takes ten seconds of silence, which only a program that wants to open a file should wait for."""
+    nuttx.faults.lose_reply_to(OPEN)
+    left = request(1, OPEN, data=b"/fs/microsd/fs/a").encode()
+    nuttx.server.handle(left, Address(254, 25), trio.current_time())
+    tree, began = nuttx.mount(root=b"/"), trio.current_time()
+    assert await names(tree, b"/") == {b"fs"}
+    assert trio.current_time() - began < 4.0
+    await trio.sleep(1.0)
+    asked, began = nuttx.count(OPEN), trio.current_time()
+    assert await names(tree, b"/fs") == {b"microsd"}
+    assert trio.current_time() - began < 1.0
+    assert await names(tree, b"/") == {b"fs"}
+    assert nuttx.count(OPEN) == asked
+    assert await read_file(tree, b"/fs/microsd/fs/a") == b"a"
 
 
 async def test_parameters_that_open_make_their_directory_appear(px4_2026: Rig) -> None:
