@@ -504,6 +504,7 @@ async def test_flight_after_flight_without_growth(day: Day, flights: int, every:
     async with day.watched():
         for number in range(flights):
             await day.fly("log.ulg", content(2000, number))
+            await day.until_handed(number + 1)  # files are written in real time
             await trio.sleep(every - 30.0)
             gc.collect()
             sizes.append(len(gc.get_objects()))
