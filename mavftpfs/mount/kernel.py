@@ -47,7 +47,7 @@ MAX_TASKS = 2000
 """Requests under way at once. With pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
 
 GRACE = 2.0
-"""Seconds that requests under way get to finish after a signal."""
+"""Seconds that requests under way get to finish after a signal, or once the kernel mount is gone."""
 
 FORGETTING_TIME = 2.0
 """Seconds for the kernel to forget what it cached, for a command that waits for that."""
@@ -258,7 +258,7 @@ class _Life:
             self.report(0, notice())
             with trio.CancelScope() as self._loop_scope:
                 if not self._stop_asked:
-                    await fuse_loop()
+                    await fuse_loop(self._bound_the_loop)
             self._loop_scope = None
             self._let_go = True
             nursery.cancel_scope.cancel()
@@ -350,13 +350,21 @@ class _Life:
         self._stop_asked = True
         if self._loop_scope is not None:
             pyfuse3.terminate()
-            self._loop_scope.deadline = trio.current_time() + GRACE
+            self._bound_the_loop()
+
+    def _bound_the_loop(self) -> None:
+        """Nobody gets an answer any more: a read may wait for a lost vehicle as long as op_deadline."""
+        assert self._loop_scope is not None
+        self._loop_scope.deadline = min(self._loop_scope.deadline, trio.current_time() + GRACE)
 
 
-async def fuse_loop() -> None:
-    """Serve the kernel until the mount is gone, from inside or outside."""
+async def fuse_loop(on_gone: Callable[[], None]) -> None:
+    """Serve the kernel until the mount is gone, from inside or outside, and every request has ended.
+
+    on_gone: called, more than once, when it is gone; requests may be under way.
+    """
     try:
-        with never_blocking():
+        with never_blocking(on_gone):
             await pyfuse3.main(min_tasks=MIN_TASKS, max_tasks=MAX_TASKS)
     except* OSError as group:
         # Reading from /dev/fuse fails when the connection was aborted (`umount -f`, fusectl).
@@ -442,7 +450,7 @@ def presentation(options: MountOptions) -> Presentation:
 
 
 @contextmanager
-def never_blocking() -> Iterator[None]:
+def never_blocking(on_gone: Callable[[], None]) -> Iterator[None]:
     """Have pyfuse3.main read /dev/fuse without blocking for the length of the body.
 
     It waits until there is a request, and then reads it with a call that blocks, in the event loop's thread.
@@ -453,7 +461,7 @@ def never_blocking() -> Iterator[None]:
 
     The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`.
     """
-    setattr(pyfuse3, "trio", _Trio())  # noqa: B010 (which its types do not tell)
+    setattr(pyfuse3, "trio", _Trio(on_gone))  # noqa: B010 (which its types do not tell)
     try:
         yield
     finally:
@@ -471,20 +479,26 @@ class _Delegate:
 
 
 class _LowLevel(_Delegate):
+    def __init__(self, on_gone: Callable[[], None]) -> None:
+        super().__init__(trio.lowlevel)
+        self._on_gone = on_gone
+
     async def wait_readable(self, fd: int) -> None:
         """Wait until a read finds something, as far as that can be known."""
         os.set_blocking(fd, False)
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         await trio.lowlevel.wait_readable(fd)
-        while not poll.poll(0):
+        while not (found := poll.poll(0)):
             await trio.lowlevel.wait_readable(fd)
+        if any(events & select.POLLERR for _, events in found):  # Linux: the mount has no kernel any more
+            self._on_gone()
 
 
 class _Trio(_Delegate):
-    def __init__(self) -> None:
+    def __init__(self, on_gone: Callable[[], None]) -> None:
         super().__init__(trio)
-        self.lowlevel = _LowLevel(trio.lowlevel)
+        self.lowlevel = _LowLevel(on_gone)
 
     @asynccontextmanager
     async def open_nursery(self) -> AsyncIterator[_Workers]:

@@ -27,15 +27,17 @@ FEW = 40
 QUICK = ("op_deadline=6",)
 
 READ_ALL = """
-import sys
+import os, sys
 with open(sys.argv[1], "rb", buffering=0) as file:
+    if sys.argv[2] == "4096":
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
     file.read(4096)
     print("started", flush=True)
-    while file.read(1 << 16):
+    while file.read(int(sys.argv[2])):
         pass
 print("whole")
 """
-"""A reader that says when its first bytes have come."""
+"""A reader that says when its first bytes have come. By single pages it wants none ahead."""
 
 
 @pytest.fixture
@@ -51,9 +53,9 @@ def big_tree(tmp_path: Path) -> Path:
     return root
 
 
-def start_reading(mount: Mount) -> subprocess.Popen[str]:
-    """Start reading big.bin and return once the first bytes have come."""
-    argv = [sys.executable, "-c", READ_ALL, str(mount.path / "big.bin")]
+def start_reading(mount: Mount, size: int = 1 << 16) -> subprocess.Popen[str]:
+    """Start reading big.bin, `size` bytes at a time; return once the first have come."""
+    argv = [sys.executable, "-c", READ_ALL, str(mount.path / "big.bin"), str(size)]
     reader = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert reader.stdout is not None
     assert reader.stdout.readline() == "started\n"
@@ -160,12 +162,18 @@ def test_ctrl_c_of_a_blocked_cat_returns(field: Field, big_tree: Path) -> None:
     wait_until("files are readable again", lambda: readable(mount, "dir2/small.txt", "small 2\n"), SILENCE)
 
 
-def test_unmounting_from_a_dead_vehicle_ends(field: Field, big_tree: Path) -> None:
+@pytest.mark.holds("promise 4")
+def test_unmounting_from_a_dead_vehicle_waits_for_no_read(field: Field, big_tree: Path) -> None:
+    """The kernel waits for a page longer than the killed program that wanted it."""
     vehicle = field.sim(big_tree)
-    mount = field.mount(vehicle.source)
-    mount.run("cat", mount.path / "dir0/small.txt")
+    mount = field.mount(vehicle.source, "op_deadline=3600")
+    reader = start_reading(mount, 4096)
     vehicle.pause()
+    wait_until("the vehicle is lost", lambda: mount.status()["link"]["state"] == "lost")
+    reader.kill()
+    reader.communicate()
     assert mount.unmount() == 0
+    vehicle.resume()
 
 
 def test_a_mount_with_few_descriptors_and_idle_connections_ends_in_order(

@@ -280,9 +280,9 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
     part = tmp_path / "a.ulg.part"
     with started("get", mount.path, "/log/a.ulg", "--to", f"{tmp_path}/"):
         wait_until("some of it is read", lambda: mount.bytes_read() > 50_000)
-        vehicle.send_signal(signal.SIGUSR2)  # the link is cut
+        vehicle.pause()
         wait_until("get has what the mount has", lambda: part.stat().st_size >= mount.bytes_read() - 8192)
-        vehicle.send_signal(signal.SIGUSR2)  # it can be unmounted
+    vehicle.resume()
 
 
 # -- by itself ------------------------------------------------------------------------------------
