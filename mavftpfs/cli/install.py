@@ -164,8 +164,8 @@ def check_program(program: Path) -> None:
             open_to_all = facts.st_mode & stat.S_IWOTH and not facts.st_mode & stat.S_ISVTX
             if facts.st_uid != 0 or open_to_all:
                 raise UsageError(
-                    f"{path} can be changed by others than root, who would run it; install a copy of root's "
-                    "own: sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
+                    f"{path} can be changed by others than root, but root would run it; install a copy "
+                    "of its own: sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
                 )
 
 

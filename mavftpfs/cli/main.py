@@ -397,7 +397,7 @@ def _install_parser(name: str) -> Parser:
 
 
 def _sim_parser(name: str) -> Parser:
-    from mavftpfs.sim.endpoints import add_arguments
+    from mavftpfs.sim.arguments import add_arguments
 
     parser = Parser(f"mavftpfs {name}", description="Run a simulated vehicle.")
     add_arguments(parser)

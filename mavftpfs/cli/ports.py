@@ -14,7 +14,8 @@ from typing import Any
 
 from mavftpfs.client.status import said_of_double
 from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
-from mavftpfs.link.rendezvous import hubs, port_name
+from mavftpfs.link.rendezvous import hubs
+from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount import daemon
 from mavftpfs.shared.errors import ExitCode, UsageError

@@ -26,13 +26,14 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.client.leftovers import rescue, spool_for
 from mavftpfs.client.options import Options
-from mavftpfs.client.status import Watcher, holder_of, snapshot
+from mavftpfs.client.status import holder_of, snapshot
 from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
+from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.link.peers import describe_peer
-from mavftpfs.link.rendezvous import leads_back
+from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.session.connection import Connection, ConnectOptions, connected

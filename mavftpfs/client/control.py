@@ -2,54 +2,30 @@
 
 One Unix socket (0600, in a 0700 directory) for each mount, named after a hash of the mountpoint. One
 request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and
-the session is closed. The server runs under trio; the client is plain blocking code for short-lived commands.
-
-If the limit is low there are few file descriptors, and the mount needs them for itself. So at most
-MAX_CLIENTS connections are taken at once. When there is no room, connections that have asked nothing are
-ended.
+the session is closed. This is the side of the commands: plain blocking code, because they should start at
+once. The mount's side is `controlserver`.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
-import logging
 import os
 import select
 import socket
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import trio
-
-from mavftpfs.shared.errors import MavftpfsError, MountFailed
+from mavftpfs.shared.errors import MountFailed
 from mavftpfs.shared.private import directories_of, own_directories, private_directory
 
 __all__ = ["directories_of", "own_directories"]
 
-log = logging.getLogger("mavftpfs.control")
-
 Reply = dict[str, Any]
-Command = Callable[[Reply], Awaitable[Reply]]
 
 MAX_LINE = 1 << 20
-REQUEST_PATIENCE = 10.0
-"""Seconds for a client to send its line, and for us to hand it the reply."""
-QUEUE = 128
-"""Clients that wait in the kernel until they are taken."""
-MAX_CLIENTS = 16
-"""Connections that are taken at once; others wait in the kernel's queue."""
-MAX_IDLE = 4
-"""So many of these may have asked nothing yet while others are still taken. A command of ours asks right
-after it has connected."""
-IDLE = 0.1
-"""Seconds after which a connection that has asked nothing is ended if there is no room."""
-_NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 _SUFFIX = ".sock"
@@ -86,146 +62,7 @@ def usable_directory(directories: list[Path]) -> Path:
     )
 
 
-# -- the mount's side -----------------------------------------------------------------------------
-
-
-@dataclass(slots=True, eq=False)
-class _Client:
-    """A connection that was taken. since: when (trio's clock); idle: it asked nothing yet."""
-
-    since: float = field(default_factory=trio.current_time)
-    scope: trio.CancelScope = field(default_factory=trio.CancelScope)
-    idle: bool = True
-
-
-class ControlServer:
-    """Answers requests at a socket path: one `command` after its name."""
-
-    def __init__(self, path: Path, commands: Mapping[str, Command]) -> None:
-        self._path = path
-        self._commands = commands
-        self._accepting = trio.CancelScope()
-        self._clients: set[_Client] = set()
-        self._crowded = False
-        self.closed = trio.Event()
-
-    async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Serve until `close`, then until the clients at work have their replies.
-
-        Raises:
-            OSError: the socket cannot be bound.
-        """
-        listener = _bind(self._path)
-        ours = self._path.lstat().st_ino
-        try:
-            async with trio.open_nursery() as clients:
-                task_status.started()
-                with self._accepting:
-                    async with listener:
-                        await self._accept(listener, clients)
-        finally:
-            with suppress(FileNotFoundError):
-                # While we delivered, the next mount may have put its socket there.
-                if self._path.lstat().st_ino == ours:
-                    self._path.unlink()
-            self.closed.set()
-
-    def close(self) -> None:
-        """Take no more clients."""
-        self._accepting.cancel()
-
-    async def _accept(self, listener: trio.SocketListener, nursery: trio.Nursery) -> None:
-        """Take clients until cancelled, as many as there is room for."""
-        while True:
-            while len(self._clients) >= MAX_CLIENTS or self._idle > MAX_IDLE:
-                await self._make_room(f"{len(self._clients)} connections")
-            try:
-                stream = await listener.accept()
-            except OSError as error:
-                if error.errno not in _NO_DESCRIPTORS:
-                    raise
-                await self._make_room(os.strerror(error.errno))
-            else:
-                client = _Client()
-                self._clients.add(client)
-                nursery.start_soon(self._serve_client, stream, client)
-
-    @property
-    def _idle(self) -> int:
-        return sum(client.idle for client in self._clients)
-
-    async def _make_room(self, why: str) -> None:
-        """Wait a moment, and end the connections that have asked nothing. The log says so once in a mount."""
-        if not self._crowded:
-            self._crowded = True
-            log.warning("the control socket is crowded (%s): connections that ask nothing are ended", why)
-        await trio.sleep(IDLE)
-        for client in self._clients:
-            if client.idle and client.since <= trio.current_time() - IDLE:
-                client.scope.cancel()
-
-    async def _serve_client(self, stream: trio.SocketStream, client: _Client) -> None:
-        try:
-            # It may go away at any time.
-            with client.scope, suppress(trio.BrokenResourceError, trio.ClosedResourceError):
-                line = b""
-                with trio.move_on_after(REQUEST_PATIENCE):
-                    line = await _receive_line(stream)
-                client.idle = False
-                reply = await self._answer(line)
-                with trio.move_on_after(REQUEST_PATIENCE):
-                    await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
-        finally:
-            self._clients.discard(client)
-            await trio.aclose_forcefully(stream)
-
-    async def _answer(self, line: bytes) -> Reply:
-        try:
-            request = json.loads(line)
-            command = self._commands[request["command"]]
-        except (ValueError, KeyError, TypeError, RecursionError):  # the last for a line of many brackets
-            return failure("not a command of this mount")
-        try:
-            return {"ok": True, **await command(request)}
-        except MavftpfsError as exc:
-            return failure(str(exc))
-        except Exception as exc:
-            log.exception("bug in a control command")
-            return failure(f"internal error: {exc!r}")
-
-
-def _bind(path: Path) -> trio.SocketListener:
-    """Bind and listen; the socket is never visible with wider permissions than 0600."""
-    path.unlink(missing_ok=True)  # of a mount that was killed; a living one was refused before
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    mask = os.umask(0o177)
-    try:
-        listener.bind(str(path))
-        listener.listen(QUEUE)
-    except OSError:
-        listener.close()
-        raise
-    finally:
-        os.umask(mask)
-    return trio.SocketListener(trio.socket.from_stdlib_socket(listener))
-
-
-def failure(reason: str) -> Reply:
-    """Return the reply of a command that did not work."""
-    return {"ok": False, "error": reason}
-
-
-async def _receive_line(stream: trio.SocketStream) -> bytes:
-    line = b""
-    while b"\n" not in line and len(line) < MAX_LINE:
-        data = await stream.receive_some(4096)
-        if not data:
-            break
-        line += data
-    return line.partition(b"\n")[0]
-
-
-# -- the command's side ---------------------------------------------------------------------------
+# -- asking ---------------------------------------------------------------------------------------
 
 
 def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], None] | None = None) -> Reply:

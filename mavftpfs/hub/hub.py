@@ -33,7 +33,8 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door, leads_back
+from mavftpfs.link.rendezvous import Door
+from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
 

@@ -8,8 +8,6 @@ that takes over inherits it with all programs that wait there.
 from __future__ import annotations
 
 import errno
-import hashlib
-import ipaddress
 import os
 import socket
 import struct
@@ -18,65 +16,15 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.link.uri import LOOPBACK, LinkKind, LinkSpec
 from mavftpfs.shared.private import own_directories, private_directory
 
 HUB = ".hub"
 ALONE = ".port"
 """The end of a door's name tells what is behind it: a hub, or a program that has the port alone."""
 
-_ANYWHERE = {"0.0.0.0", "::"}
-_LISTENING = {LinkKind.UDP_OUT: LinkKind.UDP_IN, LinkKind.TCP_OUT: LinkKind.TCP_IN}
 _QUEUE = 64
-_NETWORK = "/proc/self/ns/net"
 _LOCK_PATIENCE = 30.0
 _LOCK_PAUSE = 0.05
-
-
-def port_name(spec: LinkSpec) -> str:
-    """Return the name of a port's door, without its end; the same for two SOURCEs that exclude each other."""
-    if spec.kind is LinkKind.SERIAL:
-        text = f"serial {os.path.realpath(spec.device)}"
-    else:
-        listens = spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-        text = f"{os.stat(_NETWORK).st_ino} {spec.kind.value} {'' if listens else spec.host} {spec.port}"
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
-
-
-def same_link(one: LinkSpec, other: LinkSpec) -> bool:
-    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
-    if one.kind is not other.kind:
-        return False
-    if one.kind is LinkKind.SERIAL:
-        return os.path.realpath(one.device) == os.path.realpath(other.device)
-    if one.port != other.port:
-        return False
-    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    return one.host == other.host or (listens and bool({one.host, other.host} & _ANYWHERE))
-
-
-def leads_back(endpoint: LinkSpec, source: LinkSpec) -> bool:
-    """Return whether frames for an endpoint would be SOURCE's own: it is the same link, or one of them sends
-    to where the other listens."""
-    return same_link(endpoint, source) or _reaches(endpoint, source) or _reaches(source, endpoint)
-
-
-def _reaches(one: LinkSpec, other: LinkSpec) -> bool:
-    """Return whether one link sends to where the other listens."""
-    if _LISTENING.get(one.kind) is not other.kind or one.port != other.port:
-        return False
-    host = LOOPBACK if one.host == "localhost" else one.host
-    return host == other.host or (other.host in _ANYWHERE and _is_here(host))
-
-
-def _is_here(host: str) -> bool:
-    """Return whether a numeric address is one of this computer's."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        try:
-            sock.bind((str(ipaddress.ip_address(host)), 0))
-        except (OSError, ValueError):
-            return False
-        return True
 
 
 def knock(name: str) -> socket.socket | None:

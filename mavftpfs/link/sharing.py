@@ -25,7 +25,8 @@ from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import Link, LinkStats, Seat, background
 from mavftpfs.link.hublink import HubLink, Refused, Wish, join
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door, knock, only_one, open_door, port_name
+from mavftpfs.link.rendezvous import Door, knock, only_one, open_door
+from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 

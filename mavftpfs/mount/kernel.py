@@ -28,7 +28,8 @@ import trio
 
 import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached
-from mavftpfs.client.control import ControlServer, Reply
+from mavftpfs.client.control import Reply
+from mavftpfs.client.controlserver import ControlServer
 from mavftpfs.client.mountpoint import CannotStart, is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.client.status import network_namespace
 from mavftpfs.link.uri import LinkSpec
@@ -358,7 +359,7 @@ class _Life:
         self._loop_scope.deadline = min(self._loop_scope.deadline, trio.current_time() + GRACE)
 
 
-async def fuse_loop(on_gone: Callable[[], None]) -> None:
+async def fuse_loop(on_gone: Callable[[], None] = lambda: None) -> None:
     """Serve the kernel until the mount is gone, from inside or outside, and every request has ended.
 
     on_gone: called, more than once, when it is gone; requests may be under way.
@@ -450,7 +451,7 @@ def presentation(options: MountOptions) -> Presentation:
 
 
 @contextmanager
-def never_blocking(on_gone: Callable[[], None]) -> Iterator[None]:
+def never_blocking(on_gone: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Have pyfuse3.main read /dev/fuse without blocking for the length of the body.
 
     It waits until there is a request, and then reads it with a call that blocks, in the event loop's thread.

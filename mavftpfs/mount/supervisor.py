@@ -23,7 +23,8 @@ import trio
 import mavftpfs
 from mavftpfs.client import control
 from mavftpfs.client.connect import connect_options, opened, plain_nursery
-from mavftpfs.client.control import ControlError, ControlServer, Reply
+from mavftpfs.client.control import ControlError, Reply
+from mavftpfs.client.controlserver import ControlServer
 from mavftpfs.client.mountpoint import is_ours, unmount, unmount_what_is_left
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from mavftpfs.sim.pseudo import TREES
+TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
+"""The `@` directories of an ArduPilot."""
 
 
 class Family(Enum):

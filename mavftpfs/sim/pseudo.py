@@ -24,9 +24,9 @@ from mavftpfs.sim.parameters import (
     parameter,
     selection,
 )
+from mavftpfs.sim.profiles import TREES
 from mavftpfs.sim.tree import ClaimedFile, Entry, Kind, OpenFile, Stat, fail
 
-TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 MAX_HANDLES = 4
 _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.link.hublink import PROTOCOL, pack_facts
-from mavftpfs.link.rendezvous import HUB, hubs, knock, port_name
+from mavftpfs.link.rendezvous import HUB, hubs, knock
+from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import parse_source
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, hub_of, wait_until

@@ -21,13 +21,14 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
+from mavftpfs.sim.arguments import add_arguments, link_settings
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from tests.support.vehicles import free_udp_port
 
 
 def arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser("sim")
-    endpoints.add_arguments(parser)
+    add_arguments(parser)
     return parser.parse_args(words)
 
 
@@ -39,7 +40,7 @@ MODEL_WORDS = """
 
 def test_arguments_reach_the_model() -> None:
     args = arguments("DIR", *MODEL_WORDS.split())
-    assert endpoints.link_settings(args) == LinkSettings(
+    assert link_settings(args) == LinkSettings(
         rate=5760, queue=1000, mtu=200, duplex=Duplex.HALF, delay=0.1, jitter=0.2, loss=0.3, burst_loss=0.4,
         duplicate=0.5, corrupt=0.6, reorder=0.7,
     )  # fmt: skip
@@ -83,8 +84,9 @@ def test_a_card_that_nothing_can_be_written_to_is_told(
 RUNNER = """
 import argparse, sys
 from mavftpfs.sim import endpoints
+from mavftpfs.sim.arguments import add_arguments
 parser = argparse.ArgumentParser("sim")
-endpoints.add_arguments(parser)
+add_arguments(parser)
 sys.exit(endpoints.run(parser.parse_args()))
 """
 

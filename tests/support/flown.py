@@ -21,7 +21,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavftpfs.link.base import Link
 from mavftpfs.link.frames import Splitter
 from mavftpfs.link.messages import Address
-from mavftpfs.sim.endpoints import Endpoint, add_arguments, client_source, link_settings, open_endpoint
+from mavftpfs.sim.arguments import add_arguments, link_settings
+from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import DirectoryTree

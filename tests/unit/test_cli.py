@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -184,7 +185,19 @@ def test_commands_that_mount_nothing_need_no_libfuse() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=90)
 
 
-# -- one-shot runs --------------------------------------------------------------------------------
+@pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["status"], ["umount", "/proc/none"]])
+def test_commands_that_only_ask_load_no_event_loop(tmp_path: Path, words: list[str]) -> None:
+    """These libraries take most of the time until such a command says something."""
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('trio', 'pymavlink', 'rich')))\n"
+        f"from mavftpfs.cli.main import main; sys.exit(main({words}))"
+    )
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=90, check=False
+    )
+    assert "internal error" not in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 # -- status and umount ----------------------------------------------------------------------------

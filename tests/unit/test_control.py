@@ -18,17 +18,8 @@ import trio
 import trio.testing
 
 from mavftpfs.client import control
-from mavftpfs.client.control import (
-    MAX_CLIENTS,
-    Command,
-    ControlError,
-    ControlServer,
-    NobodyThere,
-    Reply,
-    all_sockets,
-    ask,
-    find_socket,
-)
+from mavftpfs.client.control import ControlError, NobodyThere, Reply, all_sockets, ask, find_socket
+from mavftpfs.client.controlserver import MAX_CLIENTS, Command, ControlServer
 from mavftpfs.shared.errors import UsageError
 
 

@@ -11,7 +11,8 @@ import pytest
 import trio
 
 from mavftpfs.cli.report import delivery_line, panel, screen, status_lines
-from mavftpfs.client.status import Watcher, snapshot
+from mavftpfs.client.status import snapshot
+from mavftpfs.client.watcher import Watcher
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 VEHICLE = {

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from mavftpfs.link.rendezvous import leads_back, same_link
+from mavftpfs.link.samelink import leads_back, same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_endpoint, parse_source
 from mavftpfs.shared.errors import UsageError
 

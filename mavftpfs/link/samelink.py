@@ -1,0 +1,60 @@
+"""Which SOURCEs are the same port, and which lead back to each other. Layer: link."""
+
+from __future__ import annotations
+
+import hashlib
+import ipaddress
+import os
+import socket
+
+from mavftpfs.link.uri import LOOPBACK, LinkKind, LinkSpec
+
+_ANYWHERE = {"0.0.0.0", "::"}
+_LISTENING = {LinkKind.UDP_OUT: LinkKind.UDP_IN, LinkKind.TCP_OUT: LinkKind.TCP_IN}
+_NETWORK = "/proc/self/ns/net"
+
+
+def port_name(spec: LinkSpec) -> str:
+    """Return the name of a port's door, without its end; the same for two SOURCEs that exclude each other."""
+    if spec.kind is LinkKind.SERIAL:
+        text = f"serial {os.path.realpath(spec.device)}"
+    else:
+        listens = spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+        text = f"{os.stat(_NETWORK).st_ino} {spec.kind.value} {'' if listens else spec.host} {spec.port}"
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def same_link(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
+    if one.kind is not other.kind:
+        return False
+    if one.kind is LinkKind.SERIAL:
+        return os.path.realpath(one.device) == os.path.realpath(other.device)
+    if one.port != other.port:
+        return False
+    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+    return one.host == other.host or (listens and bool({one.host, other.host} & _ANYWHERE))
+
+
+def leads_back(endpoint: LinkSpec, source: LinkSpec) -> bool:
+    """Return whether frames for an endpoint would be SOURCE's own: it is the same link, or one of them sends
+    to where the other listens."""
+    return same_link(endpoint, source) or _reaches(endpoint, source) or _reaches(source, endpoint)
+
+
+def _reaches(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether one link sends to where the other listens."""
+    if _LISTENING.get(one.kind) is not other.kind or one.port != other.port:
+        return False
+    host = LOOPBACK if one.host == "localhost" else one.host
+    return host == other.host or (other.host in _ANYWHERE and _is_here(host))
+
+
+def _is_here(host: str) -> bool:
+    """Return whether a numeric address is one of this computer's."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.bind((str(ipaddress.ip_address(host)), 0))
+        except (OSError, ValueError):
+            return False
+        return True
