@@ -2,9 +2,7 @@
 
 goodput   share of a link's limit, reading and writing, on virtual time (the same figures on every machine)
 mount     a real mount beside the clients that people use now, over real sockets
-library   reading by mavftpfs.connect beside `cp` from a mount, over real sockets
-parameters  how long 2,000 parameters take to be parsed, shown, read and packed
-plots     draw what docs/benchmarks.md shows, from the file that `--json FILE` of the others writes
+plots     the picture and the tables of docs/benchmarks.md, from what `--json FILE` of the others wrote
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-PARTS = ("goodput", "library", "mount", "parameters", "plots")
+PARTS = ("goodput", "mount", "plots")
 
 
 def main(argv: list[str]) -> int:

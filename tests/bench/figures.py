@@ -48,22 +48,33 @@ LINKS: dict[str, LinkShape | None] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """One transfer. size: bytes. seconds: from the first call to the last, None if it did not end.
-
-    cpu: seconds, user and system, of the client's processes while it lasted. memory: their peak in bytes.
+class Measured:
+    """What came of a transfer. seconds: from the first call to the last. cpu: seconds, user and system, of
+    the client's processes while it lasted. memory: their peak in bytes. None if it did not end well.
     """
+
+    outcome: Outcome
+    seconds: float | None = None
+    cpu: float | None = None
+    memory: int | None = None
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One transfer. size: bytes."""
 
     server: str
     link: str
     direction: Direction
     client: str
     size: int
-    outcome: Outcome
-    seconds: float | None = None
-    cpu: float | None = None
-    memory: int | None = None
-    detail: str = ""
+    measured: Measured
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return self.measured.outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +122,7 @@ def summarise(runs: Iterable[Run], timeouts: dict[str, float]) -> list[Row]:
         rate, at_most = rates[key]
         ours, bare = (rates.get((server, link, direction, name), (None, False)) for name in (US, BARE))
         good = [run for run in group if run.outcome is Outcome.OK]
-        cpu = _median(run.cpu / run.size for run in good if run.cpu is not None)
+        cpu = _median(run.measured.cpu / run.size for run in good if run.measured.cpu is not None)
         row = Row(
             *key,
             outcome=good[0].outcome if good else group[-1].outcome,
@@ -121,7 +132,9 @@ def summarise(runs: Iterable[Run], timeouts: dict[str, float]) -> list[Row]:
             of_bare=ratio(rate, None if bare[1] else bare[0]),
             of_limit=ratio(rate, limit(server, link, direction)),
             cpu=None if cpu is None else cpu * 1e6,
-            memory=max((run.memory for run in group if run.memory is not None), default=None),
+            memory=max(
+                (run.measured.memory for run in group if run.measured.memory is not None), default=None
+            ),
         )
         rows.append(row)
     return rows
@@ -130,7 +143,9 @@ def summarise(runs: Iterable[Run], timeouts: dict[str, float]) -> list[Row]:
 def _rate(group: list[Run], timeout: float) -> tuple[float | None, bool]:
     """Return bytes per second, and whether that is only an upper bound."""
     rate = _median(
-        run.size / run.seconds for run in group if run.outcome is Outcome.OK and run.seconds is not None
+        run.size / run.measured.seconds
+        for run in group
+        if run.outcome is Outcome.OK and run.measured.seconds is not None
     )
     if rate is not None:
         return rate, False

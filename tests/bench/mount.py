@@ -17,14 +17,14 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.bench import record, tables
 from tests.bench.cases import Direction
-from tests.bench.figures import BARE, LINKS, US, LinkShape, Outcome, Run, as_json, summarise
-from tests.bench.peers import PINS, Client, Job, Measured, clients, install
+from tests.bench.figures import BARE, LINKS, US, LinkShape, Measured, Outcome, Run, as_json, summarise
+from tests.bench.peers import PINS, Client, Job, clients, install
 from tests.support.mounts import wait_until
 from tests.support.vehicles import HOST, Process, free_udp_port
 
@@ -141,7 +141,7 @@ def run_one(cell: Cell, client: Client, source: Path, seed: int) -> Run:
         ):
             measured = Measured(Outcome.CORRUPT, detail="other bytes arrived")
         detail = measured.detail.replace(f"{folder}/", "")
-    return Run(*what, measured.outcome, measured.seconds, measured.cpu, measured.memory, detail)
+    return Run(*what, replace(measured, detail=detail))
 
 
 def measure(chosen: Sequence[Cell], everybody: Sequence[Client], repetitions: int, folder: Path) -> list[Run]:
@@ -155,7 +155,8 @@ def measure(chosen: Sequence[Cell], everybody: Sequence[Client], repetitions: in
                 runs.append(run)
                 if run.outcome is not Outcome.OK:
                     left.remove(client)
-                rate = f"{run.size / run.seconds / 1000:,.1f} kB/s" if run.seconds else run.detail
+                took, why = run.measured.seconds, run.measured.detail
+                rate = f"{run.size / took / 1000:,.1f} kB/s" if took else why
                 where = f"{run.server} {run.link} {run.direction}"
                 print(f"{where}: {run.client}: {run.outcome} {rate}", file=sys.stderr)
     return runs

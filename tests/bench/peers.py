@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.bench.cases import Direction
-from tests.bench.figures import BARE, US, Outcome
+from tests.bench.figures import BARE, US, Measured, Outcome
 from tests.support.mounts import abort_mount, mounted_at
 from tests.support.vehicles import HOST, PROJECT, Process, peak_memory
 
@@ -49,17 +49,6 @@ class Job:
     window: int
     patience: float
     folder: Path
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """What came of a job. seconds, cpu (seconds), memory (bytes): None if it did not end well."""
-
-    outcome: Outcome
-    seconds: float | None = None
-    cpu: float | None = None
-    memory: int | None = None
-    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,11 +237,11 @@ def clients() -> dict[str, Client]:
     place = _environment()
     python = str(place / "bin/python")
 
-    def peer(script: str, job: Job, *more: str) -> list[str]:
-        return [python, str(HERE / f"{script}.py"), *_task(job), *more]
+    def peer(library: str, job: Job, *more: str) -> list[str]:
+        return [python, str(HERE / "peer.py"), library, *_task(job), *more]
 
     def tuned(job: Job, point: Path) -> list[str]:
-        return peer("peer_pymavlink", job, "--chunk", "239", "--window", str(job.window))
+        return peer("pymavlink", job, "--chunk", "239", "--window", str(job.window))
 
     def bare(job: Job, point: Path) -> list[str]:
         limits = ["--window", str(job.window), "--timeout", str(job.patience)]
@@ -269,10 +258,10 @@ def clients() -> dict[str, Client]:
     everybody = [
         Client(BARE, bare),
         Client(US, ours, mounts=True),
-        Client("pymavlink mavftp", lambda job, point: peer("peer_pymavlink", job)),
+        Client("pymavlink mavftp", lambda job, point: peer("pymavlink", job)),
         Client("pymavlink mavftp, tuned", tuned),
         Client("pymavlink mavftpfs", fusepy, True, ("read",)),
-        Client("MAVSDK", lambda job, point: peer("peer_mavsdk", job)),
+        Client("MAVSDK", lambda job, point: peer("mavsdk", job)),
     ]
     return {client.name: client for client in everybody}
 

@@ -1,6 +1,6 @@
-"""Draws what docs/benchmarks.md shows: scripts/bench plots [--json FILE] [--page FILE].
+"""Draws the picture of README and docs/benchmarks.md: scripts/bench plots [--json FILE] [--page FILE].
 
-The pictures (SVG) go beside the JSON file, and are the same for the same file. Their colours can be read on
+The picture (SVG) goes beside the JSON file, and is the same for the same file. Its colours can be read on
 white and on black; the ground is transparent. `--page` puts the tables of `tables` between the marks there.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,78 +39,23 @@ STYLE: Any = {
     "legend.frameon": False,
 }
 COLOURS = ("#2f81f7", "#e3702d", "#3fa45b", "#a371f7", "#c9388f", "#8a8f98", "#b08800")
-MARKERS = "osD^vPX"
-
-Results = list[dict[str, Any]]
-"""What `goodput` found: case, share, target and more of each run."""
-
-
-def draw(path: Path, size: tuple[float, float], paint: Callable[[Figure], None]) -> None:
-    """Write one picture."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasSVG(figure)
-        paint(figure)
-        figure.savefig(path, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-
-
-# -- goodput ----------------------------------------------------------------------------------------
-
-
-def plot_goodput(results: Results, path: Path) -> None:
-    """Draw share of the limit against loss, reading and writing, at the middle rate and round trip."""
-    rates, rtts = ({run["case"][key] for run in results} for key in ("rate", "rtt"))
-    rate, rtt = (sorted(values)[len(values) // 2] for values in (rates, rtts))
-    chosen = [run for run in results if (run["case"]["rate"], run["case"]["rtt"]) == (rate, rtt)]
-
-    def paint(figure: Figure) -> None:
-        for axes, direction in zip(figure.subplots(1, 2, sharey=True), ("read", "write"), strict=True):
-            paint_lines(axes, [run for run in chosen if run["case"]["direction"] == direction])
-            axes.set_title(f"{direction}, {rate / 1000:g} kB/s, RTT {rtt * 1000:g} ms", fontsize=10)
-        figure.axes[0].set_ylim(0, max(1.05, figure.axes[0].get_ylim()[1]))
-        figure.axes[0].set_ylabel("share of the limit")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=7, fontsize=9)
-
-    draw(path, (8.6, 3.6), paint)
-
-
-def paint_lines(axes: Axes, results: Results) -> None:
-    """Draw one line for each profile, and what is to be reached."""
-    lines: dict[str, dict[float, float]] = {}
-    for run in results:
-        loss = run["case"]["loss"] * 100
-        lines.setdefault(run["case"]["profile"], {})[loss] = run["share"]
-    targets = {run["case"]["loss"] * 100: run["target"] for run in results if run["target"] is not None}
-    for (profile, points), colour, marker in zip(lines.items(), COLOURS, MARKERS, strict=False):
-        xs = sorted(points)
-        ys = [points[x] for x in xs]
-        axes.plot(xs, ys, color=colour, marker=marker, markersize=5, label=profile)
-    xs = sorted(targets)
-    ys = [targets[x] for x in xs]
-    axes.plot(xs, ys, color="#808890", linestyle="dashed", linewidth=1, label="target")
-    axes.set_xlabel("loss each way, %")
-
-
-# -- the peers --------------------------------------------------------------------------------------
 
 
 def plot_peers(rows: Sequence[Row], path: Path) -> None:
     """Draw what part of the link's limit (loopback: of the bare loop) each client reached."""
     names = [name for name in dict.fromkeys(row.client for row in rows) if name != BARE]
     names.sort(key=lambda name: name != US)
-
-    def paint(figure: Figure) -> None:
+    conditions = len({(row.server, row.link) for row in rows})
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8.6, 1.4 + 0.75 * conditions), layout="constrained")
+        FigureCanvasSVG(figure)
         for axes, direction in zip(figure.subplots(1, 2, sharey=True), ("read", "write"), strict=True):
-            chosen = [row for row in rows if row.direction == direction]
-            paint_bars(axes, chosen, names)
+            paint_bars(axes, [row for row in rows if row.direction == direction], names)
             axes.set_title(direction, fontsize=10)
         figure.axes[0].invert_yaxis()
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
-
-    conditions = len({(row.server, row.link) for row in rows})
-    draw(path, (8.6, 1.4 + 0.75 * conditions), paint)
+        figure.savefig(path, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
 
 
 def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
@@ -156,26 +101,10 @@ def note_of(row: Row) -> str:
     return f"{'< ' if row.at_most else ''}{share:.2f}"
 
 
-# -- the command ------------------------------------------------------------------------------------
-
-
-def plot_all(sections: dict[str, dict[str, Any]], folder: Path) -> list[Path]:
-    """Draw whatever there are results for, and return what was written."""
-    written: list[Path] = []
-    if "goodput" in sections:
-        results: Results = sections["goodput"]["results"]
-        written.append(folder / "goodput-loss.svg")
-        plot_goodput(results, written[-1])
-    if "mount" in sections:
-        written.append(folder / "peers.svg")
-        plot_peers([row_from_json(row) for row in sections["mount"]["results"]["rows"]], written[-1])
-    return written
-
-
 def main(argv: Sequence[str]) -> int:
     """Draw, and fill in the page's tables if asked to."""
     parser = argparse.ArgumentParser(
-        prog="scripts/bench plots", description="draw what docs/benchmarks.md shows"
+        prog="scripts/bench plots", description="draw the picture of docs/benchmarks.md"
     )
     parser.add_argument("--json", type=Path, default=RESULTS, metavar="FILE", help="what --json wrote before")
     parser.add_argument(
@@ -183,11 +112,11 @@ def main(argv: Sequence[str]) -> int:
     )
     args = parser.parse_args(argv)
     sections = record.sections(args.json)
-    if not sections:
-        print(f"nothing is recorded in {args.json}", file=sys.stderr)
+    if "mount" not in sections:
+        print(f"nothing of `scripts/bench mount` is recorded in {args.json}", file=sys.stderr)
         return 1
-    for path in plot_all(sections, args.json.parent):
-        print(path)
+    rows = [row_from_json(row) for row in sections["mount"]["results"]["rows"]]
+    plot_peers(rows, args.json.with_name("peers.svg"))
     if args.page is not None:
         args.page.write_text(tables.filled_in(args.page.read_text(), sections))
     return 0
