@@ -163,6 +163,8 @@ class RawFile(_Ending, io.RawIOBase):
         """Cut or extend it to `size`, or to the position; returns the size."""
         self._require(self._mode.writes, "writable")
         size = self._at if size is None else size
+        if size < 0:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         self._portal.call(self._opened.truncate, size)
         return size
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import os
@@ -273,6 +274,8 @@ class Drone:
 
     async def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it by zeros."""
+        if size < 0:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         with translated():
             await self._files.truncate(await self._existing(path), size)
 

@@ -69,6 +69,8 @@ _ABOUT_TARGET = (
 _HINTS = {
     errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
     errors.NotDeliveredYet: " (the vehicle is armed, or has not got all of it yet)",
+    errors.RequestTimeout: " (the vehicle does not answer)",
+    errors.FileBusy: " (another program uses the vehicle's files, or the vehicle writes this one)",
 }
 
 
@@ -229,7 +231,12 @@ class MountedFiles:
 
     async def crc32(self, path: bytes) -> int:
         """Ask the vehicle."""
-        return int(await _call(path, os.getxattr, self._place(path), XATTR_CRC32), 16)
+        try:
+            return int(await _call(path, os.getxattr, self._place(path), XATTR_CRC32), 16)
+        except errors.OtherRefusal:
+            if (await self.stat(path)).kind is EntryKind.DIRECTORY:  # which has no such attribute
+                raise errors.IsADirectory(_sentence(errors.IsADirectory, path)) from None
+            raise
 
     async def mkdir(self, path: bytes) -> None:
         """As os.mkdir."""
@@ -250,6 +257,11 @@ class MountedFiles:
             await _call(old, os.rename, self._place_to_change(old), self._place(new))
         except _ABOUT_TARGET as exc:
             raise type(exc)(_sentence(type(exc), new)) from exc
+        except errors.InvalidMove as exc:
+            raise errors.InvalidMove(f"{old!r} cannot become a part of itself") from exc
+        except NotFound as exc:
+            await self.stat(old)  # raises, if it is this one
+            raise NotFound(_sentence(NotFound, split(new)[0])) from exc
 
     async def refresh(self) -> None:
         """Make the mount ask the vehicle again. Another user's mount may go on with what it knows."""

@@ -78,11 +78,13 @@ CALLS: dict[str, Call] = {
     "rename": lambda on, d: on.rename(d + "/a", d + "/n"),
     "rename over": lambda on, d: on.rename(d + "/a", d + "/b"),
     "rename nothing": lambda on, d: on.rename(d + "/nothing", d + "/n"),
+    "rename below nothing": lambda on, d: on.rename(d + "/a", d + "/nothing/n"),
     "rename over a directory": lambda on, d: on.rename(d + "/a", d + "/e"),
     "rename a directory": lambda on, d: on.rename(d + "/e", d + "/n"),
     "rename into itself": lambda on, d: on.rename(d + "/e", d + "/e/e"),
     "truncate": lambda on, d: on.truncate(d + "/a", 3),
     "extend": lambda on, d: on.truncate(d + "/a", 10),
+    "truncate below zero": lambda on, d: on.truncate(d + "/a", -1),
     "truncate nothing": lambda on, d: on.truncate(d + "/nothing", 3),
     "text": lambda on, d: (on.write_text(d + "/n", "größe"), on.read_text(d + "/n")),
     "bytes": lambda on, d: (on.write_bytes(d + "/a", DATA), on.read_bytes(d + "/a") == DATA),
@@ -373,8 +375,13 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
 NAMED = [
     *("list a file", "list nothing", "stat nothing", "mkdir there", "mkdir below nothing", "rmdir full"),
     *("rmdir a file", "remove a directory", "remove nothing", "rename nothing", "rename over a directory"),
+    *("rename below nothing", "rename into itself"),
     *("truncate nothing", "read a directory", "open a directory", "write a directory", "write below nothing"),
 ]
+
+
+def crc32_of(drone: Any, path: str) -> object:
+    return drone.crc32(path)
 
 
 @pytest.mark.mount
@@ -384,16 +391,21 @@ def test_an_error_is_said_in_the_same_words_over_a_mount(field: Field) -> None:
     for name in ("a", "b"):
         (card / "d" / name).touch()
     vehicle = field.sim(card)
-    mount = field.mount(vehicle.source)
-    for name in NAMED:
+    mount = field.mount(vehicle.source, "op_deadline=1")
+    for name, call in {**{name: CALLS[name] for name in NAMED}, "crc32": crc32_of}.items():
         said = []
         for use_mount in (False, True):
             with mavftpfs.connect(vehicle.source, use_mount=use_mount) as drone:
                 assert (drone.mountpoint == str(mount.path)) == use_mount
                 with pytest.raises(OSError, match="/") as caught:
-                    CALLS[name](drone, "/d")
+                    call(drone, "/d")
                 said.append((type(caught.value), str(caught.value)))
         assert said[0] == said[1], name
+    with mavftpfs.connect(str(mount.path)) as drone:
+        vehicle.pause()
+        with pytest.raises(TimeoutError, match=r"/n: .*the vehicle does not answer"):
+            CALLS["mkdir"](drone, "")
+        vehicle.resume()
 
 
 @pytest.mark.mount

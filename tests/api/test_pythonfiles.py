@@ -38,6 +38,7 @@ BINARY: dict[str, Call] = {
     "write beyond": lambda file: (file.seek(6_000), file.write(b"x")),
     "write a view": lambda file: file.write(memoryview(bytearray(b"abcdef"))[::2].tobytes()),
     "truncate": lambda file: (file.seek(7), file.truncate(), file.truncate(20), file.tell()),
+    "truncate below zero": lambda file: (file.write(b"abc"), file.truncate(-1)),
     "flush": lambda file: (file.write(b"a"), file.flush()),
     "text": lambda file: file.write("a text"),
     "facts": lambda file: (file.readable(), file.writable(), file.seekable(), file.isatty(), file.closed),
