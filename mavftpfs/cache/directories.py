@@ -26,7 +26,8 @@ from __future__ import annotations
 import errno
 import logging
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
@@ -230,6 +231,20 @@ class Directories:
             directory.entries[name] = entry
             if proven:
                 directory.proven[name] = self.clock()
+
+    @contextmanager
+    def changing(self, *paths: bytes) -> Iterator[None]:
+        """Have these names change in the body. A listing that ends meanwhile proves nothing: servers count
+        names, and when one is taken away, the next one moves up, past the place where the listing goes on."""
+        began = self.clock()
+        try:
+            yield
+        finally:
+            for path in paths:
+                parent, _ = split(path)
+                directory = self._known.get(parent)
+                if directory is not None and directory.ended_at > began:
+                    self.expire(parent)
 
     def rename(self, old: bytes, new: bytes) -> None:
         """Note a rename, perhaps over another file, that the vehicle has just confirmed."""

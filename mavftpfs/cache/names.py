@@ -350,7 +350,8 @@ class Names:
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
         """If the outcome of the body is unknown, expire the listings of these names."""
         try:
-            yield
+            with self._context.directories.changing(*paths):
+                yield
         except (OutcomeUnknown, trio.Cancelled):
             for path in paths:
                 self._context.directories.expire(split(path)[0])

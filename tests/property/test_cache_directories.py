@@ -1,33 +1,34 @@
 """Remembered listings against the directories themselves, with sweeps that our own changes race.
 
-Nobody but us changes the directories, so a listing that claims to be fresh and complete must equal them:
-whatever a sweep saw of one page before a change and of the next one after it.
+What others change is told at once, so a listing that claims to be fresh and complete must equal the
+directory: whatever a sweep saw of one page before a change and of the next one after it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import ExitStack
+from random import Random
 from typing import cast
 
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from mavftpfs.cache.directories import Directories, Sweep
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join
 
-DIRECTORIES = (b"/", b"/d", b"/e")
-NAMES = (b"a", b"b", b"c", b"x")
-PAGE = 2
+DIRECTORIES = (b"/", b"/d")
+NAMES = (b"a", b"b", b"c")
 
-directories = st.sampled_from(DIRECTORIES)
-names = st.sampled_from(NAMES)
-sizes = st.integers(0, 3)
+
+def file(name: bytes, size: int) -> DirEntry:
+    return DirEntry(name, EntryKind.FILE, size)
 
 
 class Paging:
-    """A sweep that asks for PAGE entries at a time, by index, as servers answer."""
+    """A sweep that asks for one entry at a time, by index, as servers answer."""
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep = sweep
@@ -35,130 +36,131 @@ class Paging:
         self.index = 0
 
 
-class Racing(RuleBasedStateMachine):
+class Racing:
     """Sweeps, changes on the vehicle, and the notes of them, in any order that can happen."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, rng: Random) -> None:
+        self.rng = rng
         self.now = 0.0
-        options = CacheOptions(dir_timeout=20, max_entries=9)
+        options = CacheOptions(dir_timeout=20, max_entries=rng.choice([5, 100]))
         self.directories = Directories(cast(RemoteStore, None), options, clock=lambda: self.now)
-        self.truth: dict[bytes, dict[bytes, DirEntry]] = {path: {} for path in DIRECTORIES}
-        self.sweeps: list[Paging] = []
-        self.unnoted: list[tuple[str, bytes, bytes, int]] = []
+        self.truth = {path: {name: file(name, 1) for name in NAMES[:2]} for path in DIRECTORIES}
+        self.sweeps: dict[bytes, Paging] = {}
+        self.unnoted: tuple[bytes, DirEntry | None, bytes] | None = None
+        self.under_way = ExitStack()
+
+    def step(self) -> None:
+        self.now += 0.01
+        acts = [self.sweep_on, self.sweep_on, self.put, self.rename, self.note, self.disturb]
+        self.rng.choice(acts)(self.rng.choice(DIRECTORIES))
+        if self.unnoted is None:
+            for path in DIRECTORIES:
+                self.check(path)
+        known = self.directories._known.values()
+        assert self.directories.entry_count == sum(len(directory.entries) for directory in known)
 
     # --- sweeps
 
-    @rule(path=directories)
-    def begin(self, path: bytes) -> None:
-        if path not in [paging.sweep.path for paging in self.sweeps]:
-            self.sweeps.append(Paging(self.directories.begin(path)))
-
-    @precondition(lambda self: self.sweeps)
-    @rule(data=st.data())
-    def next_page(self, data: st.DataObject) -> None:
-        paging = data.draw(st.sampled_from(self.sweeps))
-        entries = list(self.truth[paging.sweep.path].values())[paging.index : paging.index + PAGE]
-        paging.index += PAGE
-        paging.seen.update((entry.name, entry) for entry in entries)
-        if not entries:
-            self.sweeps.remove(paging)
-            listing = Listing(tuple(paging.seen.values()), 0.0)
-            del self.directories._sweeps[paging.sweep.path]
-            directory = self.directories.remember(paging.sweep, listing)
+    def sweep_on(self, path: bytes) -> None:
+        """Have a sweep begin, or get its next page."""
+        if path not in self.sweeps:
+            self.sweeps[path] = Paging(self.directories.begin(path))
+        paging = self.sweeps[path]
+        page = list(self.truth[path].values())[paging.index : paging.index + 1]
+        paging.index += 1
+        paging.seen.update((entry.name, entry) for entry in page)
+        if not page:
+            self.abandon(path)
+            directory = self.directories.remember(paging.sweep, Listing(tuple(paging.seen.values()), 0.0))
             assert directory.listed_at == paging.sweep.began
 
-    @precondition(lambda self: self.sweeps)
-    @rule(data=st.data())
-    def abandon(self, data: st.DataObject) -> None:
-        paging = data.draw(st.sampled_from(self.sweeps))
-        self.sweeps.remove(paging)
-        del self.directories._sweeps[paging.sweep.path]
+    def abandon(self, path: bytes) -> None:
+        if self.sweeps.pop(path, None) is not None:
+            del self.directories._sweeps[path]
 
-    @rule(seconds=st.sampled_from([1.0, 19.0, 21.0]))
-    def wait(self, seconds: float) -> None:
-        self.now += seconds
+    def disturb(self, path: bytes) -> None:
+        match self.rng.randrange(8):
+            case 0:
+                self.others_change(path, self.directories.forget)
+            case 1 | 2:
+                self.others_change(path, self.directories.expire)
+            case 3:
+                self.abandon(path)
+            case _:
+                self.now += self.rng.choice([1.0, 19.0, 21.0])
 
-    @rule(path=directories)
-    def expire(self, path: bytes) -> None:
-        self.directories.expire(path)
-
-    @rule(path=directories)
-    def forget(self, path: bytes) -> None:
-        self.directories.forget(path)
+    def others_change(self, path: bytes, tell: Callable[[bytes], None]) -> None:
+        """Have others change a directory, as is told at once."""
+        self.note(path)
+        name = self.rng.choice(NAMES)
+        if self.truth[path].pop(name, None) is None:
+            self.truth[path][name] = file(name, 7)
+        tell(path)
 
     # --- changes: the vehicle makes them first, we note them when the answer comes
 
-    @precondition(lambda self: not self.unnoted)
-    @rule(path=directories, name=names, size=sizes)
-    def create(self, path: bytes, name: bytes, size: int) -> None:
-        if name not in self.truth[path]:
-            self.truth[path][name] = DirEntry(name, EntryKind.FILE, size)
-            self.unnoted.append(("create", join(path, name), b"", size))
-
-    @precondition(lambda self: not self.unnoted)
-    @rule(path=directories, name=names)
-    def remove(self, path: bytes, name: bytes) -> None:
-        if self.truth[path].pop(name, None) is not None:
-            self.unnoted.append(("remove", join(path, name), b"", 0))
-
-    @precondition(lambda self: not self.unnoted)
-    @rule(path=directories, name=names, size=sizes)
-    def resize(self, path: bytes, name: bytes, size: int) -> None:
-        if name in self.truth[path]:
-            self.truth[path][name] = DirEntry(name, EntryKind.FILE, size)
-            self.unnoted.append(("resize", join(path, name), b"", size))
-
-    @precondition(lambda self: not self.unnoted)
-    @rule(old=directories, name=names, new=directories, other=names)
-    def rename(self, old: bytes, name: bytes, new: bytes, other: bytes) -> None:
-        if name in self.truth[old] and (old, name) != (new, other):
-            entry = self.truth[old].pop(name)
-            self.truth[new].pop(other, None)
-            self.truth[new][other] = DirEntry(other, EntryKind.FILE, entry.size)
-            self.unnoted.append(("rename", join(old, name), join(new, other), 0))
-
-    @precondition(lambda self: self.unnoted)
-    @rule()
-    def note(self) -> None:
-        what, path, new, size = self.unnoted.pop()
-        if what == "create":
-            name = path.rpartition(b"/")[2]
-            self.directories.put(path, DirEntry(name, EntryKind.FILE, size))
-        elif what == "remove":
-            self.directories.put(path, None)
-        elif what == "resize":
-            self.directories.put(path, DirEntry(split(path)[1], EntryKind.FILE, size), proven=True)
+    def put(self, path: bytes) -> None:
+        """Make a file, change its size, or remove it."""
+        self.note(path)
+        name, size = self.rng.choice(NAMES), self.rng.randrange(-1, 3)
+        if size < 0:
+            self.truth[path].pop(name, None)
         else:
+            self.truth[path][name] = file(name, size)
+        self.change(join(path, name), self.truth[path].get(name))
+
+    def rename(self, path: bytes) -> None:
+        """Rename what was just looked up."""
+        self.note(path)
+        if not self.is_fresh(path):
+            return
+        name, new, other = self.rng.choice(NAMES), self.rng.choice(DIRECTORIES), self.rng.choice(NAMES)
+        if name in self.truth[path] and (path, name) != (new, other):
+            entry = self.truth[path].pop(name)
+            self.truth[new].pop(other, None)
+            self.truth[new][other] = file(other, entry.size)
+            self.change(join(path, name), None, join(new, other))
+
+    def change(self, path: bytes, entry: DirEntry | None, new: bytes = b"") -> None:
+        self.under_way.enter_context(self.directories.changing(path, *[new] * bool(new)))
+        self.unnoted = (path, entry, new)
+
+    def note(self, _: bytes) -> None:
+        if self.unnoted is None:
+            return
+        (path, entry, new), self.unnoted = self.unnoted, None
+        self.under_way.close()
+        if new:
             self.directories.rename(path, new)
+        else:
+            self.directories.put(path, entry, proven=entry is not None)
+        assert self.directories.entry(new or path) in (None, self.true_entry(new or path))
 
     # --- what must hold
 
-    @invariant()
-    def fresh_is_true(self) -> None:
-        if self.unnoted:
+    def true_entry(self, path: bytes) -> DirEntry | None:
+        parent, _, name = path.rpartition(b"/")
+        return self.truth[parent or b"/"].get(name)
+
+    def is_fresh(self, path: bytes) -> bool:
+        directory = self.directories.known(path)
+        return directory is not None and self.now < directory.fresh_until
+
+    def check(self, path: bytes) -> None:
+        """A fresh listing is true, and so is what the vehicle has confirmed, in a stale one too."""
+        directory = self.directories.known(path)
+        if directory is None:
             return
-        for path in DIRECTORIES:
-            directory = self.directories.known(path)
-            if directory is not None and self.directories.clock() < directory.fresh_until:
-                assert directory.complete
-                assert directory.entries == self.truth[path]
-
-    @invariant()
-    def proven_is_true(self) -> None:
-        if self.unnoted:
-            return
-        for path in DIRECTORIES:
-            directory = self.directories.known(path)
-            for name in () if directory is None else directory.proven:
-                assert self.directories.entry(join(path, name)) == self.truth[path][name]
-
-    @invariant()
-    def memory_is_bounded(self) -> None:
-        known = [d for d in (self.directories._known.get(p) for p in DIRECTORIES) if d is not None]
-        assert self.directories.entry_count == sum(len(directory.entries) for directory in known)
-        assert len(self.directories) == len(known)
+        if self.is_fresh(path):
+            assert directory.complete
+            assert directory.entries == self.truth[path]
+        for name in directory.proven:
+            assert directory.entries[name] == self.truth[path][name]
 
 
-TestRacing = Racing.TestCase
-TestRacing.settings = settings(max_examples=150, stateful_step_count=40)
+@settings(max_examples=200)
+@given(st.integers(0, 2**32))
+def test_a_fresh_listing_is_the_directory(seed: int) -> None:
+    racing = Racing(Random(seed))
+    for _ in range(100):
+        racing.step()
