@@ -26,8 +26,6 @@ RETRY, MOST_RETRY = 30.0, 600.0
 """Seconds until a failed step is tried again: the first time, and at most."""
 GROWN, MOST_GROWN = 60.0, 3600.0
 """Seconds until a log that grew all the time is looked at again: the first time, and at most."""
-STILL_THERE = 3600.0
-"""Seconds without news after which a line says so."""
 
 
 class Log(NamedTuple):
@@ -91,11 +89,10 @@ class _Vehicle:
 class Policy:
     """Decides for all vehicles on a link; a system id is a vehicle."""
 
-    def __init__(self, now: float) -> None:
+    def __init__(self) -> None:
         self._vehicles: dict[int, _Vehicle] = {}
         self._served = 0
         self._trouble_until = -inf
-        self._news_at = now
 
     # --- what happens
 
@@ -111,7 +108,6 @@ class Policy:
             vehicle.look_at = inf
         else:
             self._begin(vehicle, now)
-        self._news_at = now
         if was_lost:
             return "back"
         return "here" if before is None else "armed" if armed else "disarmed"
@@ -141,15 +137,7 @@ class Policy:
             if not vehicle.lost and now - vehicle.heard_at > LOST:
                 vehicle.lost = True
                 vehicle.ready.clear()
-                self._news_at = now
                 yield system
-
-    def nothing_new(self, now: float) -> bool:
-        """Return whether it is time to say that there is no news, and count it as said."""
-        if now - self._news_at < STILL_THERE:
-            return False
-        self._news_at = now
-        return True
 
     # --- what is done
 
@@ -162,15 +150,14 @@ class Policy:
 
     def next(self, now: float) -> Step:
         """Return what to do now. The vehicle that was served last goes on, so that it is left only once."""
-        silence_ends = self._news_at + STILL_THERE
         if now < self._trouble_until:
-            return Wait(min(self._trouble_until, silence_ends))
+            return Wait(self._trouble_until)
         for system in sorted(self._vehicles, key=lambda system: (system != self._served, system)):
             vehicle = self._vehicles[system]
             if self.may_transfer(system, now) and (vehicle.ready or vehicle.look_at <= now):
                 self._served = system
                 return Fetch(system, vehicle.ready[0]) if vehicle.ready else Look(system)
-        return Wait(min([silence_ends, *self._deadlines()]))
+        return Wait(min(self._deadlines(), default=inf))
 
     def looked(self, system: int, logs: Sequence[Log], now: float) -> None:
         """Take the logs of a vehicle that are not here yet, in the order in which they are to be fetched."""

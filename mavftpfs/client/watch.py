@@ -71,7 +71,7 @@ class Watch:
         self._say = say
         self._hand_on = hand_on
         self._progress = progress or Progress()
-        self._policy = Policy(trio.current_time())
+        self._policy = Policy()
         self._changed = trio.Event()
         self._leave: LinkError | bool = False
         self._wanted_system = 0
@@ -83,7 +83,6 @@ class Watch:
         self._done_here: set[tuple[str, str]] = set()
         self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
         self._complaints: dict[str, str] = {}
-        self._came = 0
         with local_disk(self._local):
             self._local.mkdir(parents=True, exist_ok=True)
             self._memory = Memory(self._local)
@@ -220,8 +219,6 @@ class Watch:
         self._changed = trio.Event()
         with trio.move_on_at(step.until):
             await self._changed.wait()
-        if self._policy.nothing_new(trio.current_time()):
-            self._say(f"nothing new; {self._came} logs came so far")
 
     async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> bool:
         """Take a step; return whether the vehicle may be asked for more."""
@@ -333,7 +330,6 @@ class Watch:
             return
         self._policy.fetched(system, log)
         self._done_here.add(key)
-        self._came += 1
         self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}{fetched.kept_words}")
         if self._hand_on is not None:
             self._to_hand_on.send_nowait(brought)

@@ -11,7 +11,6 @@ from mavftpfs.client.flights import (
     PATIENCE,
     QUIET,
     RETRY,
-    STILL_THERE,
     Fetch,
     Log,
     Look,
@@ -27,7 +26,7 @@ class Story:
 
     def __init__(self) -> None:
         self.now = 1000.0
-        self.policy = Policy(self.now)
+        self.policy = Policy()
         self.armed: dict[int, bool] = {}
 
     def hears(self, system: int = 1, *, armed: bool = False) -> str:
@@ -139,12 +138,3 @@ def test_a_restart_counts_as_the_end_of_a_flight_but_not_in_flight(story: Story)
     story.policy.restarted(1, story.now)
     assert isinstance(story.does(), Wait)
     story.policy.restarted(77, story.now)
-
-
-def test_that_there_is_no_news_is_said_once_an_hour(story: Story) -> None:
-    story.looks()
-    said = 0
-    for _ in range(3 * int(STILL_THERE)):
-        story.passes(1)
-        said += story.policy.nothing_new(story.now)
-    assert said == 3
