@@ -29,7 +29,8 @@ from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import decode_reply, sent
-from tests.support.virtual import CLIENT, MemorySink, VirtualLink
+from tests.support.transfers import MemorySink
+from tests.support.virtual import CLIENT, VirtualLink
 
 BYTE = st.integers(0, 255)
 PAYLOADS = st.builds(
@@ -161,7 +162,7 @@ def test_receive_never_raises(
         assert 1 <= engine.flow.window <= engine.flow.cap
     for operation in operations:
         assert operation.error is None or isinstance(operation.error, MavftpfsError)
-    assert sink.held.end <= len(CONTENT)
+    assert sink.have.end <= len(CONTENT)
 
 
 # --- the engine and every server over a hostile link
@@ -250,12 +251,12 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
             transfer.by_requests = rng.random() < 0.5
     transfer.want(0, size, True)
     link.run_until(lambda: transfer.idle or transfer.done, 2000.0)
-    for start, stop in sink.held:
+    for start, stop in sink.have:
         assert bytes(sink.data[start:stop]) == content[start:stop]
     chunks = -(-size // MAX_DATA) + 8
     lossless = 1.5 * chunks / ((1 - loss) * (1 - spoil)) ** 2
     assert link.engine.stats.requests - before <= lossless + 60
     if transfer.error is None:
-        assert sink.held.covers(0, size)
+        assert sink.have.covers(0, size)
     else:
         assert spoil > 0.0, transfer.error

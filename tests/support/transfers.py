@@ -30,11 +30,12 @@ def path(profile: str, name: str) -> bytes:
 
 
 class MemorySink:
-    """A ReadSink that keeps everything and can be waited for."""
+    """A ReadSink that keeps what came first, and can be waited for."""
 
     def __init__(self, size: int) -> None:
         self.data = bytearray(size)
         self.have = ExtentSet()
+        self.repeats = 0
         self.suspicions: list[str] = []
         self.errors: list[Exception] = []
         self._news = trio.Event()
@@ -46,8 +47,11 @@ class MemorySink:
         """Nobody asks."""
 
     def on_data(self, offset: int, data: bytes) -> None:
-        assert offset + len(data) <= len(self.data)
-        self.data[offset : offset + len(data)] = data
+        assert offset + len(data) <= len(self.data), "data beyond the size of the file"
+        gaps = self.have.missing(offset, offset + len(data))
+        self.repeats += gaps != [(offset, offset + len(data))]
+        for start, stop in gaps:
+            self.data[start:stop] = data[start - offset : stop - offset]
         self.have.add(offset, offset + len(data))
 
     def on_batch(self, count: int) -> None:

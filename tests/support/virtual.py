@@ -16,7 +16,6 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import PAYLOAD_SIZE
 from mavftpfs.shared.errors import RemoteProtocolError
-from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from tests.support.replies import decode_reply
 
@@ -33,27 +32,6 @@ class Server(Protocol):
     def outgoing(self, now: float) -> list[tuple[Address, bytes]]: ...
 
     def next_deadline(self) -> float | None: ...
-
-
-class MemorySink:
-    """A file's bytes as they come; what is held is never overwritten."""
-
-    def __init__(self, size: int) -> None:
-        self.data = bytearray(size)
-        self.held = ExtentSet()
-        self.repeats = 0
-
-    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        return self.held.missing(start, stop)
-
-    def on_data(self, offset: int, data: bytes) -> None:
-        assert offset + len(data) <= len(self.data), "data beyond the size of the file"
-        gaps = self.held.missing(offset, offset + len(data))
-        if gaps != [(offset, offset + len(data))]:
-            self.repeats += 1
-        for start, stop in gaps:
-            self.data[start:stop] = data[start - offset : stop - offset]
-        self.held.add(offset, offset + len(data))
 
 
 class VirtualLink:

@@ -13,7 +13,7 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from tests.support.replies import ack, chunk, sent
-from tests.support.virtual import MemorySink
+from tests.support.transfers import MemorySink
 
 SIZE = 4 * 239
 CONTENT = bytes(SIZE)

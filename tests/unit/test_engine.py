@@ -15,7 +15,7 @@ from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
 from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, chunk, nak, packet, sent
-from tests.support.virtual import MemorySink
+from tests.support.transfers import MemorySink
 
 SIZE = 239 * 40
 
@@ -138,7 +138,7 @@ def test_a_reply_that_does_not_fit_changes_nothing(change: dict[str, int], stale
     transfer, sink = reading(engine)
     (request,) = sent(engine, 0.0)
     engine.receive(chunk(request, bytes(SIZE))._replace(**change), 0.1)  # type: ignore[arg-type]
-    assert sink.held.empty
+    assert sink.have.empty
     assert not transfer.done
     assert engine.in_flight == (not stale)  # then the seq will never be answered
 
@@ -150,7 +150,7 @@ def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
     _, sink = reading(engine)
     (request,) = sent(engine, 0.0)
     engine.receive(chunk(request, b"x" * SIZE)._replace(session=9), 0.1)
-    assert sink.held.empty
+    assert sink.have.empty
     engine.receive(chunk(request, b"y" * SIZE), 0.1)
     assert bytes(sink.data[:239]) == b"y" * 239
 
@@ -283,7 +283,7 @@ def test_later_answers_prove_a_loss() -> None:
     assert again[0].seq != out[0].seq
     assert engine.stats.retransmissions == 1
     assert engine.stats.by_opcode[Opcode.READ_FILE] == engine.stats.requests
-    assert not sink.held.covers(0, 1)
+    assert not sink.have.covers(0, 1)
 
 
 def test_what_was_lost_often_does_not_wait_for_its_timer() -> None:
@@ -420,7 +420,7 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     other, _ = reading(engine)
     assert sent(engine, 0.0) == []
     engine.receive(chunk(out[0], bytes(SIZE)), 0.1)
-    assert sink.held.empty
+    assert sink.have.empty
     assert len(sent(engine, 0.1)) == 1
     engine.on_deadline(1.2)
     assert len(sent(engine, 1.2)) >= 1

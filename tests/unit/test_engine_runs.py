@@ -16,8 +16,7 @@ from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, chunk, decode_reply, sent
-from tests.support.transfers import MemorySource
-from tests.support.virtual import MemorySink
+from tests.support.transfers import MemorySink, MemorySource
 
 CONTENT = random.Random(8).randbytes(MAX_DATA * 300 + 17)
 WINDOW = 24

@@ -17,7 +17,7 @@ from mavftpfs.shared.errors import FileChanged, FtpNak, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
-from tests.support.virtual import MemorySink
+from tests.support.transfers import MemorySink
 
 CONTENT = random.Random(8).randbytes(239 * 40 + 17)
 SIZE = len(CONTENT)
@@ -121,7 +121,7 @@ def test_readahead_can_be_dropped() -> None:
     reader.answer(request)
     assert reader.sent() == []
     assert reader.transfer.idle
-    assert reader.sink.held == ExtentSet([(0, 239)])
+    assert reader.sink.have == ExtentSet([(0, 239)])
 
 
 # --- replies to ReadFile
@@ -145,7 +145,7 @@ def test_an_over_long_reply_is_clipped() -> None:
     reader.transfer.want(0, 100, True)
     (request,) = reader.sent()
     reader.engine.receive(ack(request, CONTENT[:239]), 0.1)
-    assert reader.sink.held == ExtentSet([(0, 100)])
+    assert reader.sink.have == ExtentSet([(0, 100)])
     assert reader.transfer.idle
 
 
