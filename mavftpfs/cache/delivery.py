@@ -28,7 +28,6 @@ from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.together import together
-from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -55,16 +54,13 @@ MISMATCHES = 2
 RESEND_PAUSE = 1.0
 """Seconds before such a file is sent again: the cause may last a moment."""
 
-SENT_TWICE = 4096
-"""Bytes of the largest file that is sent before it is known whether the card can rename. If it cannot, the
-file is sent twice, once in a mount: a round trip or two. Finding out first would cost four requests on every
-card."""
-
 SHORT = 4096
 """Bytes of the largest file whose checksum the slowest card computes at once."""
 
 START_AT = 64 * 1024
-"""A background upload begins when so many bytes wait; fewer wait for the close."""
+"""A background upload begins when so many bytes wait; fewer wait for the close. Before the first file of such
+a size is sent, it is found out whether the card can rename. A smaller one is sent twice if it cannot, once in
+a mount: finding out costs four requests on every card."""
 
 START_PAUSE = 5.0
 """Seconds after which an upload that could not begin is tried again."""
@@ -170,11 +166,7 @@ class Deliverer:
             await attempt.upload.end()
             if not attempt.in_place and attempt.upload.begun:
                 await self._names.discard(attempt.path)
-            if attempt.trial is not None:
-                await attempt.trial.end()
         finally:
-            if attempt.trial is not None:
-                attempt.trial.leave()
             self._context.own.in_use.discard(attempt.path)
 
     async def withdraw(self, node: Node) -> bool | None:
@@ -302,16 +294,19 @@ class Deliverer:
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
-        attempt, traits = node.attempt, self._context.store.traits
+        context, attempt, path = self._context, node.attempt, node.path
+        traits = context.store.traits
         self._require_deliverable(draft)
-        in_place = traits.rename_works is False  # then it is sent under its own name
-        if attempt is not None and attempt.fits(draft, in_place=in_place):
+        if attempt is not None and attempt.fits(draft, in_place=traits.rename_works is False):
             return attempt
         if attempt is not None:
             await self.abandon(node)
-        context, path = self._context, node.path
-        trial = await self._begin_trial(node, draft)
-        in_place = traits.rename_works is False
+        # With `inplace` the card may have no room for both files, so it is found out before any file.
+        overwrites = context.options.inplace and draft.base is not None
+        if traits.rename_works is None and (draft.size >= START_AT or overwrites):
+            await self._names.find_out(path)
+            self._require_deliverable(draft)
+        in_place = traits.rename_works is False  # then it is sent under its own name
         begun_at = context.clock()
         try:
             # Last time the whole file was sent before its name proved to be taken: look first.
@@ -325,37 +320,11 @@ class Deliverer:
         except BaseException:
             draft.give_up()
             context.own.in_use.discard(path)
-            if trial is not None:
-                trial.leave()
             raise
-        attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at, trial)
+        attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at)
         if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
-            if trial is not None:
-                await trial.end()
-        elif trial is not None and not await trial.rename():  # while the upload begins
-            return await self._attempt(node, draft)  # under its own name
         return attempt
-
-    async def _begin_trial(self, node: Node, draft: Draft) -> RenameTrial | None:
-        """Before a large file is sent, begin to find out whether the card can rename.
-
-        Raises:
-            As RenameTrial.begin and _require_deliverable.
-        """
-        inplace = self._context.options.inplace and draft.base is not None
-        if self._context.store.traits.rename_works is not None or not (draft.size > SENT_TWICE or inplace):
-            return None
-        trial = await self._names.begin_trial(node.path)
-        try:
-            if inplace:  # first: the card may have no room for both files, and never tell
-                await trial.rename()
-                await trial.end()
-            self._require_deliverable(draft)  # it may have changed meanwhile
-        except BaseException:
-            await trial.end()
-            raise
-        return trial
 
     async def _compare(self, draft: Draft, attempt: Attempt) -> int | None:
         doubted = self._context.store.in_doubt(attempt.begun_at)
@@ -382,7 +351,7 @@ class Deliverer:
             await together(compare, look)
         else:
             await compare()
-            await (look() if attempt.trial is None else together(look, attempt.trial.end))
+            await look()
         self._require_deliverable(draft)
         return crc32
 

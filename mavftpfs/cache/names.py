@@ -26,7 +26,6 @@ import trio
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.replacements import Replacement
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
-from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -37,6 +36,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NotSupported,
     OutcomeUnknown,
+    PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
@@ -213,17 +213,40 @@ class Names:
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
-        """Find out with an empty file of ours whether the card can rename. Raises as RenameTrial.begin."""
-        trial = await self.begin_trial(near)
-        await trial.rename()
-        await trial.end()
+        """Find out with an empty file of ours whether the card can rename (`Traits.rename_works`). near: a
+        path beside which it is made.
 
-    async def begin_trial(self, near: bytes) -> RenameTrial:
-        """Begin to find out whether the card can rename. Raises as RenameTrial.begin."""
-        context = self._context
-        trial = RenameTrial(context.store, context.directories, context.own, near)
-        await trial.begin()
-        return trial
+        The refusal of another file's rename does not tell: its error number proves nothing (servers.md 12),
+        and the card may refuse only that name. An ACK does not tell either. So the file is removed under its
+        new name: if that works, the rename worked.
+
+        Raises:
+            As VehicleStore, but FtpNak. Also if nothing is raised, nothing may have been found out.
+        """
+        context, store, own = self._context, self._context.store, self._context.own
+        try:
+            first = place = own.beside(near, Kind.NEW)
+            second = own.beside(first, Kind.NEW)
+        except PathTooLong:
+            return
+        own.in_use |= {first, second}
+        try:
+            await store.create_empty(first)
+            try:
+                await store.rename(first, second)
+                place = second
+            except FtpNak:
+                store.traits.rename_works = False
+            await store.remove(place)
+            if place == second:
+                store.traits.rename_works = True
+        except FtpNak as nak:
+            log.debug("an empty file beside %r was refused: %s", near, nak)
+            if place == second and await context.directories.current(second) is None:
+                store.traits.rename_works = False
+        finally:
+            own.in_use -= {first, second}
+            context.directories.expire(split(near)[0])  # the next listing cleans up what is left
 
     async def purge(self, path: bytes) -> None:
         """Before a name goes, remove what earlier replacements left: it would bring the name back.

@@ -18,7 +18,6 @@ from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.cache.trial import RenameTrial
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sending import SendBuffer
@@ -29,7 +28,7 @@ class Attempt:
     """One try to deliver a draft.
 
     path: where its bytes go: a reserved name, or the file's own if it is sent `in_place`. begun_at: when it
-    began, by the caches' clock. trial: the test whether the card can rename, which runs beside the upload.
+    began, by the caches' clock.
     """
 
     path: bytes
@@ -37,7 +36,6 @@ class Attempt:
     sending: SendBuffer
     upload: Upload
     begun_at: float
-    trial: RenameTrial | None = None
 
     def fits(self, draft: Draft, *, in_place: bool) -> bool:
         """Return whether the bytes that it sent are still right, and the place that they go to."""

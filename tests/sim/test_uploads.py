@@ -8,9 +8,8 @@ from functools import partial
 import pytest
 import trio
 
-from mavftpfs.cache.delivery import SENT_TWICE
+from mavftpfs.cache.delivery import START_AT
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.flow import FIRST
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errnos import errno_for
@@ -26,15 +25,13 @@ STRANGER = Address(255, 190)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
-@pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
-async def test_little_of_the_first_large_file_is_sent_twice_where_the_card_cannot_rename(size: int) -> None:
-    """It begins while the refusal of the trial is on its way: that is one round trip, whatever its size."""
+@pytest.mark.parametrize("size", [START_AT, 200_000])
+async def test_the_first_large_file_is_sent_once_where_the_card_cannot_rename(size: int) -> None:
     here = Rig("littlefs", {b"/d": None})
     target, data = path("littlefs", "new"), content(size)
     async with here.mounted(target[:-4]) as tree:
         await write_file(tree, target, data)
-        again = here.connection.engine.stats.by_opcode[Opcode.WRITE_FILE] - -(-size // MAX_DATA)
-        assert again <= 3 * FIRST
+        assert here.connection.engine.stats.by_opcode[Opcode.WRITE_FILE] == -(-size // MAX_DATA)
         assert here.card.data(target) == data
     assert {entry.name for entry in here.card.entries(target[:-4])} == {b".", b"..", b"new"}
 
