@@ -489,7 +489,7 @@ class VersionHandle(OpenFile):
         limit, small = files.cache.readahead_limits(len(files.open_versions))
         ahead = self._readahead.on_read(start, stop, limit=limit, small=small)
         if ahead.seeked and version.reader is not None:
-            version.reader.drop_readahead()
+            version.reader.drop(demand=False)
         data = version.get(start, stop)
         if data is not None:
             if version.reader is not None and ahead.start < ahead.stop:

@@ -62,12 +62,9 @@ class Reader(Protocol):
         """Ask for bytes; returns at once. Wants add up, demand goes before readahead."""
         ...
 
-    def drop_readahead(self) -> None:
-        """Forget wants for which no program waits (after a seek, or a release)."""
-        ...
-
-    def drop_wants(self) -> None:
-        """Forget all wants (a read was interrupted). What is on its way still comes."""
+    def drop(self, *, demand: bool = True) -> None:
+        """Forget all wants (a read was interrupted); demand: False: those for which no program waits (after
+        a seek, or a release). What is on its way still comes."""
         ...
 
     def close(self) -> None:

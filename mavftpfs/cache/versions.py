@@ -362,7 +362,7 @@ class Version:
         """Drop readahead and the remote reader."""
         reader, self.reader = self.reader, None
         if reader is not None:
-            reader.drop_readahead()
+            reader.drop(demand=False)
             reader.close()
 
     def replace(self, why: str) -> None:
@@ -434,7 +434,7 @@ class Version:
         finally:
             self._waiters.remove(waiter)
             if not waiter.done.is_set() and self.reader is not None:
-                self.reader.drop_wants()
+                self.reader.drop()
                 for other in self._waiters:
                     self.reader.want(other.start, other.stop, demand=True)
         if waiter.error is not None:

@@ -18,10 +18,9 @@ from math import inf
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer
+from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer, Wants
 from mavftpfs.protocol.requests import MANNERS, Request
 from mavftpfs.shared.errors import MavftpfsError, SessionLost
-from mavftpfs.shared.extents import ExtentSet
 
 _MOST_PACKETS = 40_000
 _MIN_QUIET = 1.0
@@ -137,11 +136,18 @@ class BurstTransfer(ReadTransfer):
         burst.
     """
 
-    def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
-        super().__init__(session, size, sink, chunks)
+    def __init__(
+        self,
+        session: int,
+        size: int,
+        sink: DataSink,
+        chunks: ChunkSize | None = None,
+        wants: Wants | None = None,
+    ) -> None:
+        super().__init__(session, size, sink, chunks, wants)
         self.by_requests = False
         self._burst: Burst | None = None
-        self._gaps = ExtentSet()
+        self._covered = 0  # below this the last burst left out what is wanted still
         self._barren_bursts = 0
         self._gave_up = False
 
@@ -162,11 +168,11 @@ class BurstTransfer(ReadTransfer):
             return []
         if self.by_requests or self._gave_up:
             return super().next_requests(most, now)
-        gap = self._gaps.take_first(self.chunks.size)
+        gap = self.wants.take(self.chunks.size, 0, self._covered)
         if gap is not None:
-            self._forget_want(*gap)
-            return self._requests_for(*gap, self.chunks.size)
-        first = self._demand.first() or self._ahead.first()
+            return self._requests_for(gap, self.chunks.size)
+        self._covered = 0
+        first = self.wants.demand.first() or self.wants.ahead.first()
         if self._unanswered or first is None:
             return []
         opcode = Opcode.BURST_READ_FILE
@@ -186,7 +192,7 @@ class BurstTransfer(ReadTransfer):
         if burst is None or data is None:
             return False
         if data:
-            self._forget_want(reply.offset, reply.offset + len(data))
+            self.wants.discard(reply.offset, reply.offset + len(data))
             self._place(reply.offset, [data])
         if burst.endless:
             self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
@@ -204,25 +210,13 @@ class BurstTransfer(ReadTransfer):
         else:
             self._end_burst(burst)
 
-    def drop_readahead(self) -> None:
-        """Forget wants for which no program waits; what is on its way still arrives."""
-        super().drop_readahead()
-        self._gaps = ExtentSet(
-            part for start, stop in self._gaps for part in self._demand.intersection(start, stop)
-        )
-
     def fail(self, error: MavftpfsError) -> None:
         """End; what was on its way is wanted again."""
         self._burst = None
         super().fail(error)
 
-    def _forget_want(self, start: int, stop: int) -> None:
-        self._demand.discard(start, stop)
-        self._ahead.discard(start, stop)
-
     def _end_burst(self, burst: Burst) -> None:
-        self._burst, self.timer = None, inf
-        self._gaps = ExtentSet(self.wants.intersection(0, burst.highest))
+        self._burst, self.timer, self._covered = None, inf, burst.highest
         if burst.packets:
             self._barren_bursts = 0
             return

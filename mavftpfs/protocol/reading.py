@@ -5,6 +5,7 @@ lie, from its beginning until the server says that it ends."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
@@ -47,32 +48,94 @@ class DataSink(Protocol):
         ...
 
 
+class Wants:
+    """What is wanted of a file, and not asked for yet. It outlives the transfers that take from it.
+
+    Attributes:
+        demand: what programs wait for; it goes first. ahead: readahead, none of it in demand.
+    """
+
+    def __init__(self) -> None:
+        self.demand, self.ahead = ExtentSet(), ExtentSet()
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is wanted."""
+        return self.demand.empty and self.ahead.empty
+
+    def add(self, ranges: Iterable[tuple[int, int]], *, demand: bool) -> None:
+        """Want these ranges, too."""
+        for start, stop in ranges:
+            if demand:
+                self.demand.add(start, stop)
+                self.ahead.discard(start, stop)
+            else:
+                for gap_start, gap_stop in self.demand.missing(start, stop):
+                    self.ahead.add(gap_start, gap_stop)
+
+    def discard(self, start: int, stop: int) -> None:
+        """Want [start, stop) no more."""
+        self.demand.discard(start, stop)
+        self.ahead.discard(start, stop)
+
+    def clear(self, *, demand: bool = True) -> None:
+        """Want nothing more; demand: False: no readahead."""
+        if demand:
+            self.demand = ExtentSet()
+        self.ahead = ExtentSet()
+
+    def keep(self, missing: Callable[[int, int], list[tuple[int, int]]]) -> None:
+        """Want only what is missing still."""
+        for wanted in (self.demand, self.ahead):
+            for start, stop in wanted:
+                wanted.discard(start, stop)
+                for gap_start, gap_stop in missing(start, stop):
+                    wanted.add(gap_start, gap_stop)
+
+    def take(self, limit: int, start: int, stop: int) -> tuple[int, int, bool] | None:
+        """Remove and return the first of it in [start, stop), at most `limit` bytes, and whether it is
+        demand."""
+        for wanted, demand in ((self.demand, True), (self.ahead, False)):
+            for first, end in wanted.intersection(start, stop):
+                end = min(end, first + limit)
+                wanted.discard(first, end)
+                return first, end, demand
+        return None
+
+
 class ReadTransfer(Operation):
     """Reads wanted ranges of an open regular file for as long as its owner likes.
 
     Args:
         session: id of the open file. size: as the open ACK said; nothing beyond is ever asked for.
-        sink: takes the data. chunks: the size of requests.
+        sink: takes the data. chunks: the size of requests. wants: what is wanted already.
 
     Attributes:
         received_bytes: delivered to the sink so far.
 
     Fails with SessionLost (reopen, and start another with `wants`), FileChanged (the file ends before its
-    size), FtpNak, or RequestTimeout. `wants` stays valid after a failure.
+    size), FtpNak, or RequestTimeout. Then, and after `give_back`, all that did not come is in `wants`.
     """
 
     rank = Priority.DEMAND
     bulk = _READ
 
-    def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
+    def __init__(
+        self,
+        session: int,
+        size: int,
+        sink: DataSink,
+        chunks: ChunkSize | None = None,
+        wants: Wants | None = None,
+    ) -> None:
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.size = size
         self.received_bytes = 0
+        self.wants = Wants() if wants is None else wants
         self._sink = sink
-        self._demand = ExtentSet()
-        self._ahead = ExtentSet()
-        self._unanswered: dict[Request, None] = {}
+        # Whether a program waits for it; None: it was dropped since, and is not asked for again.
+        self._unanswered: dict[Request, bool | None] = {}
         self._errors = 0
 
     # --- what the owner says and sees
@@ -82,22 +145,27 @@ class ReadTransfer(Operation):
         lacking = ExtentSet(self._sink.missing(start, min(stop, self.size)))
         for request in self._unanswered:
             lacking.discard(request.offset, request.offset + request.size)
-        for piece_start, piece_stop in lacking:
-            if demand:
-                self._demand.add(piece_start, piece_stop)
-                self._ahead.discard(piece_start, piece_stop)
-            else:
-                for ahead_start, ahead_stop in self._demand.missing(piece_start, piece_stop):
-                    self._ahead.add(ahead_start, ahead_stop)
+            if request.offset < stop and start < request.offset + request.size:
+                self._unanswered[request] = demand or bool(self._unanswered[request])
+        self.wants.add(lacking, demand=demand)
 
-    def drop_readahead(self) -> None:
-        """Forget wants for which no program waits; what is on its way still arrives."""
-        self._ahead = ExtentSet()
+    def drop(self, *, demand: bool = True) -> None:
+        """Want nothing more; demand: False: no readahead. What is on its way still arrives."""
+        self.wants.clear(demand=demand)
+        for request, waited_for in self._unanswered.items():
+            if demand or not waited_for:
+                self._unanswered[request] = None
 
-    def drop_wants(self) -> None:
-        """Forget everything that is wanted; what is on its way still arrives."""
-        self._demand = ExtentSet()
-        self.drop_readahead()
+    def give_back(self) -> None:
+        """What is on its way is not waited for any more: it is wanted again."""
+        for request in list(self._unanswered):
+            self._want_again(request)
+
+    def _want_again(self, request: Request, got: int = 0) -> None:
+        waited_for = self._unanswered.pop(request)
+        if waited_for is not None:
+            rest = (request.offset + got, request.offset + request.size)
+            self.wants.add([rest], demand=waited_for)
 
     @property
     def in_flight(self) -> int:
@@ -105,24 +173,19 @@ class ReadTransfer(Operation):
         return len(self._unanswered)
 
     @property
-    def wants(self) -> ExtentSet:
-        """What is wanted and has not come, requests on their way included."""
-        wants = ExtentSet(self._demand)
-        for start, stop in self._ahead:
-            wants.add(start, stop)
-        for request in self._unanswered:
-            wants.add(request.offset, request.offset + request.size)
-        return wants
-
-    @property
     def idle(self) -> bool:
         """Whether nothing is wanted or on its way."""
-        return not self._unanswered and self._demand.empty and self._ahead.empty
+        return not self._unanswered and self.wants.empty
+
+    @property
+    def demanded(self) -> bool:
+        """Whether a program waits for some of it."""
+        return not self.wants.demand.empty or any(self._unanswered.values())
 
     @property
     def priority(self) -> Priority:
-        """DEMAND while a program waits."""
-        return Priority.READAHEAD if self._demand.empty else Priority.DEMAND
+        """DEMAND while a program waits for what is to be asked for."""
+        return Priority.READAHEAD if self.wants.demand.empty else Priority.DEMAND
 
     # --- requests
 
@@ -130,15 +193,17 @@ class ReadTransfer(Operation):
         """Return ReadFile requests for a row of chunks; demand goes first."""
         chunk = self.chunks.next_size(now)
         limit = chunk if self.chunks.trying else most * chunk
-        row = self._demand.take_first(limit) or self._ahead.take_first(limit)
-        return [] if row is None else self._requests_for(*row, chunk)
+        return self._requests_for(self.wants.take(limit, 0, self.size), chunk)
 
-    def _requests_for(self, start: int, stop: int, chunk: int) -> list[Request]:
+    def _requests_for(self, row: tuple[int, int, bool] | None, chunk: int) -> list[Request]:
+        if row is None:
+            return []
         session, requests = self.session, []
+        start, stop, demand = row
         for offset in range(start, stop, chunk):
             request = Request(self, _READ, READ_MANNER, session, offset, min(chunk, stop - offset))
             requests.append(request)
-            self._unanswered[request] = None
+            self._unanswered[request] = demand
         return requests
 
     # --- replies to ReadFile
@@ -148,8 +213,7 @@ class ReadTransfer(Operation):
         if reply.opcode != _NAK:
             self.on_run([(request, reply.data)], now)
             return
-        del self._unanswered[request]
-        self._demand.add(request.offset, request.offset + request.size)
+        self._want_again(request)
         nak = nak_of(request, reply)
         error = self._meaning(request, nak)
         if error is not nak or self._errors >= _ERRORS_TOLERATED:
@@ -165,14 +229,15 @@ class ReadTransfer(Operation):
         start = stop = first.offset
         for request, data in run:
             offset, size = request.offset, request.size
-            del unanswered[request]
             if offset != stop:
                 self._place(start, pieces)
                 pieces, start = [], offset
-            if len(data) != size:
-                data = data[:size]
-                if len(data) < size:
-                    self._on_short(request, len(data))
+            if len(data) < size:
+                self._on_short(request, len(data))
+            else:
+                del unanswered[request]
+                if len(data) > size:
+                    data = data[:size]
             pieces.append(data)
             stop = offset + len(data)
             if self.done:
@@ -186,10 +251,9 @@ class ReadTransfer(Operation):
             self._sink.on_data(offset, data)
 
     def _on_short(self, request: Request, count: int) -> None:
-        start = request.offset + count
-        self._demand.add(start, request.offset + request.size)
+        self._want_again(request, count)
         if count == 0:
-            self.fail(FileChanged(f"the file ends at {start}, before its size of {self.size}"))
+            self.fail(FileChanged(f"the file ends at {request.offset}, before its size of {self.size}"))
 
     def _meaning(self, request: Request, nak: FtpNak) -> MavftpfsError:
         """Return what a refused ReadFile within the size means (servers.md 1, 7, 12)."""
@@ -206,15 +270,12 @@ class ReadTransfer(Operation):
         """See Operation: the bytes of a chunk that was too long are asked for in shorter ones."""
         if request.opcode != _READ or not self.chunks.on_lost(request.size, request.sent_at, now):
             return False
-        del self._unanswered[request]
-        self._demand.add(request.offset, request.offset + request.size)
+        self._want_again(request)
         return True
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was on its way is wanted again."""
-        for request in self._unanswered:
-            self._demand.add(request.offset, request.offset + request.size)
-        self._unanswered.clear()
+        self.give_back()
         super().fail(error)
 
 

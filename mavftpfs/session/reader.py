@@ -8,11 +8,10 @@ import trio
 
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
-from mavftpfs.protocol.reading import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer, Wants
 from mavftpfs.session.scheduler import RECENT, Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
-from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 
 FIRST_WANT = 0.05
@@ -23,7 +22,7 @@ _OFTEN = 0.25
 
 class FileStream(SessionUser):
     """Implements cache.remote.Reader. It outlives the server's session on its file: what is wanted and did
-    not come is handed to the transfer of its next turn.
+    not come is for the transfer of its next turn.
 
     expected_size: in bytes, if the file need not be opened to know it.
 
@@ -40,7 +39,7 @@ class FileStream(SessionUser):
         self._scheduler = scheduler
         self._server = scheduler.server
         self.opened = Future()
-        self._demand, self._ahead = ExtentSet(), ExtentSet()
+        self._wants = Wants()
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # by that transfer
@@ -62,35 +61,28 @@ class FileStream(SessionUser):
         if self._removed:
             self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
-        wanted = self._demand if demand else self._ahead
-        for gap_start, gap_stop in self._sink.missing(start, stop):
-            wanted.add(gap_start, gap_stop)
-        if self._transfer is not None:
+        if self._transfer is not None:  # which knows what is on its way
             self._transfer.want(start, stop, demand)
-        if self.asked_at is None and not self._demand.empty:
+        else:
+            self._wants.add(self._sink.missing(start, stop), demand=demand)
+        if self.asked_at is None and not self._wants.demand.empty:
             self._scheduler.renew(self)
         self._wanted.set()
         self._server.wake()
 
-    def drop_readahead(self) -> None:
-        """Forget wants for which no program waits."""
-        self._ahead = ExtentSet()
+    def drop(self, *, demand: bool = True) -> None:
+        """Ask for nothing more; demand: False: no readahead. What is on its way still comes."""
         if self._transfer is not None:
-            self._transfer.drop_readahead()
-
-    def drop_wants(self) -> None:
-        """No program waits any more: ask for nothing else. What is on its way still comes."""
-        self._demand = ExtentSet()
-        self.drop_readahead()
-        if self._transfer is not None:
-            self._transfer.drop_wants()
-        elif self.opened.done:
+            self._transfer.drop(demand=demand)
+            return
+        self._wants.clear(demand=demand)
+        if self._wants.demand.empty and self.opened.done:
             self.asked_at = None
 
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True
-        self._demand, self._ahead = ExtentSet(), ExtentSet()
+        self._wants.clear()
         self._wanted.set()
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
@@ -101,7 +93,7 @@ class FileStream(SessionUser):
     @property
     def idle(self) -> bool:
         """See SessionUser."""
-        return self.closed or (self.opened.done and self._demand.empty and self._ahead.empty)
+        return self.closed or (self.opened.done and self._wants.empty)
 
     def goes_on(self, session: OpenSession) -> bool:
         """See SessionUser."""
@@ -123,7 +115,7 @@ class FileStream(SessionUser):
 
     def _fail(self, error: MavftpfsError) -> None:
         """What is wanted cannot be had now."""
-        self._demand, self._ahead = ExtentSet(), ExtentSet()
+        self._wants.clear()
         self.asked_at = None
         if not self.opened.done:
             self.opened.end(error)
@@ -151,7 +143,7 @@ class FileStream(SessionUser):
                     self._fail(error)
             except MavftpfsError as error:
                 self._fail(error)
-            self.asked_at = None if self._demand.empty else server.clock()
+            self.asked_at = None if self._wants.demand.empty else server.clock()
 
     async def _open(self, turn: Turn) -> None:
         """Have the file open. Give the caller that waited for that a moment to ask for its bytes, before
@@ -184,11 +176,9 @@ class FileStream(SessionUser):
         server, session = self._server, self._server.session
         if session is None or self.idle:
             return  # the vehicle restarted since it was opened, or nothing is wanted
+        self._wants.keep(self._sink.missing)  # other readers may have got some of it
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
-        transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks)
-        for wanted, demand in ((self._demand, True), (self._ahead, False)):
-            for start, stop in wanted:
-                transfer.want(start, stop, demand)
+        transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
         began, driver, engine = server.clock(), server.driver, server.engine
         server.transfer = self._transfer = transfer
         self._received = 0
@@ -200,7 +190,7 @@ class FileStream(SessionUser):
                 rival = turn.rival
                 if rival is not None and self.gives_way(rival, began, server.clock(), engine.rtt):
                     break
-                if self._scheduler.is_excluded(self.path) or (rival is not None and self._demand.empty):
+                if self._scheduler.is_excluded(self.path) or (rival is not None and not transfer.demanded):
                     break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
@@ -213,16 +203,14 @@ class FileStream(SessionUser):
                     raise SessionLost("no answer for a while during a read", by_server=False)
         finally:
             server.transfer = self._transfer = None
-            if transfer.idle:  # everything wanted has come
-                self._demand, self._ahead = ExtentSet(), ExtentSet()
+            transfer.give_back()
             driver.cancel(transfer)
             self.on_turn(began, server.clock())
         if transfer.error is not None:
             raise transfer.error
 
     def _on_batch(self, now: float) -> None:
-        """A batch of replies was processed: pass data on, once. What came is wanted no more, even if the
-        cache soon drops it again."""
+        """A batch of replies was processed: pass data on, once."""
         transfer = self._transfer
         if transfer is None:
             return
@@ -230,11 +218,6 @@ class FileStream(SessionUser):
         if count:
             self._received, self._last_data_at, self._lost = transfer.received_bytes, now, 0
             if not self.closed:
-                for wanted in (self._demand, self._ahead):
-                    for start, stop in wanted:
-                        wanted.discard(start, stop)
-                        for gap_start, gap_stop in self._sink.missing(start, stop):
-                            wanted.add(gap_start, gap_stop)
                 self._sink.on_batch(count)
         if transfer.idle or transfer.done:
             self._server.wake()

@@ -133,15 +133,3 @@ class ExtentSet:
     def first(self) -> tuple[int, int] | None:
         """Return the lowest extent, or None."""
         return (self._starts[0], self._stops[0]) if self._starts else None
-
-    def take_first(self, limit: int) -> tuple[int, int] | None:
-        """Remove and return the lowest at most `limit` bytes of the lowest extent, or None."""
-        if not self._starts:
-            return None
-        start = self._starts[0]
-        stop = min(self._stops[0], start + limit)
-        if stop == self._stops[0]:
-            del self._starts[0], self._stops[0]
-        else:
-            self._starts[0] = stop
-        return start, stop

@@ -96,10 +96,14 @@ def test_nothing_is_asked_beyond_the_end_or_twice() -> None:
     reader.transfer.want(SIZE, SIZE + 100, True)
     assert reader.transfer.idle
     reader.transfer.want(0, 478, True)
-    reader.sent()
+    out = reader.sent()
     reader.transfer.want(0, 478, True)
     assert reader.sent() == []
-    assert reader.transfer.wants == ExtentSet([(0, 478)])
+    for request in out:
+        reader.answer(request)
+    reader.sink.held = ExtentSet()  # the cache dropped it again
+    assert reader.sent() == []
+    assert reader.transfer.idle
 
 
 def test_demand_goes_before_readahead_and_promotes_it() -> None:
@@ -117,11 +121,36 @@ def test_readahead_can_be_dropped() -> None:
     reader = Reader(limit=1)
     reader.transfer.want(0, 1000, False)
     (request,) = reader.sent()
-    reader.transfer.drop_readahead()
+    reader.transfer.drop(demand=False)
     reader.answer(request)
     assert reader.sent() == []
     assert reader.transfer.idle
     assert reader.sink.have == ExtentSet([(0, 239)])
+
+
+def test_what_is_on_its_way_at_the_end_of_a_turn_is_wanted_as_before() -> None:
+    reader = Reader(limit=2)
+    wants = reader.transfer.wants
+    reader.transfer.want(0, 478, False)
+    assert len(reader.sent()) == 2
+    reader.transfer.want(0, 100, True)
+    assert reader.transfer.demanded
+    reader.transfer.give_back()
+    assert (wants.demand, wants.ahead) == (ExtentSet([(0, 239)]), ExtentSet([(239, 478)]))
+
+
+@pytest.mark.parametrize(("demand", "left"), [(True, []), (False, [(0, 239)])])
+def test_what_was_dropped_on_its_way_is_not_asked_for_again(
+    demand: bool, left: list[tuple[int, int]]
+) -> None:
+    reader = Reader(limit=2)
+    reader.transfer.want(0, 478, False)
+    assert len(reader.sent()) == 2
+    reader.transfer.want(0, 100, True)
+    reader.transfer.drop(demand=demand)
+    reader.transfer.give_back()
+    assert list(reader.transfer.wants.demand) == left
+    assert reader.transfer.wants.ahead.empty
 
 
 # --- replies to ReadFile
@@ -155,7 +184,7 @@ def test_an_empty_ack_means_that_the_file_shrank() -> None:
     reader.transfer.want(0, 1000, True)
     reader.engine.receive(ack(reader.sent()[0]), 0.1)
     assert isinstance(reader.transfer.error, FileChanged)
-    assert reader.transfer.wants == ExtentSet([(0, 1000)])
+    assert reader.transfer.wants.demand == ExtentSet([(0, 1000)])
     assert reader.engine.take_finished() == [reader.transfer]
 
 
@@ -177,7 +206,7 @@ def test_a_lost_session_leaves_the_wants(codes: tuple[int, ...]) -> None:
     error = reader.transfer.error
     assert isinstance(error, SessionLost)
     assert error.by_server
-    assert reader.transfer.wants == ExtentSet([(239, 1000)])
+    assert reader.transfer.wants.demand == ExtentSet([(239, 1000)])
 
 
 def test_other_refusals_are_asked_again_a_few_times() -> None:
@@ -282,5 +311,5 @@ def test_a_burst_without_session(code: int) -> None:
     reader.transfer.want(0, SIZE, True)
     reader.engine.receive(burst_nak(reader.sent()[0], 0, code), 0.1)
     assert isinstance(reader.transfer.error, SessionLost)
-    assert reader.transfer.wants == ExtentSet([(0, SIZE)])
+    assert reader.transfer.wants.demand == ExtentSet([(0, SIZE)])
     assert not reader.transfer.bursting

@@ -4,7 +4,6 @@ file."""
 from __future__ import annotations
 
 import random
-from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import (
@@ -25,7 +23,6 @@ from mavftpfs.session.scheduler import (
     SessionUser,
 )
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.extents import ExtentSet
 from tests.support.transfers import MemorySink
 
 
@@ -99,30 +96,14 @@ def test_when_a_turn_ends(
 # --- a reader
 
 
-def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> None:
-    sink = MemorySink(1000)
-    stream = FileStream(b"/f", sink, 1000, scheduler())
-    stream.want(0, 600, demand=True)
-    stream.want(600, 900, demand=False)
-    for offset, size in ((0, 600), (600, 300)):
-        assert not stream.idle
-        sink.on_data(offset, bytes(size))
-        transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
-        stream._transfer = cast(ReadTransfer, transfer)
-        stream._on_batch(0.0)
-        sink.have = ExtentSet()  # evicted
-        assert stream._demand.empty
-    assert stream.idle
-
-
 def test_only_what_the_cache_lacks_is_wanted() -> None:
     sink = MemorySink(1000)
     stream = FileStream(b"/f", sink, 1000, scheduler())
     sink.on_data(100, bytes(100))
     stream.want(100, 200, demand=True)
-    assert stream._demand.empty
+    assert stream.idle
     stream.want(0, 300, demand=True)
-    assert list(stream._demand) == [(0, 100), (200, 300)]
+    assert list(stream._wants.demand) == [(0, 100), (200, 300)]
 
 
 def test_a_closed_stream_wants_nothing() -> None:
@@ -130,4 +111,4 @@ def test_a_closed_stream_wants_nothing() -> None:
     stream.want(0, 100, demand=True)
     stream.close()
     stream.want(0, 100, demand=True)
-    assert stream._demand.empty
+    assert stream._wants.empty
