@@ -82,7 +82,7 @@ class FileStream(SessionUser):
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True
-        self._wants.clear()
+        self.drop()
         self._wanted.set()
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
@@ -115,7 +115,7 @@ class FileStream(SessionUser):
 
     def _fail(self, error: MavftpfsError) -> None:
         """What is wanted cannot be had now."""
-        self._wants.clear()
+        self.drop()
         self.asked_at = None
         if not self.opened.done:
             self.opened.end(error)
