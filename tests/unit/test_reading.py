@@ -101,7 +101,7 @@ def test_nothing_is_asked_beyond_the_end_or_twice() -> None:
     assert reader.sent() == []
     for request in out:
         reader.answer(request)
-    reader.sink.held = ExtentSet()  # the cache dropped it again
+    reader.sink.have = ExtentSet()  # the cache dropped it again
     assert reader.sent() == []
     assert reader.transfer.idle
 
