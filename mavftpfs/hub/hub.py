@@ -101,6 +101,7 @@ class Hub:
         self._door = door
         self._port: Link | None = None
         self._clients: dict[int, _Client] = {}
+        self._joining: list[tuple[str, ...]] = []
         self._endpoints: dict[str, _Endpoint] = {}
         self._sides = 0
         self._ended = trio.Event()
@@ -209,7 +210,11 @@ class Hub:
                 f"port {spec.port} of {self.spec.host} is shared already; of {spec.host} it cannot be"
             )
         forward = tuple(map(str, hello.get("forward", ())))
-        await self._open_endpoints(forward, nursery, patient=bool(hello.get("again")))
+        self._joining.append(forward)
+        try:
+            await self._open_endpoints(forward, nursery, patient=bool(hello.get("again")))
+        finally:
+            self._joining.remove(forward)
         self._sides += 1
         side = self._sides
         self.router.add(side, Kind.CLIENT, fixed=True)
@@ -283,10 +288,13 @@ class Hub:
             self._sides += 1
             endpoint = self._endpoints[text] = _Endpoint(self._sides, text, spec)
             self.router.add(endpoint.side, Kind.ENDPOINT, fixed=endpoint.spec.kind is not LinkKind.UDP_IN)
+            if patient:
+                nursery.start_soon(self._serve_endpoint, endpoint, True)
+                continue
             try:
-                await nursery.start(self._serve_endpoint, endpoint, patient)
+                await nursery.start(self._serve_endpoint, endpoint, False)
             except LinkClosed as exc:
-                self._drop_endpoint(endpoint)
+                del self._endpoints[text]
                 raise LinkClosed(f"forward={exc}") from exc
 
     async def _serve_endpoint(
@@ -295,29 +303,28 @@ class Hub:
         patient: bool,
         task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED,
     ) -> None:
-        """Keep an endpoint open; patient: also one that cannot be opened yet."""
-        with endpoint.scope:
-            while True:
-                try:
-                    async with open_link(endpoint.spec, patient=True) as link:
-                        endpoint.link, endpoint.problem = link, ""
-                        task_status.started()
-                        patient = True
-                        await self._read(endpoint.side, link)
-                except LinkClosed as exc:
-                    endpoint.link = None
-                    if not patient:
-                        raise
-                    if not endpoint.problem:
-                        log.warning("forward=%s", exc)
-                    endpoint.problem = str(exc)
-                    task_status.started()
-                await trio.sleep(_RETRY)
+        """Open an endpoint, and pass on what comes from it. patient: if it cannot be opened, try again."""
+        try:
+            with endpoint.scope:
+                while True:
+                    try:
+                        async with open_link(endpoint.spec, patient=True) as link:
+                            endpoint.link, endpoint.problem = link, ""
+                            task_status.started()
+                            await self._read(endpoint.side, link)
+                    except LinkClosed as exc:
+                        if not patient:
+                            raise
+                        if not endpoint.problem:
+                            log.warning("forward=%s", exc)
+                        endpoint.problem = str(exc)
+                    await trio.sleep(_RETRY)
+        finally:
+            self.router.remove(endpoint.side)  # only now: until it ended the task may pass on a last frame
 
     def _drop_endpoint(self, endpoint: _Endpoint) -> None:
+        del self._endpoints[endpoint.text]
         endpoint.scope.cancel()
-        self._endpoints.pop(endpoint.text, None)
-        self.router.remove(endpoint.side)
 
     # -- frames
 
@@ -447,7 +454,8 @@ class Hub:
             await trio.sleep(_LOOK)
 
     def _end_if_done(self) -> None:
-        wanted = {text for client in self._clients.values() for text in client.forward}
+        asked = [*self._joining, *(client.forward for client in self._clients.values())]
+        wanted = {text for forward in asked for text in forward}
         if self._clients:
             for endpoint in [known for text, known in self._endpoints.items() if text not in wanted]:
                 if not self._is_active(endpoint):

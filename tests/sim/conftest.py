@@ -9,7 +9,7 @@ from trio.testing import MockClock
 
 from tests.support.clocks import use_virtual_time
 
-REAL_TIME = ("test_endpoints", "test_impostors", "test_links")
+REAL_TIME = ("test_endpoints", "test_hub", "test_impostors", "test_links")
 """Modules with sockets. A test of theirs runs on virtual time only if it asks for it."""
 
 

@@ -1,0 +1,119 @@
+"""The hub between real sockets: endpoints that cannot be opened, clients that come and go."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trio
+import trio.testing
+
+from mavftpfs.hub.hub import Hub
+from mavftpfs.link.hublink import PROTOCOL, HubLink, Wish, ask, join
+from mavftpfs.link.messages import Address
+from mavftpfs.link.rendezvous import ALONE, Door
+from mavftpfs.link.uri import parse_source
+from tests.support.vehicles import free_udp_port
+
+HOST = "127.0.0.1"
+US = Address(254, 191)
+
+
+@pytest.fixture
+def autojump_clock() -> trio.testing.MockClock:
+    """Virtual time that leaves the kernel and name servers a moment to answer."""
+    return trio.testing.MockClock(autojump_threshold=0.05)
+
+
+class Running:
+    """A hub that runs, and its first client."""
+
+    def __init__(self, hub: Hub, path: Path, source: str, first: HubLink) -> None:
+        self.hub = hub
+        self.source = source
+        self.first = first
+        self.ended = trio.Event()
+        self._path = path
+
+    def knock(self) -> socket.socket:
+        """Return a new connection to the hub."""
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        (door,) = self._path.parent.glob("port.*")
+        sock.connect(str(door))
+        return sock
+
+    async def joined(self, *forward: str, again: bool = False) -> HubLink:
+        """Return another client."""
+        wish = Wish(US, forward)
+        return await join(self.knock(), parse_source(self.source), wish, None, again=again)
+
+    async def status(self) -> dict[str, Any]:
+        with self.knock() as sock:
+            return await ask(sock, {"protocol": PROTOCOL, "status": True})
+
+
+@asynccontextmanager
+async def running(place: Path, *forward: str, again: bool = False) -> AsyncIterator[Running]:
+    """Run a hub of a port, with one client that asks for these endpoints."""
+    source = f"udpin:{HOST}:{free_udp_port()}"
+    path = place / f"port{ALONE}"
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listening.setblocking(False)
+    listening.bind(str(path))
+    listening.listen(8)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    hub = Hub(parse_source(source), (), Door(listening, path))
+    async with trio.open_nursery() as nursery:
+        ready = trio.Event()
+        nursery.start_soon(hub.run, theirs, ready.set)
+        await ready.wait()
+        first = await join(ours, parse_source(source), Wish(US, forward), None, again=again)
+        yield Running(hub, path, source, first)
+        await first.aclose()
+        nursery.cancel_scope.cancel()
+
+
+async def test_an_endpoint_that_cannot_be_opened_yet_is_tried_again(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    taken = free_udp_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HOST, taken))
+        async with running(tmp_path, f"udpin:{HOST}:{taken}", again=True) as here:
+            await trio.sleep(20)
+            (endpoint,) = (await here.status())["endpoints"]
+            assert "in use" in endpoint["problem"]
+            other.close()
+            await trio.sleep(5)
+            (endpoint,) = (await here.status())["endpoints"]
+            assert endpoint["problem"] is None
+
+
+class SlowNames(trio.abc.HostnameResolver):
+    """A name server that takes three seconds for one name."""
+
+    async def getaddrinfo(self, host: Any, port: Any, *args: Any, **kwargs: Any) -> Any:
+        if host == b"slow.example":
+            await trio.sleep(3)
+            host = HOST
+        return socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+
+    async def getnameinfo(self, sockaddr: Any, flags: int) -> Any:
+        raise NotImplementedError
+
+
+async def test_endpoints_stay_while_the_client_that_wants_them_waits_for_another_one(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    trio.socket.set_custom_hostname_resolver(SlowNames())
+    async with running(tmp_path) as here:
+        places = f"udpout:{HOST}:{free_udp_port()}", f"udpout:slow.example:{free_udp_port()}"
+        client = await here.joined(*places)
+        assert {facts["endpoint"] for facts in (await here.status())["endpoints"]} == set(places)
+        await client.aclose()
+        await trio.sleep(5)
+        assert (await here.status())["endpoints"] == []
