@@ -44,9 +44,8 @@ QUIET = 0.1
 """Seconds of silence within a frame after which the rest of a stream's frame is not waited for."""
 ACTIVE = 10.0
 """Seconds for which an endpoint that was heard keeps the hub up, while a vehicle is armed."""
-FIRST_PATIENCE = 10.0
-"""Seconds for the first client to join."""
 HELLO_PATIENCE = 10.0
+"""Seconds for a connection to say what it wants."""
 
 _DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or frames that a router sends back"
 _POLL = 0.003
@@ -105,7 +104,6 @@ class Hub:
         self._endpoints: dict[str, _Endpoint] = {}
         self._sides = 0
         self._ended = trio.Event()
-        self._stopping = False
         self._came = trio.Event()
         self._work = trio.Event()
         serial = spec.kind is LinkKind.SERIAL
@@ -115,26 +113,29 @@ class Hub:
         self._outbox = Outbox(max(_LEAST_OUTBOX, spec.baud // 10) if serial else _OUTBOX)
         self._said_doubles: set[Address] = set()
 
-    async def run(self, first: socket.socket | None, on_ready: Callable[[], None]) -> None:
-        """Serve until the hub is not needed any more. first: a client that waits already."""
+    async def run(self, first: socket.socket, on_ready: Callable[[], None]) -> None:
+        """Serve until the hub is not needed any more. first: the connection of the program that started it.
+
+        Until that program has joined, port and door are its own.
+        """
         async with AsyncExitStack() as stack:
-            stack.callback(self._door.remove)
-            port = self._port = await stack.enter_async_context(open_link(self.spec, self._inherited))
+            # Patient: what was handed over may have no connection at the moment.
+            opening = open_link(self.spec, self._inherited, patient=True)
+            port = self._port = await stack.enter_async_context(opening)
             fixed = self.spec.kind is not LinkKind.UDP_IN
             self.router.add(PORT, Kind.PORT, fixed=fixed)
-            self._door.is_hubs()
             async with trio.open_nursery() as nursery:
-                if first is not None:
-                    nursery.start_soon(self._serve, first, nursery)
+                nursery.start_soon(self._serve, first, nursery)
                 on_ready()
-                # The program that had the port until now keeps its address.
-                with trio.move_on_after(FIRST_PATIENCE):
-                    await self._came.wait()
-                nursery.start_soon(self._accept, nursery)
-                nursery.start_soon(self._read, PORT, port)
-                nursery.start_soon(self._write)
-                nursery.start_soon(self._watch)
-                await self._ended.wait()
+                await self._came.wait()
+                if not self._ended.is_set():
+                    stack.callback(self._door.remove)
+                    self._door.is_hubs()
+                    nursery.start_soon(self._accept, nursery)
+                    nursery.start_soon(self._read, PORT, port)
+                    nursery.start_soon(self._write)
+                    nursery.start_soon(self._watch)
+                    await self._ended.wait()
                 nursery.cancel_scope.cancel()
 
     # -- clients
@@ -173,10 +174,7 @@ class Hub:
 
     async def _answered(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
         """Reply to the first message of a connection; return the client if it is let in."""
-        if hello.get("protocol") != PROTOCOL:
-            text = "another version of mavftpfs has the port; end its mounts, or: mavftpfs hub --stop --force"
-            sock.send(pack_facts({"refused": text}))
-        elif "join" in hello:
+        if "join" in hello:
             try:
                 client = await self._joined(sock, hello, nursery)
             except (MavftpfsError, KeyError, TypeError, ValueError) as exc:
@@ -192,7 +190,6 @@ class Hub:
         elif "status" in hello:
             sock.send(pack_facts(self.status()))
         elif "stop" in hello:
-            self._stopping = True
             sock.send(pack_facts(self.status()))
             self._ended.set()
         return None
@@ -201,8 +198,12 @@ class Hub:
         """Let a client in.
 
         Raises:
-            MavftpfsError: it wants another port, or an endpoint that cannot be opened.
+            MavftpfsError: it is of another version, wants another port, or an endpoint that cannot be opened.
         """
+        if hello.get("protocol") != PROTOCOL:
+            raise LinkClosed(
+                "another version of mavftpfs has the port; end its mounts, or: mavftpfs hub --stop --force"
+            )
         spec = parse_source(hello["join"])
         anywhere = {"0.0.0.0", "::"}
         if spec.host != self.spec.host and not {spec.host, self.spec.host} & anywhere:
@@ -215,12 +216,12 @@ class Hub:
             await self._open_endpoints(forward, nursery, patient=bool(hello.get("again")))
         finally:
             self._joining.remove(forward)
+        own, number = self._granted(Address(*hello["own"]), hello.get("number"))
         self._sides += 1
         side = self._sides
         self.router.add(side, Kind.CLIENT, fixed=True)
         if hello.get("beats"):
             self.router.focus(side, BEATS)
-        own, number = self._granted(Address(*hello["own"]), hello.get("number"))
         client = _Client(side, sock, own, number, str(hello.get("name", "")), forward)
         self._clients[side] = client
         log.info("%s joined as %d/%d", client.name or "a client", *own)
@@ -228,7 +229,11 @@ class Hub:
 
     def _granted(self, wanted: Address, number: int | None) -> tuple[Address, int]:
         """Return the address that a client gets, and the link id of its signatures: those that it asks for,
-        unless another client has them."""
+        unless another client has them.
+
+        Raises:
+            LinkClosed: all link ids are in use.
+        """
         now = trio.current_time()
         owns = {client.own for client in self._clients.values()}
         for _ in range(255):
@@ -237,7 +242,9 @@ class Hub:
             wanted = Address(wanted.system, wanted.component % 249 + 1)
         numbers = {client.number for client in self._clients.values()}
         if number is None or number in numbers:
-            number = next(free for free in range(256) if free not in numbers)
+            number = next((free for free in range(256) if free not in numbers), None)
+        if number is None:
+            raise LinkClosed(f"{len(numbers)} programs share this port already, and no more can")
         return wanted, number
 
     def _leave(self, client: _Client) -> None:

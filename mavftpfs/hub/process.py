@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def serve(source: str, inherited: Sequence[int], on_ready: Callable[[], None]) -
     trio.run(_until_signalled, partial(hub.run, first, on_ready), strict_exception_groups=False)
 
 
-async def _until_signalled(work: Callable[[], object]) -> None:
+async def _until_signalled(work: Callable[[], Awaitable[None]]) -> None:
     with trio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:
         async with trio.open_nursery() as nursery:
 
@@ -39,5 +39,5 @@ async def _until_signalled(work: Callable[[], object]) -> None:
                     nursery.cancel_scope.cancel()
 
             nursery.start_soon(watch)
-            await work()  # type: ignore[misc]
+            await work()
             nursery.cancel_scope.cancel()

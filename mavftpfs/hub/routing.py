@@ -135,13 +135,13 @@ class Router:
         side.heard[place.address] = now
         if frame.id == HEARTBEAT_ID:
             self._on_heartbeat(frame, side)
-            return (*self._plan(frame, place, now), *self._clients(frame, place, now))
+            return (*self._plan(frame, place), *self._clients(frame, place, now))
         key = (place, frame.source, frame.target, frame.id == FTP_MESSAGE_ID)
         plan = self._plans.get(key)
         if plan is None:
             if len(self._plans) >= _MOST_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = (*self._plan(frame, place, now), *self._clients(frame, place, now))
+            plan = self._plans[key] = (*self._plan(frame, place), *self._clients(frame, place, now))
         return plan
 
     def _is_believed(self, frame: Frame, place: Place, kind: Kind, now: float) -> bool:
@@ -200,11 +200,11 @@ class Router:
         self._plans.clear()
 
     def _on_heartbeat(self, frame: Frame, side: _Side) -> None:
-        armed = armed_by(frame) if side.kind is Kind.PORT else None
+        armed = armed_by(frame) if side.kind is Kind.PORT and frame.crc_fits else None
         if armed is not None:
             self.armed[frame.source.system] = armed
 
-    def _plan(self, frame: Frame, place: Place, now: float) -> Iterator[Place]:
+    def _plan(self, frame: Frame, place: Place) -> Iterator[Place]:
         """Yield the places on the port and at endpoints that a frame goes to."""
         origin = self._sides[place.side]
         known = [where for where in self._places_of(frame.target) if where.side != place.side]
@@ -216,8 +216,6 @@ class Router:
             yield from known or self._all_of(PORT)
             return
         shunned = {place.side, *(heard.side for heard in self._elsewhere.get(frame.source, ()))}
-        if self._book.place_of(frame.source, now) is not None:
-            shunned.add(PORT)
         if not known:
             others = [number for number, side in self._sides.items() if side.kind is not Kind.CLIENT]
             known = [where for number in others for where in self._all_of(number)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ import pytest
 import trio
 import trio.testing
 
+from mavftpfs.client.connect import plain_nursery
 from mavftpfs.hub.hub import Hub
-from mavftpfs.link.hublink import PROTOCOL, HubLink, Wish, ask, join
+from mavftpfs.link.hublink import PROTOCOL, HubLink, Refused, Wish, ask, join, pack_facts, unpack_facts
 from mavftpfs.link.messages import Address
 from mavftpfs.link.rendezvous import ALONE, Door
 from mavftpfs.link.uri import parse_source
@@ -30,13 +31,11 @@ def autojump_clock() -> trio.testing.MockClock:
 
 
 class Running:
-    """A hub that runs, and its first client."""
+    """A hub that runs, with one client."""
 
-    def __init__(self, hub: Hub, path: Path, source: str, first: HubLink) -> None:
-        self.hub = hub
+    def __init__(self, path: Path, source: str, ended: trio.Event) -> None:
         self.source = source
-        self.first = first
-        self.ended = trio.Event()
+        self.ended = ended
         self._path = path
 
     def knock(self) -> socket.socket:
@@ -57,9 +56,11 @@ class Running:
 
 
 @asynccontextmanager
-async def running(place: Path, *forward: str, again: bool = False) -> AsyncIterator[Running]:
+async def running(
+    place: Path, *forward: str, again: bool = False, source: str = ""
+) -> AsyncIterator[Running]:
     """Run a hub of a port, with one client that asks for these endpoints."""
-    source = f"udpin:{HOST}:{free_udp_port()}"
+    source = source or f"udpin:{HOST}:{free_udp_port()}"
     path = place / f"port{ALONE}"
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listening.setblocking(False)
@@ -67,14 +68,20 @@ async def running(place: Path, *forward: str, again: bool = False) -> AsyncItera
     listening.listen(8)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     hub = Hub(parse_source(source), (), Door(listening, path))
-    async with trio.open_nursery() as nursery:
-        ready = trio.Event()
-        nursery.start_soon(hub.run, theirs, ready.set)
-        await ready.wait()
-        first = await join(ours, parse_source(source), Wish(US, forward), None, again=again)
-        yield Running(hub, path, source, first)
-        await first.aclose()
-        nursery.cancel_scope.cancel()
+    with listening, theirs:
+        async with plain_nursery() as nursery:
+            ready = trio.Event()
+            ended = trio.Event()
+
+            async def run() -> None:
+                await hub.run(theirs, ready.set)
+                ended.set()
+
+            nursery.start_soon(run)
+            await ready.wait()
+            first = await join(ours, parse_source(source), Wish(US, forward), None, again=again)
+            yield Running(path, source, ended)
+            await first.aclose()
 
 
 async def test_an_endpoint_that_cannot_be_opened_yet_is_tried_again(
@@ -117,3 +124,46 @@ async def test_endpoints_stay_while_the_client_that_wants_them_waits_for_another
         await client.aclose()
         await trio.sleep(5)
         assert (await here.status())["endpoints"] == []
+
+
+async def test_a_hub_that_does_not_take_over_leaves_the_door_to_its_program(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    with pytest.raises(Refused):
+        async with running(tmp_path, "nonsense"):
+            pass
+    assert (tmp_path / f"port{ALONE}").is_socket()
+
+
+async def test_a_hub_may_be_asked_and_stopped_by_another_version_but_not_joined(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    async with running(tmp_path) as here:
+        for request, reply in ({"join": here.source}, "refused"), ({"status": True}, "clients"):
+            with here.knock() as sock:
+                sock.send(pack_facts({"protocol": PROTOCOL + 1, **request}))
+                await trio.lowlevel.wait_readable(sock)
+                assert reply in (unpack_facts(sock.recv(65536)) or {})
+        with here.knock() as sock:
+            await ask(sock, {"protocol": PROTOCOL + 1, "stop": True})
+        await here.ended.wait()
+
+
+async def test_more_programs_than_link_ids_are_refused(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    async with running(tmp_path) as here, AsyncExitStack() as stack:
+        for _ in range(255):
+            stack.push_async_callback((await here.joined()).aclose)
+        with pytest.raises(Refused, match="256 programs"):
+            await here.joined()
+        assert len((await here.status())["clients"]) == 256
+
+
+async def test_a_port_is_shared_while_its_vehicle_restarts(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    with socket.create_server((HOST, 0)) as server:
+        source = f"tcp:{HOST}:{server.getsockname()[1]}"
+    async with running(tmp_path, source=source) as here:
+        assert len((await here.status())["clients"]) == 1

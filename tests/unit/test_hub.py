@@ -239,6 +239,8 @@ def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
     unheard = attitude(Address(77, 1))._replace(crc_fits=False)
     assert not net.sides(unheard, PORT, AT_TWO) & {EAST, WEST}
     assert not net.router.taken(Address(77, 1), net.now)
+    net.send(beat(ONE, armed=True)._replace(crc_fits=False), PORT, AT_ONE)
+    assert not net.router.armed[1]
 
 
 def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
