@@ -1,8 +1,7 @@
 """The mount's side of the control socket (`control` has the commands' side). Layer: client.
 
-If the limit is low there are few file descriptors, and the mount needs them for itself. So at most
-MAX_CLIENTS connections are taken at once. When there is no room, connections that have asked nothing are
-ended.
+The mount needs file descriptors for itself. So at most MAX_CLIENTS connections are taken at once, and one
+that asks nothing is ended.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import os
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import trio
@@ -26,27 +24,17 @@ log = logging.getLogger("mavftpfs.control")
 
 Command = Callable[[Reply], Awaitable[Reply]]
 
-REQUEST_PATIENCE = 10.0
-"""Seconds for a client to send its line, and for us to hand it the reply."""
+ASKING_PATIENCE = 2.0
+"""Seconds for a client to send its line: a command of ours asks right after it has connected."""
+REPLY_PATIENCE = 10.0
+"""Seconds for us to hand it the reply."""
 QUEUE = 128
 """Clients that wait in the kernel until they are taken."""
-MAX_CLIENTS = 16
+MAX_CLIENTS = 8
 """Connections that are taken at once; others wait in the kernel's queue."""
-MAX_IDLE = 4
-"""So many of these may have asked nothing yet while others are still taken. A command of ours asks right
-after it has connected."""
-IDLE = 0.1
-"""Seconds after which a connection that has asked nothing is ended if there is no room."""
 _NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
-
-
-@dataclass(slots=True, eq=False)
-class _Client:
-    """A connection that was taken. since: when (trio's clock); idle: it asked nothing yet."""
-
-    since: float = field(default_factory=trio.current_time)
-    scope: trio.CancelScope = field(default_factory=trio.CancelScope)
-    idle: bool = True
+_PAUSE = 0.1
+"""Seconds until a connection is taken after there was no descriptor for it."""
 
 
 class ControlServer:
@@ -56,8 +44,8 @@ class ControlServer:
         self._path = path
         self._commands = commands
         self._accepting = trio.CancelScope()
-        self._clients: set[_Client] = set()
-        self._crowded = False
+        self._room = trio.Semaphore(MAX_CLIENTS)
+        self._is_short = False
         self.closed = trio.Event()
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
@@ -88,46 +76,33 @@ class ControlServer:
     async def _accept(self, listener: trio.SocketListener, nursery: trio.Nursery) -> None:
         """Take clients until cancelled, as many as there is room for."""
         while True:
-            while len(self._clients) >= MAX_CLIENTS or self._idle > MAX_IDLE:
-                await self._make_room(f"{len(self._clients)} connections")
+            await self._room.acquire()
+            nursery.start_soon(self._serve_client, await self._next(listener))
+
+    async def _next(self, listener: trio.SocketListener) -> trio.SocketStream:
+        """Return the next connection. The log says once in a mount that there was no descriptor for one."""
+        while True:
             try:
-                stream = await listener.accept()
+                return await listener.accept()
             except OSError as error:
                 if error.errno not in _NO_DESCRIPTORS:
                     raise
-                await self._make_room(os.strerror(error.errno))
-            else:
-                client = _Client()
-                self._clients.add(client)
-                nursery.start_soon(self._serve_client, stream, client)
+                if not self._is_short:
+                    self._is_short = True
+                    log.warning("no descriptor is left for a command (%s)", os.strerror(error.errno))
+                await trio.sleep(_PAUSE)
 
-    @property
-    def _idle(self) -> int:
-        return sum(client.idle for client in self._clients)
-
-    async def _make_room(self, why: str) -> None:
-        """Wait a moment, and end the connections that have asked nothing. The log says so once in a mount."""
-        if not self._crowded:
-            self._crowded = True
-            log.warning("the control socket is crowded (%s): connections that ask nothing are ended", why)
-        await trio.sleep(IDLE)
-        for client in self._clients:
-            if client.idle and client.since <= trio.current_time() - IDLE:
-                client.scope.cancel()
-
-    async def _serve_client(self, stream: trio.SocketStream, client: _Client) -> None:
+    async def _serve_client(self, stream: trio.SocketStream) -> None:
         try:
-            # It may go away at any time.
-            with client.scope, suppress(trio.BrokenResourceError, trio.ClosedResourceError):
+            with suppress(trio.BrokenResourceError, trio.ClosedResourceError):  # it may go away at any time
                 line = b""
-                with trio.move_on_after(REQUEST_PATIENCE):
+                with trio.move_on_after(ASKING_PATIENCE):
                     line = await _receive_line(stream)
-                client.idle = False
                 reply = await self._answer(line)
-                with trio.move_on_after(REQUEST_PATIENCE):
+                with trio.move_on_after(REPLY_PATIENCE):
                     await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
         finally:
-            self._clients.discard(client)
+            self._room.release()
             await trio.aclose_forcefully(stream)
 
     async def _answer(self, line: bytes) -> Reply:

