@@ -72,7 +72,8 @@ class Router:
     """Knows the sides, what was heard where, and where a frame goes.
 
     Attributes:
-        doubles: senders of the port that were heard at a second address, and where: two vehicles, or a fake.
+        doubles: senders of the port that were heard at a second address too, and where: two vehicles, or a
+            fake.
         armed: system -> whether its autopilot's last heartbeat said that it is armed.
     """
 
@@ -81,6 +82,7 @@ class Router:
         self.armed: dict[int, bool] = {}
         self._sides: dict[int, _Side] = {}
         self._book = AddressBook()
+        self._suspects: dict[Address, NetAddress] = {}
         self._elsewhere: dict[Address, dict[Place, float]] = {}
         self._beats: dict[Address, float] = {}
         self._plans: dict[tuple[Place, Address, Address, bool], tuple[Place, ...]] = {}
@@ -156,11 +158,14 @@ class Router:
             if not frame.crc_fits:
                 return before == where
             if not book.accepts(sender, where, now):
-                if len(self.doubles) < _MOST_SENDERS:
-                    self.doubles[sender] = where
+                self._suspects[sender] = where
                 return False
             if before != where:
                 self._plans.clear()
+                self._suspects.pop(sender, None)
+                self.doubles.pop(sender, None)
+            elif sender in self._suspects:  # both are there: it did not just move
+                self.doubles[sender] = self._suspects.pop(sender)
             return True
         if book.place_of(sender, now) is not None:
             return False  # it comes back, or claims to be the vehicle

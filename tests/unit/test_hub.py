@@ -216,10 +216,21 @@ def test_heartbeats_of_others_are_told_to_clients_but_no_flood_of_them(net: Net)
 def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> None:
     somewhere = ("10.0.0.66", 1)
     assert net.sides(ftp(ONE, STATION), PORT, somewhere) == {MOUNT}, "which judges for itself"
+    assert net.router.doubles == {}, "it may have moved"
+    net.send(attitude(ONE), PORT, AT_ONE)
     assert net.router.doubles == {ONE: somewhere}
     assert net.send(ftp(STATION, ONE), EAST) >= {Place(PORT, AT_ONE)}
     net.now += PATIENCE + 1
     assert EAST in net.sides(attitude(ONE), PORT, somewhere), "the first one fell silent"
+    assert net.router.doubles == {}
+
+
+def test_a_vehicle_that_comes_back_at_another_address_is_no_second_one(net: Net) -> None:
+    somewhere = ("10.0.0.1", 50000)
+    for _ in range(int(PATIENCE) + 2):
+        net.send(beat(ONE), PORT, somewhere)
+        net.now += 1
+    assert net.router.doubles == {}
 
 
 def test_what_comes_back_by_another_way_is_not_passed_on(net: Net) -> None:
