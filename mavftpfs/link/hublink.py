@@ -12,6 +12,7 @@ import json
 import socket
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import trio
@@ -62,6 +63,12 @@ def make_tag(address: NetAddress | None) -> bytes:
     """Return the tag of an address."""
     tag = b"" if address is None else json.dumps(address).encode()
     return tag if len(tag) <= _MAX_TAG else b""
+
+
+@lru_cache(maxsize=256)  # bounded: frames may come from any number of addresses
+def _address_of(tag: bytes) -> NetAddress | None:
+    """Return the address of a tag."""
+    return tuple(json.loads(tag)) if tag else None
 
 
 def pack_frames(frames: Iterable[bytes], tag: bytes = b"") -> list[bytes]:
@@ -119,7 +126,6 @@ class HubLink:
         self.gone = trio.Event()
         self._sock = sock
         self._senders: list[NetAddress | None] = []
-        self._tags: dict[bytes, NetAddress | None] = {b"": None}
         self._outbox = Outbox(_OUTBOX_LIMIT)
         self._work = trio.Event()
         self._reopened = False
@@ -232,20 +238,13 @@ class HubLink:
             elif message[:1] == _FRAMES:
                 tag, piece = unpack_frames(message)
                 pieces.append(piece)
-                senders.append(self._sender(tag))
+                senders.append(_address_of(tag))
             elif (unpack_facts(message) or {}).get("reopened"):
                 self._reopened = True
         if pieces:
             self._senders = senders
             self.stats.received_bytes += sum(map(len, pieces))
         return pieces
-
-    def _sender(self, tag: bytes) -> NetAddress | None:
-        try:
-            return self._tags[tag]
-        except KeyError:
-            found = self._tags[tag] = tuple(json.loads(tag))
-            return found
 
     def _send(self, message: bytes) -> bool:
         """Return False if there is no room; a hub that is gone takes all."""

@@ -31,6 +31,7 @@ def knock(name: str) -> socket.socket | None:
     """Return a connection to the program that has a port, None if none of ours has."""
     for path in [directory / (name + end) for directory in own_directories() for end in (HUB, ALONE)]:
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        sock.setblocking(False)  # the queue of a program that was stopped may be full
         try:
             sock.connect(str(path))
         except OSError:

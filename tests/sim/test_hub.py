@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import tracemalloc
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -14,9 +15,21 @@ import trio.testing
 
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.hub.hub import Hub
-from mavftpfs.link.hublink import PROTOCOL, HubLink, Refused, Wish, ask, join, pack_facts, unpack_facts
+from mavftpfs.link.hublink import (
+    PROTOCOL,
+    HubLink,
+    Refused,
+    Wish,
+    ask,
+    join,
+    make_tag,
+    pack_facts,
+    pack_frames,
+    set_buffers,
+    unpack_facts,
+)
 from mavftpfs.link.messages import Address
-from mavftpfs.link.rendezvous import ALONE, Door
+from mavftpfs.link.rendezvous import ALONE, Door, knock, open_door
 from mavftpfs.link.uri import parse_source
 from tests.support.vehicles import free_udp_port
 
@@ -167,3 +180,41 @@ async def test_a_port_is_shared_while_its_vehicle_restarts(
         source = f"tcp:{HOST}:{server.getsockname()[1]}"
     async with running(tmp_path, source=source) as here:
         assert len((await here.status())["clients"]) == 1
+
+
+# -- clients and doors ----------------------------------------------------------------------------
+
+
+async def test_frames_from_made_up_addresses_take_no_memory() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    set_buffers(ours)
+    link = HubLink(ours, parse_source(f"udpin:{HOST}:14550"), {"own": US, "number": 0})
+    tracemalloc.start()
+    try:
+        for turn in range(3000):
+            if turn == 1000:
+                before = tracemalloc.get_traced_memory()[0]
+            (message,) = pack_frames([b"frame"], make_tag((f"10.0.{turn >> 8}.{turn & 255}", 14550)))
+            theirs.send(message)
+            assert await link.receive() == [b"frame"]
+            assert link.sender(0) == (f"10.0.{turn >> 8}.{turn & 255}", 14550)
+        assert tracemalloc.get_traced_memory()[0] - before < 1 << 17
+    finally:
+        tracemalloc.stop()
+        theirs.close()
+        await link.aclose()
+
+
+async def test_the_full_queue_of_a_stopped_program_does_not_stop_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    door = open_door("port")
+    assert door is not None
+    waiting = []
+    while (sock := await trio.to_thread.run_sync(knock, "port", abandon_on_cancel=True)) is not None:
+        waiting.append(sock)
+        assert len(waiting) < 1000
+    for sock in waiting:
+        sock.close()
+    door.remove()
