@@ -284,12 +284,14 @@ class Deliverer:
         if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
         await self._context.store.settle(attempt.path)
-        if attempt.in_place:
-            crc32 = await self._compare(draft, attempt)
-            await self._end(node, draft, attempt)
-        else:
-            crc32 = await self._compare_and_look(node, draft, attempt)
-            await self._commit(node, draft, attempt, summed=crc32 is not None)
+        crc32 = await self._compare_and_look(node, draft, attempt)
+        node.attempt = None
+        try:
+            await self._end(draft, attempt)
+            if not attempt.in_place:
+                await self._commit(node, draft, attempt, summed=crc32 is not None)
+        finally:
+            self._context.own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         self._on_delivered(node, draft, crc32)
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
@@ -326,10 +328,6 @@ class Deliverer:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
         return attempt
 
-    async def _compare(self, draft: Draft, attempt: Attempt) -> int | None:
-        doubted = self._context.store.in_doubt(attempt.begun_at)
-        return await self.verifier.check(attempt.path, draft, doubted=doubted)
-
     async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
         """Compare what was sent, and check what has the name; return the CRC32 if it was compared.
 
@@ -344,7 +342,8 @@ class Deliverer:
 
         async def compare() -> None:
             nonlocal crc32
-            crc32 = await self._compare(draft, attempt)
+            doubted = self._context.store.in_doubt(attempt.begun_at)
+            crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
 
         look = partial(self._require_expected, node, draft)
         if draft.size <= SHORT:
@@ -375,36 +374,30 @@ class Deliverer:
         Raises:
             As Names.rename and replace, and as _confirm.
         """
-        own, store, path = self._context.own, self._context.store, node.path
-        unfinished = self._context.unfinished
+        store, unfinished, path = self._context.store, self._context.unfinished, node.path
+        self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
+        draft.on(Event.COMMITS)
         try:
-            await self._end(node, draft, attempt)
-            self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
-            draft.on(Event.COMMITS)
             compared = summed or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
                 await self._names.rename(attempt.path, path, compared=compared)
             else:
                 await self._names.replace(attempt.path, path, compared=compared)
         except BaseException as error:
-            if draft.state is State.COMMITTING:
-                unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-                if unknown or unfinished.is_unknown(path):
-                    unfinished.on_unknown(path)
-                    draft.interrupted()
-                else:
-                    draft.on(Event.REFUSED)
-                    await self._names.discard(attempt.path)
+            unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
+            if unknown or unfinished.is_unknown(path):
+                unfinished.on_unknown(path)
+                draft.interrupted()
+            else:
+                draft.on(Event.REFUSED)
+                await self._names.discard(attempt.path)
             raise
-        finally:
-            own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         await self._confirm(node, draft, attempt)
 
     @staticmethod
-    async def _end(node: Node, draft: Draft, attempt: Attempt) -> None:
+    async def _end(draft: Draft, attempt: Attempt) -> None:
         """End the task of an upload that sent everything. If the caller is cancelled meanwhile, the draft is
         sent again."""
-        node.attempt = None
         try:
             await attempt.upload.end()
         except BaseException:

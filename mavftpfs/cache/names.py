@@ -301,9 +301,27 @@ class Names:
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
         await self._forget_old(target)
-        own, unfinished, moved = self._context.own, self._context.unfinished, None
+        own = self._context.own
         aside = own.beside(target, Kind.OLD)
         own.in_use.add(aside)
+        stays = False
+        try:
+            if await self._swap(source, target, aside, compared=compared):
+                stays = keep_old or await self._discard_old(target, aside)
+        finally:
+            if not stays:
+                own.in_use.discard(aside)
+        return aside if stays and keep_old else None
+
+    # --- inside
+
+    async def _swap(self, source: bytes, target: bytes, aside: bytes, *, compared: bool) -> bool:
+        """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
+
+        Raises:
+            As replace.
+        """
+        moved: bool | None = None  # not known
         try:
             try:
                 await self.rename(target, aside, compared=compared)
@@ -322,29 +340,19 @@ class Names:
             if moved:
                 await self._undo(aside, target)
             raise
-        else:
-            if moved and not keep_old:
-                await self._discard_old(target, aside)
-        finally:
-            if unfinished.owner_of(aside) is None or unfinished.is_unknown(target):
-                own.in_use.discard(aside)
-        if not (moved and keep_old):
-            return None
-        own.in_use.add(aside)
-        return aside
+        return moved
 
-    # --- inside
-
-    async def _discard_old(self, target: bytes, aside: bytes) -> None:
-        """Remove the file that a new one replaced. In doubt a listing has to show the new one first: a late
-        copy of the first rename may have moved it over the old one. `Cleaner.finish` sees to that. Removed or
-        not, the record stays for some seconds: a late copy may bring the old file back."""
-        context = self._context
-        if not context.store.in_doubt():
+    async def _discard_old(self, target: bytes, aside: bytes) -> bool:
+        """Remove the file that a new one replaced; return whether it stays for now. In doubt it stays until a
+        listing shows the new one: a late copy of the first rename may have moved that over the old one.
+        `Cleaner.finish` sees to that. Removed or not, the record stays for some seconds: a late copy may
+        bring the old file back."""
+        context, stays = self._context, self._context.store.in_doubt()
+        if not stays:
             await self.discard(aside)
-            context.own.in_use.discard(aside)
         context.unfinished.put(target, Replacement(aside, placed=True, until=context.clock() + KEEP_OLD))
         context.retry_later()
+        return stays
 
     async def _forget_old(self, path: bytes) -> None:
         """Remove the old file that is kept for a name, if there is one: the name is about to change again."""

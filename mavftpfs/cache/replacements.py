@@ -85,10 +85,6 @@ class Replacements:
         """Remove the record of a path, and return it."""
         return self._records.pop(path, None)
 
-    def owner_of(self, aside: bytes) -> bytes | None:
-        """Return the path whose old file lies, or may lie, at `aside`."""
-        return next((path for path, record in self._records.items() if record.aside == aside), None)
-
     def asides(self) -> set[bytes]:
         """Return where files lie that may have to be moved back."""
         return {record.aside for record in self._records.values() if record.lacks_file and record.aside}
