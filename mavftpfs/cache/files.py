@@ -9,10 +9,9 @@ At open it is decided whether the version in the cache is still the vehicle's fi
 
 While a program has a file open, its session is closed and opened again: after losses, restarts, and turns of
 other users. Then size and mtime are compared (`VersionHandle.read`). A file that is equal, or larger, is the
-same, because logs grow. For another file readers get FileChanged. But if its size is equal, and no program
-got a byte of the old one, they go on with the new one. The open reply tells the size. Where listings tell
-mtimes, a listing that began after the reopening tells the mtime. After a restart of the vehicle nothing is
-proven.
+same, because logs grow. For another file readers get FileChanged. The open reply tells the size. Where
+listings tell mtimes, a listing that began after the reopening tells the mtime. After a restart of the vehicle
+nothing is proven.
 
 The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
 handles of an older one are open.
@@ -289,8 +288,6 @@ class Files:
             self.kill(version)
         elif entry is None:
             return  # the listing is incomplete, and does not tell
-        elif answer is Sameness.UNPROVEN and not version.given:
-            version.start_over(entry.mtime, directory.listed_at)
         else:
             if version.opened_at <= directory.listed_at and not version.current:
                 version.prove(directory.listed_at)
@@ -374,7 +371,7 @@ class Files:
             return
         version = self._version(path, size)
         version.proven_at, version.in_kernel = proven_at, True
-        version.ours = version.given = True
+        version.ours = True
         self._replace(version)
         for at in range(0, size, ADOPTED_AT_ONCE):
             version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
@@ -465,7 +462,6 @@ class VersionHandle(OpenFile):
             else:
                 await files.compare(version, now=stop == self.size)
                 if version.drops == drops:
-                    version.given = True
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
             if version.drops != drops:
                 version.close_reader()

@@ -164,7 +164,7 @@ class Version:
     Attributes:
         state: see VersionState.
         path: its present path. size: in bytes, by the open reply. mtime: None if not known to belong to this
-            size. ours: we wrote it. given: a program got bytes of it.
+            size. ours: we wrote it.
         proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the present session.
         compare_after: until then no listing is asked for only to compare it.
@@ -173,7 +173,7 @@ class Version:
             local disk, if it may have one. in_kernel: the kernel may have pages of it, and all of them are
             right.
         ignores_data: what comes from the present reader is ignored, until a new one is opened.
-        drops: how often all bytes were dropped because they were in doubt, or another file's.
+        drops: how often all bytes were dropped because they were in doubt.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class Version:
         self.state = VersionState.CURRENT
         self.proven_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
-        self.ours = self.given = self.by_others = self.in_kernel = self.ignores_data = False
+        self.ours = self.by_others = self.in_kernel = self.ignores_data = False
         self.kept: Kept | None = None
         self.drops = 0
         self._why = ""
@@ -328,7 +328,7 @@ class Version:
     def known(self) -> Known:
         """What it is compared by."""
         restarted = self.proven_at == NEVER
-        return Known(self.size, self.mtime, given=self.given, restarted=restarted, ours=self.ours)
+        return Known(self.size, self.mtime, restarted=restarted, ours=self.ours)
 
     def require_not_replaced(self) -> None:
         """Raise FileChanged if another file has the path."""
@@ -345,13 +345,6 @@ class Version:
         self.proven_at = self.compare_after = NEVER
         self.kept = None
         self.on_opened(at)
-
-    def start_over(self, mtime: int | None, at: float) -> None:
-        """Become the file that a listing showed at that time, with this mtime: no program got a byte of the
-        old one."""
-        self.mtime, self.kept = mtime, None
-        self.prove(at)
-        self.on_suspect("another file has its name")
 
     def _look(self) -> None:
         if not self.replaced:

@@ -23,8 +23,7 @@ class Sameness(Enum):
     GREW = "grew"
     """It is the same file, and bytes were appended to it: logs grow."""
     UNPROVEN = "unproven"
-    """Nothing contradicts, but nothing proves it. Something else can tell more, or no program has bytes that
-    could be wrong."""
+    """Nothing contradicts, but nothing proves it. Something else can tell more."""
     OTHER = "other"
     """Another file has the name, or none has it."""
 
@@ -34,8 +33,6 @@ class Known:
     """What is known of a file.
 
     size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
-    given: a program may have read bytes of it. Then another file of the same size must not continue in its
-    place.
     restarted: the vehicle restarted since the last proof. After a restart no program goes on writing an old
     file.
     ours: we wrote it. Others may have replaced it before a listing told its time, so its time is no proof.
@@ -45,7 +42,6 @@ class Known:
     size: int
     mtime: int | None = None
     crc32: int | None = None
-    given: bool = True
     restarted: bool = False
     ours: bool = False
     at_open: bool = False
@@ -106,7 +102,7 @@ def _by_listing(known: Known, seen: Listed) -> Sameness:
         return Sameness.OTHER if known.restarted else Sameness.GREW
     timed = known.mtime is not None and entry.mtime is not None
     if timed and known.mtime != entry.mtime:
-        return Sameness.OTHER if known.given else Sameness.UNPROVEN
+        return Sameness.OTHER
     if known.ours or (known.at_open and not timed):
         return Sameness.UNPROVEN
     return Sameness.SAME
