@@ -387,14 +387,11 @@ class Directories:
             await self._walk_to_root()
         elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
             raise NotADirectory(f"{path!r} is not a directory")
-        waited_for = False
         while True:
             with trio.move_on_after(LOOK if until_lost else inf):
-                sweep = partial(self._sweep, path)
-                directory = await self._sweeping.run(path, sweep, again=waited_for)
+                directory = await self._sweeping.run(path, partial(self._sweep, path))
                 break
             self.require_heard()
-            waited_for = True
         if self._on_swept is not None:
             await self._on_swept(path, directory)
         return directory

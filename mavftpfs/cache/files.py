@@ -337,15 +337,6 @@ class Files:
 
     # --- we changed the file ourselves
 
-    def whole(self, path: bytes) -> Version | None:
-        """Return a path's version if all of it is here, surely of one file, and no other version of it is
-        open."""
-        version = self._current.get(path)
-        if version is None or version.replaced or not version.whole:
-            return None
-        alone = all(v is version or v.by_others for v in self.open_versions if v.path == path)
-        return version if alone and self._is_sure(version) else None
-
     def others_replaced(self, path: bytes) -> bool:
         """Return whether a version of the path is open that others replaced: it may not be read any more."""
         return any(v.path == path and v.by_others for v in self.open_versions)

@@ -6,8 +6,7 @@ delivers the drafts of what it moves.
 
 A program that has a file open reads on when the file loses its name. If the file was written here whole, its
 bytes are here. Else it is hidden: kept on the vehicle under a reserved name until its last handle is closed.
-Where the card cannot rename (LittleFS), a file that is cached whole is kept here; else the change of the name
-is refused (EBUSY).
+Where the card cannot rename (LittleFS), the change of the name is refused (EBUSY).
 """
 
 from __future__ import annotations
@@ -20,11 +19,9 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import Base
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
-from mavftpfs.cache.versions import BLOCK_SIZE
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -32,12 +29,10 @@ from mavftpfs.shared.errors import (
     FtpNak,
     InvalidMove,
     IsADirectory,
-    NoSpace,
     NotADirectory,
     NotFound,
     NotSupported,
     PathTooLong,
-    SpoolFailed,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
 
@@ -145,12 +140,8 @@ class Namespace:
             context.require_idle(path)
         await self._names.purge(path)
         if there and node is not None and node.needs_card:
-            try:
-                await self._hide(node)
-                return
-            except FileBusy:
-                if not self._keep_here(node):
-                    raise
+            await self._hide(node)
+            return
         if there:
             await self._names.remove_if_there(path)
             context.files.on_changed(path)
@@ -229,23 +220,6 @@ class Namespace:
             context.nodes.unnamed(displaced)
 
     # --- inside: open files that lose their names
-
-    def _keep_here(self, node: Node) -> bool:
-        """Keep a file's bytes here for the programs that have it open; return whether all of them are
-        here."""
-        context, version = self._context, self._context.files.whole(node.path)
-        if version is None or node.draft is not None:
-            return False
-        draft = node.begin_draft(context.spool, Base(version.size), context.clock())
-        try:
-            for at in range(0, version.size, BLOCK_SIZE):
-                draft.fill(at, version.get(at, min(at + BLOCK_SIZE, version.size)) or b"")
-        except (NoSpace, SpoolFailed) as error:
-            log.info("%r cannot be held here: %s", node.path, error)
-            node.drop_draft()
-            return False
-        draft.content.restate(delivered=True)  # the next mount has nothing to deliver of it
-        return True
 
     async def _hide(self, node: Node) -> None:
         """Keep an unlinked file on the vehicle under a reserved name as long as a program has it open.

@@ -2,9 +2,8 @@
 
 A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a description beside it,
 `NNNNNN.json`:
-- `path`: its path on the vehicle;
-- `unfinished`: a program was still writing, no close was confirmed or refused yet; else what `describe` tells
-  of a file that could not be delivered;
+- `path`: its path on the vehicle. Nothing more while a program writes, and no close was confirmed or refused;
+- what `describe` tells of a file that could not be delivered;
 - `needed` false: the vehicle has all of it, or no program wants it any more.
 
 The description is written before the first byte. So the next mount can always say what it found, whenever the
@@ -227,7 +226,7 @@ def _read_facts(data: Path) -> dict[str, object]:
 
 def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
     """Return whether the vehicle lacks a spooled file that a user may want."""
-    return facts.get("needed") is not False and not (facts.get("unfinished") and not data.stat().st_size)
+    return facts.get("needed") is not False and ("size" in facts or data.stat().st_size > 0)
 
 
 def _description(target: Path) -> Path:

@@ -8,8 +8,6 @@ from typing import Generic, TypeVar
 
 import trio
 
-from mavftpfs.shared.errors import RequestTimeout
-
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
@@ -36,16 +34,12 @@ class SingleFlight(Generic[K, T]):
         self._nursery = nursery
         self._running: dict[K, _Call[T]] = {}
 
-    async def run(self, key: K, work: Callable[[], Awaitable[T]], *, again: bool = False) -> T:
+    async def run(self, key: K, work: Callable[[], Awaitable[T]]) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
-
-        A time-out of work that was under way before is not shared: a late caller starts the work again,
-        unless the same caller waited for it before (`again`).
 
         Raises:
             Exception: what the work raised; all its callers get the same object.
         """
-        joined = key in self._running and not again
         while True:
             call = self._running.get(key)
             if call is None:
@@ -58,10 +52,9 @@ class SingleFlight(Generic[K, T]):
                 await call.done.wait()
             if call.results:
                 return call.results[0]
-            if call.error is not None and not (joined and isinstance(call.error, RequestTimeout)):
+            if call.error is not None:
                 raise call.error.with_traceback(None)
-            joined = False  # the caller that ran it was cancelled, or it timed out before we waited long
-            await trio.lowlevel.checkpoint()
+            await trio.lowlevel.checkpoint()  # the caller that ran it was cancelled
 
     async def _run(self, key: K, call: _Call[T], work: Callable[[], Awaitable[T]]) -> None:
         try:

@@ -210,7 +210,7 @@ class SpoolContent:
         """
         facts: dict[str, Any] = {"needed": False}
         if self.name is not None and not settled:
-            facts = {"path": self.name.decode(errors="surrogateescape"), "unfinished": True}
+            facts = {"path": self.name.decode(errors="surrogateescape")}
         if self._path is not None and facts != self._told:
             try:
                 write_facts(self._path, facts, durable=False)

@@ -51,7 +51,7 @@ class Kept:
         """Why we cannot put it back, or ""."""
         if self.path is None:
             return "where it belongs was not written down"
-        if self.facts.get("unfinished"):
+        if "whole" not in self.facts:
             return "a program was still writing it, so it may be a part only"
         return "" if self.facts.get("whole") else "only the changed parts of it are here"
 

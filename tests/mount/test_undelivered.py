@@ -169,7 +169,7 @@ def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
     card = field.local("card")
     directory = keep(
         state,
-        written={"path": "/written", "unfinished": True},
+        written={"path": "/written"},
         changed={"path": "/changed", "whole": False, "size_on_vehicle": 9},
         unknown={},
     )

@@ -187,7 +187,7 @@ def test_the_name_is_written_down_before_the_first_byte(tmp_path: Path) -> None:
     directory, _ = spilled(tmp_path)
     assert rescued(directory, tmp_path) == {"card__log.bin": b"so far"}
     facts = json.loads((tmp_path / "recovered/card__log.bin.json").read_text())
-    assert facts == {"path": "/card/log.bin", "unfinished": True}
+    assert facts == {"path": "/card/log.bin"}
 
 
 def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from random import Random
 
 import pytest
@@ -23,7 +23,6 @@ from mavftpfs.shared.errors import (
     NotFound,
     PathTooLong,
     ReadOnly,
-    RequestTimeout,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
@@ -362,27 +361,3 @@ async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays() -> None
         askers.start_soon(ask)
     assert len(caught) == 2
     assert not flights._running
-
-
-async def test_who_came_later_gets_no_time_out_of_who_was_there() -> None:
-    """He waited a moment, and the vehicle may be back."""
-    flights: SingleFlight[str, int] = SingleFlight()
-    begun: list[float] = []
-
-    async def work() -> int:
-        begun.append(trio.current_time())
-        await trio.sleep(30)
-        if len(begun) == 1:
-            raise RequestTimeout("silence")
-        return 1
-
-    async with trio.open_nursery() as nursery:
-        nursery.start_soon(times_out, flights, work)
-        await trio.sleep(29)
-        assert await flights.run("key", work) == 1
-    assert begun == [0, 30]
-
-
-async def times_out(flights: SingleFlight[str, int], work: Callable[[], Awaitable[int]]) -> None:
-    with pytest.raises(RequestTimeout):
-        await flights.run("key", work)
