@@ -139,11 +139,11 @@ class Directories:
         options: CacheOptions,
         *,
         clock: Callable[[], float],
-        nursery: trio.Nursery | None = None,
+        nursery: trio.Nursery,
         on_listed: Callable[[bytes, Directory], None] = lambda path, directory: None,
         on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None,
     ) -> None:
-        """`clock`: seconds, monotonic. With a nursery a listing outlives its caller.
+        """`clock`: seconds, monotonic. In `nursery` a listing outlives its caller.
 
         `on_listed` is called with each new listing, and `on_swept` is awaited before one is returned.
         """
@@ -362,7 +362,7 @@ class Directories:
         if self._is_fresh(directory) or self._store.why_lost() is not None:
             return directory
         try:
-            return await self._list(path, until_lost=self._sweeping.outlives_callers)
+            return await self._list(path, until_lost=True)
         except VehicleLost:
             return directory
 

@@ -30,7 +30,6 @@ class SingleFlight(Generic[K, T]):
     """
 
     def __init__(self, nursery: trio.Nursery | None = None) -> None:
-        self.outlives_callers = nursery is not None
         self._nursery = nursery
         self._running: dict[K, _Call[T]] = {}
 

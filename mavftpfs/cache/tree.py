@@ -65,7 +65,7 @@ class Tree:
         *,
         clock: Callable[[], float],
         invalidate: Callable[[bytes], None],
-        nursery: trio.Nursery | None = None,
+        nursery: trio.Nursery,
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
@@ -74,10 +74,9 @@ class Tree:
         """`invalidate(path)`: copies that the caller (a mount's kernel) keeps of a path's bytes and
         attributes are wrong; must not block.
 
-        With a nursery, listings and snapshots under way survive the cancellation of their callers, and
-        written bytes go to the vehicle while the program still writes.
+        `nursery`: listings and snapshots under way survive the cancellation of their callers.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
-        `keep` makes the cache on the local disk, which needs a nursery.
+        `keep` makes the cache on the local disk.
         """
         self._options = options
         self._clock = clock
@@ -88,7 +87,7 @@ class Tree:
         )
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self._kept: KeptCache | None = None
-        if keep is not None and nursery is not None:
+        if keep is not None:
             self._kept = keep(self._directories, self._blocks)
             nursery.start_soon(self._kept.run)
         self._files = Files(

@@ -117,7 +117,7 @@ class VirtualTrees:
         options: CacheOptions,
         *,
         invalidate: Callable[[bytes], None],
-        nursery: trio.Nursery | None = None,
+        nursery: trio.Nursery,
     ) -> None:
         self._store = store
         self._directories = directories

@@ -16,7 +16,7 @@ from random import Random
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
+from mavftpfs.cache.delivery import Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import Base
 from mavftpfs.cache.files import Files
@@ -44,10 +44,6 @@ RETRY_PAUSE = 1.0
 PAUSES = (2.0, 30.0)
 """Seconds between two attempts to deliver what no program has open: at first, and at most."""
 
-REFUSALS = 3
-"""After so many rounds in which the vehicle answered, and refused all that is left, an unmount stops
-trying."""
-
 
 class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
@@ -65,7 +61,7 @@ class Writeback:
         options: CacheOptions,
         wall: Callable[[], float],
         rng: Random,
-        nursery: trio.Nursery | None,
+        nursery: trio.Nursery,
         spool_directory: SpoolDirectory | None,
     ) -> None:
         """Build on the parts for reading.
@@ -223,14 +219,11 @@ class Writeback:
 
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""
-        nodes, refused = self._context.nodes, 0
         with trio.move_on_after(timeout):
             await self._deliver_each(lambda node: True)
-            while self.undelivered() and refused < REFUSALS:
+            while any(node.undelivered and may_pass(node) for node in self._context.nodes):
                 await trio.sleep(RETRY_PAUSE)
-                await self._deliver_each(lambda node: True)
-                passing = any(isinstance(n.error, PASSING) for n in nodes if n.undelivered)
-                refused = 0 if passing else refused + 1
+                await self._deliver_each(may_pass)
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
@@ -269,7 +262,7 @@ class Writeback:
 
     def retry(self) -> None:
         """Deliver what no program writes any more: the vehicle is back, or may be written again."""
-        if self._nursery is not None and (self._context.unfinished or self.undelivered()):
+        if self._context.unfinished or self.undelivered():
             self._nursery.start_soon(self._try_all)
 
     def status(self) -> dict[str, object]:
@@ -313,7 +306,7 @@ class Writeback:
 
     def _retry_later(self) -> None:
         """Try again later: something was not delivered, or a replacement is unfinished."""
-        if self._nursery is not None and not self._retrying:
+        if not self._retrying:
             self._retrying = True
             self._nursery.start_soon(self._retry)
 

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from random import Random
 from typing import cast
 
+import trio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,7 +44,8 @@ class Racing:
         self.rng = rng
         self.now = 0.0
         options = CacheOptions(dir_timeout=20, max_entries=rng.choice([5, 100]))
-        self.directories = Directories(cast(RemoteStore, None), options, clock=lambda: self.now)
+        store, nursery = cast(RemoteStore, None), cast(trio.Nursery, None)
+        self.directories = Directories(store, options, clock=lambda: self.now, nursery=nursery)
         self.truth = {path: {name: file(name, 1) for name in NAMES[:2]} for path in DIRECTORIES}
         self.sweeps: dict[bytes, Paging] = {}
         self.unnoted: tuple[bytes, DirEntry | None, bytes] | None = None

@@ -6,8 +6,6 @@ from __future__ import annotations
 import pytest
 import trio
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address, FtpRun
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
@@ -292,8 +290,7 @@ async def test_bursts_through_the_caches(profile: str) -> None:
     for path, data in files.items():
         here.card.add(path, data)
     async with here.connected(ConnectOptions(read_mode="burst")) as connection:
-        options = CacheOptions(cache_size=1 << 20)
-        tree = Tree(connection.store, options, clock=trio.current_time, invalidate=lambda changed: None)
+        tree = here.mount(root=b"/", cache_size=1 << 20)
         opened = {path: await tree.open(path) for path in files}
 
         async def read_all(path: bytes, start: int) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import cast
 
 import pytest
+import trio
 
 from mavftpfs.cache.attributes import MAX_MTIME, MAX_SIZE, UNKNOWN_MTIME, shown_mtime, tidy
 from mavftpfs.cache.directories import Directories, Directory
@@ -32,7 +33,7 @@ def make(
     clock: Callable[[], float] = lambda: 0.0, *, dir_timeout: float | None = 20, max_entries: int = 1000
 ) -> Directories:
     options = CacheOptions(dir_timeout=dir_timeout, max_entries=max_entries)
-    return Directories(cast(RemoteStore, None), options, clock=clock)
+    return Directories(cast(RemoteStore, None), options, clock=clock, nursery=cast(trio.Nursery, None))
 
 
 def put(directories: Directories, path: bytes, *entries: DirEntry, took: float = 0) -> Directory:
