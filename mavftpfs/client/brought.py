@@ -18,9 +18,6 @@ NAME = ".mavftpfs-logs"
 HEAD = 4096
 """First bytes by which logs of the same name and size are told apart if they have no time."""
 
-_SPARE = 100
-"""The file is written again when it has more lines than so many that no longer count."""
-
 
 @dataclass(frozen=True, slots=True)
 class Brought:
@@ -51,13 +48,10 @@ class Memory:
         """Raises: OSError: it cannot be read."""
         self._place = local / NAME
         self._logs: dict[Key, Brought] = {}
-        lines = self._read()
-        for line in lines:
+        for line in self._read():
             log = _parsed(line)
             if log is not None:
                 self._logs[log.vehicle, log.path] = log
-        if len(lines) > 2 * len(self._logs) + _SPARE:
-            self._write_anew()
 
     def of(self, vehicle: str | None, path: str) -> Brought | None:
         """Return what is known of a log."""
@@ -98,14 +92,6 @@ class Memory:
             return self._place.read_bytes().splitlines()
         except FileNotFoundError:
             return []
-
-    def _write_anew(self) -> None:
-        new = self._place.with_name(f"{NAME}.new")
-        with new.open("wb") as file:
-            file.writelines(map(_line, self._logs.values()))
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self._place)
 
 
 def _line(log: Brought) -> bytes:

@@ -113,17 +113,16 @@ def selection(query: bytes) -> Selection:
     return Selection(found[b"start"], found[b"count"], found[b"withdefaults"] == 1)
 
 
-def pack_file(chosen: Sequence[Parameter], total: int, *, block: int, defaults: bool, every: bool) -> bytes:
+def pack_file(chosen: Sequence[Parameter], total: int, *, block: int, defaults: bool) -> bytes:
     """Return param.pck for reads of `block` bytes: the last value of an entry crosses no block's end.
 
-    total: as the header says it. defaults: with default values, for every entry (`every`) or where they
-    differ.
+    total: as the header says it. defaults: with default values where they differ.
     """
     out = bytearray(HEADER.pack(MAGIC_DEFAULTS if defaults else MAGIC, len(chosen), total))
     last = b""
     for one in chosen:
         default = one.value if one.default is None else one.default
-        told = default if defaults and (every or one.misfit or default != one.value) else b""
+        told = default if defaults and (one.misfit or default != one.value) else b""
         common = _common_prefix(last, one.name)
         kind = one.kind | (_HAS_DEFAULT << 4 if told else 0)
         entry = (
@@ -143,14 +142,11 @@ def _common_prefix(last: bytes, name: bytes) -> int:
 
 
 class Table:
-    """The parameters that a vehicle has, in its order. Times are seconds of any clock that does not go back.
+    """The parameters that a vehicle has, in its order. Times are seconds of any clock that does not go
+    back."""
 
-    every_default: a download with defaults has one with every entry (PX4 after pull request 28630).
-    """
-
-    def __init__(self, parameters: Iterable[Parameter], *, every_default: bool = False) -> None:
+    def __init__(self, parameters: Iterable[Parameter]) -> None:
         self._held = {one.name: one for one in parameters}
-        self._every_default = every_default
         self._drifted_to: float | None = None
         self._packed: dict[tuple[Selection, int], bytes] = {}
 
@@ -190,8 +186,7 @@ class Table:
         if wanted.start >= len(there):
             raise fail(errno.EINVAL)
         chosen = there[wanted.start :][: wanted.count or None]
-        every = self._every_default
-        packed = pack_file(chosen, len(there), block=block, defaults=wanted.defaults, every=every)
+        packed = pack_file(chosen, len(there), block=block, defaults=wanted.defaults)
         self._packed[wanted, block] = packed
         return packed
 

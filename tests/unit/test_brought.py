@@ -43,12 +43,3 @@ def test_what_others_wrote_there_is_left_out(tmp_path: Path) -> None:
     memory = Memory(tmp_path)
     memory.note(LOG)
     assert Memory(tmp_path).of(None, LOG.path) == LOG
-
-
-def test_the_file_does_not_grow_for_ever(tmp_path: Path) -> None:
-    for number in range(5):
-        memory = Memory(tmp_path)
-        for size in range(100):
-            memory.note(replace(LOG, size=100 * number + size))
-    assert (tmp_path / NAME).stat().st_size < 250 * 150
-    assert Memory(tmp_path).of(None, LOG.path) == replace(LOG, size=499)

@@ -9,12 +9,10 @@ from dataclasses import replace
 import pytest
 
 from mavftpfs.sim.parameters import (
-    FLOAT,
     HEADER,
     INT32,
     LenientUpload,
     Parameter,
-    Selection,
     StrictUpload,
     Table,
     Upload,
@@ -129,14 +127,6 @@ def test_uploads_are_acked_and_refused_as_recorded(name: str) -> None:
         after = steps.get(f"after {upload_name}: read")
         if after is not None:
             assert without_live(table.visible(0)) == without_live(unpacked(data_of(after))), upload_name
-
-
-def test_a_table_may_tell_every_default() -> None:
-    two = Table([parameter("A_FLOAT", FLOAT, 1.5, 0.0), parameter("A_INT", INT32, 3, 3)])
-    some = two.download(Selection(defaults=True), 239, 0)
-    every = Table(unpacked(some), every_default=True).download(Selection(defaults=True), 239, 0)
-    assert len(every) == len(some) + 4
-    assert [one.default for one in unpacked(every)] == [bytes(4), struct.pack("<i", 3)]
 
 
 def test_a_parameter_may_need_another() -> None:
