@@ -6,7 +6,6 @@ Only safe bytes are counted: bytes that came, or bytes that the vehicle acknowle
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
@@ -15,21 +14,19 @@ import trio
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import Session, mount_status
 from mavftpfs.shared.errors import LinkError
+from mavftpfs.shared.speed import Speed
 
-RATE_SPAN = 10.0
-"""Seconds over which the rate is measured."""
-_SAMPLE = 0.2
 WAITING = "waiting for the vehicle"
 
 
 class Progress:
-    """Counts; shows nothing by itself. All sizes in bytes."""
+    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._samples: deque[tuple[float, int]] = deque()
+        self._speed = Speed()
         self.files = self.files_done = 0
-        self.total = self._ended = self._moved = 0
+        self.total = self._ended = 0
         self.name = ""
         self.size = self.here = 0
         self.state = ""
@@ -43,14 +40,12 @@ class Progress:
     def begin(self, name: str, size: int, here: int = 0) -> None:
         """Begin a file, or begin it again; `here` bytes of it need not move."""
         self.name, self.size, self.here, self.state = name, size, here, ""
-        self._sample()
 
     def at(self, here: int) -> None:
         """Note how many bytes of the file are safe."""
-        self._moved += max(0, here - self.here)
+        self._speed.on_bytes(max(0, here - self.here), self._clock())
         self.here = here
         self.size = max(self.size, here)
-        self._sample()
 
     def check(self) -> None:
         """Note that all bytes moved, and are being compared."""
@@ -59,12 +54,6 @@ class Progress:
     def wait(self) -> None:
         """Note that the vehicle is lost."""
         self.state = WAITING
-
-    def note_lost(self, lost: bool) -> None:
-        """Note that the vehicle is lost, or heard again: the rate so far tells nothing any more."""
-        if lost or self.lost:
-            self._samples.clear()
-        self.lost = lost
 
     def end(self, planned: int) -> None:
         """Note that the file is done, or failed; `planned`: its bytes in the plan."""
@@ -81,22 +70,12 @@ class Progress:
     @property
     def rate(self) -> float | None:
         """Bytes per second that move, None before it is known."""
-        if len(self._samples) < 2:
-            return None
-        (began, before), now = self._samples[0], self._clock()
-        return (self._moved - before) / (now - began) if now - began >= 1.0 else None
+        return self._speed.at(self._clock())
 
     @property
     def time_left(self) -> float | None:
         """Seconds until all is done, None while unknown."""
         return (self.total - self.done) / self.rate if self.rate else None
-
-    def _sample(self) -> None:
-        now = self._clock()
-        if not self._samples or now - self._samples[-1][0] >= _SAMPLE:
-            self._samples.append((now, self._moved))
-        while now - self._samples[0][0] > RATE_SPAN and len(self._samples) > 2:
-            self._samples.popleft()
 
 
 LOOK_PERIOD = 0.5
@@ -115,7 +94,7 @@ async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[N
     async def watch() -> None:
         while True:
             with suppress(LinkError):  # if the mount is gone, the body gets the error
-                progress.note_lost(await lost())
+                progress.lost = await lost()
             await trio.sleep(LOOK_PERIOD)
 
     async with plain_nursery() as nursery:

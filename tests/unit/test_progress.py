@@ -7,15 +7,21 @@ from mavftpfs.client.progress import Progress
 from tests.support.clocks import HandClock
 
 
+def move(progress: Progress, clock: HandClock, seconds: int, rate: int = 10_000) -> None:
+    """Let the file at work move on."""
+    for _ in range(seconds):
+        clock.now += 1
+        progress.at(progress.here + rate)
+
+
 def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
     clock = HandClock(100.0)
     progress = Progress(clock)
     progress.plan(1, 1_000_000)
     progress.begin("/a", 1_000_000, 900_000)
     assert (progress.done, progress.rate) == (900_000, None)
-    clock.now += 2
-    progress.at(920_000)
-    assert totals(progress) == "920.0 kB of 1.0 MB, 10.0 kB/s, 8.0 s left"
+    move(progress, clock, 4)
+    assert totals(progress) == "940.0 kB of 1.0 MB, 10.0 kB/s, 6.0 s left"
 
 
 def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it() -> None:
@@ -23,22 +29,17 @@ def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it
     progress = Progress(clock)
     progress.plan(1, 1_000_000)
     progress.begin("/a", 1_000_000)
-    for _ in range(3):
-        clock.now += 2
-        progress.at(progress.here + 20_000)
-    progress.note_lost(False)
+    move(progress, clock, 6)
     assert totals(progress) == "60.0 kB of 1.0 MB, 10.0 kB/s, 1 min 34 s left"
     progress.wait()
-    progress.note_lost(True)
+    progress.lost = True
     assert totals(progress) == "60.0 kB of 1.0 MB, waiting for the vehicle"
     assert current(progress, 80) == "/a"
     clock.now += 60
     progress.begin("/a", 1_000_000, 60_000)
-    progress.note_lost(False)
-    progress.at(60_000)
-    clock.now += 2
-    progress.at(80_000)
-    assert totals(progress) == "80.0 kB of 1.0 MB, 10.0 kB/s, 1 min 32 s left"
+    progress.lost = False
+    move(progress, clock, 4, 5_000)
+    assert totals(progress) == "80.0 kB of 1.0 MB, 5.0 kB/s, 3 min 4 s left"
 
 
 def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
@@ -69,7 +70,7 @@ def test_the_bar_keeps_its_width() -> None:
     for name in ("/a", "/b"):
         progress.begin(name, 150_000_000)
         for step in range(1, 11):
-            clock.now += 90.0
+            clock.now += 4.0
             progress.at(15_000_000 * step)
             lines.add(len(totals(progress)))
             widths.add(bar_width(progress, 100))
