@@ -135,7 +135,8 @@ class Flow:
 
     Attributes:
         window: requests that may be in flight. cap: the widest window now.
-        loss: the share of requests that are lost, 0..1.
+        loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
+            server that pauses, does not count.
         alone: no other FTP client was heard lately.
         pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`.
         starved: there was room and nothing to send.
@@ -379,7 +380,8 @@ class Flow:
     def _learn_averages(self, now: float, total: int, *, losses: bool) -> None:
         """Average the share of losses and the round trips. losses: those of this round are the link's."""
         loss, memory = self._lost / total, min(SMOOTHING, total / LOSS_MEMORY)
-        self.loss += (loss - self.loss) * memory
+        if losses or loss < self.loss:
+            self.loss += (loss - self.loss) * memory
         if loss < self._usual_loss:
             self._usual_loss += (loss - self._usual_loss) * memory
         elif losses:

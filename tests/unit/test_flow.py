@@ -186,6 +186,15 @@ def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
     assert flow._reserve() < 0.5 * usual
 
 
+def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
+    flow, path = paused()
+    path.rounds(1, lost=flow.window // 2)
+    assert flow.loss == 0.0
+    path.rounds(10)
+    path.rounds(10, lost=flow.window // 10)
+    assert 0.03 < flow.loss < 0.15
+
+
 def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
     flow = Flow()
     path = Path(flow, rate=400.0, base=0.1)
