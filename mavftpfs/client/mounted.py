@@ -104,6 +104,14 @@ async def _call(path: bytes, function: Callable[..., ResultT], *args: object) ->
         raise _translated(exc, path) from exc
 
 
+def _write_all(fd: int, data: bytes | memoryview, offset: int) -> None:
+    """Write all of `data`. A write of which only the end is refused returns how much went before."""
+    left = memoryview(data)
+    while left:
+        count = os.pwrite(fd, left, offset)
+        left, offset = left[count:], offset + count
+
+
 @dataclass(slots=True)
 class MountedFile:
     """An open file of a mount; see File. withdraw: asks the mount to take it back, and blocks; None if it
@@ -120,10 +128,10 @@ class MountedFile:
         return await _call(self.path, os.pread, self.fd, size, offset)
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """As os.pwrite."""
-        count = await _call(self.path, os.pwrite, self.fd, data, offset)
-        self.size = max(self.size, offset + count)
-        return count
+        """As os.pwrite, until all of it is written."""
+        await _call(self.path, _write_all, self.fd, data, offset)
+        self.size = max(self.size, offset + len(data))
+        return len(data)
 
     async def fsync(self) -> None:
         """As os.fsync."""
@@ -132,6 +140,7 @@ class MountedFile:
     async def truncate(self, size: int) -> None:
         """As os.ftruncate."""
         await _call(self.path, os.ftruncate, self.fd, size)
+        self.size = size
 
     async def release(self) -> None:
         """As os.close, which goes on in its thread if it takes long."""
@@ -150,6 +159,20 @@ class MountedFile:
             with suppress(errors.MavftpfsError):
                 await self.release()
         return there
+
+
+def _size_of_opened(fd: int) -> int:
+    """Return the size of a file that was just opened.
+
+    Raises:
+        IsADirectoryError.
+    """
+    found = os.fstat(fd)
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    # Else the kernel asks for 128 KiB at once, which takes 22 s on a radio. The mount itself reads ahead.
+    os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
+    return found.st_size
 
 
 class MountedFiles:
@@ -185,8 +208,12 @@ class MountedFiles:
         """As os.scandir."""
 
         def scan(place: bytes) -> list[tuple[bytes, Stat]]:
+            found = []
             with os.scandir(place) as entries:
-                return [(entry.name, _stat_of(entry.stat())) for entry in entries]
+                for entry in entries:
+                    with suppress(FileNotFoundError):  # it was removed meanwhile, and the directory was not
+                        found.append((entry.name, _stat_of(entry.stat())))
+            return found
 
         return await _call(path, scan, self._place(path))
 
@@ -202,21 +229,33 @@ class MountedFiles:
             return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
 
     async def _open(self, path: bytes, flags: int) -> MountedFile:
-        def opened(place: bytes) -> tuple[int, int]:
-            fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
-            found = os.fstat(fd)
-            if stat.S_ISDIR(found.st_mode):
-                os.close(fd)
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-            # Else the kernel asks for 128 KiB at once, which takes 22 s on a radio. The mount itself reads
-            # ahead.
-            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
-            return fd, found.st_size
-
         writable = bool(flags & (os.O_RDWR | os.O_TRUNC))
         place = self._place_to_change(path) if writable else self._place(path)
-        fd, size = await _call(path, opened, place)
-        return MountedFile(path, fd, size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
+        opened: list[int] = []
+        wanted = True
+
+        def open_it() -> int:
+            opened.append(os.open(place, flags | os.O_CLOEXEC, 0o666))
+            if not wanted:
+                drop()
+                return 0
+            return _size_of_opened(opened[0])
+
+        def drop() -> None:
+            with suppress(IndexError):  # the other thread does it
+                fd = opened.pop()
+                if flags & (os.O_TRUNC | os.O_CREAT):  # else its close would deliver an empty file
+                    self._withdraw(place)
+                os.close(fd)
+
+        try:
+            size = await _call(path, open_it)
+        except BaseException:  # the thread may still wait for the mount
+            wanted = False
+            with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
+                await trio.to_thread.run_sync(drop, abandon_on_cancel=True)
+            raise
+        return MountedFile(path, opened[0], size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
 
     def _withdraw(self, place: bytes) -> bool | None:
         request = {"command": "withdraw", "path": os.fsdecode(place[len(self._mountpoint) :])}

@@ -15,6 +15,7 @@ import numpy
 import pytest
 
 import mavftpfs
+from mavftpfs.client.mounted import MountedFiles
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
 from tests.support.trees import content
@@ -370,6 +371,37 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
     with mavftpfs.connect(vehicle.source, use_mount=False) as drone:
         assert drone.mountpoint is None
         assert drone.read_bytes("/f") == DATA
+
+
+@pytest.mark.mount
+@pytest.mark.holds("promise 1")
+def test_a_mount_that_takes_a_part_of_a_write_has_not_taken_it(field: Field) -> None:
+    """The kernel's write then returns how much went before the refusal, and no error."""
+    card = field.local("card")
+    mount = field.mount(field.sim(card).source, "spool_max=1M", "dirty_max=64K")
+    with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="No space") as caught:
+        drone.write_bytes("/f", bytes(3 << 20))
+    assert caught.value.errno == errno.ENOSPC
+    assert list(card.iterdir()) == []
+
+
+@pytest.mark.mount
+def test_through_a_mount_a_file_that_was_cut_ends_where_it_was_cut(field: Field) -> None:
+    card = field.local("card")
+    (card / "f").write_bytes(b"0123456789")
+    mount = field.mount(field.sim(card).source)
+    with mavftpfs.connect(str(mount.path)) as drone, drone.open("/f", "r+b", buffering=0) as file:
+        file.truncate(3)
+        assert file.seek(0, os.SEEK_END) == 3
+        file.write(b"x")
+    assert (card / "f").read_bytes() == b"012x"
+
+
+async def test_through_a_mount_a_name_that_vanishes_while_it_is_listed_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "f").touch()
+    (tmp_path / "gone").symlink_to(tmp_path / "nothing")
+    files = MountedFiles(str(tmp_path), b"/", b"/")
+    assert [name for name, _ in await files.list(b"/")] == [b"f"]
 
 
 NAMED = [

@@ -430,3 +430,23 @@ async def test_a_mount_that_does_not_answer_stops_no_other_task(sim: SimVehicle,
             mount.process.popen.send_signal(signal.SIGCONT)
         nursery.cancel_scope.cancel()
     assert turns > 0
+
+
+@pytest.mark.mount
+@pytest.mark.holds("promise 2")
+async def test_through_a_mount_a_cancelled_open_empties_nothing(sim: SimVehicle, field: Field) -> None:
+    """The kernel's open goes on in its thread. What it opens is closed, and the old file stays."""
+    mount = field.mount(sim.source, "op_deadline=5", "dir_timeout=0", "attr_timeout=0")
+
+    def open_here() -> list[str]:
+        links = [Path("/proc/self/fd", number) for number in os.listdir("/proc/self/fd")]
+        return [place for place in map(os.path.realpath, links) if place.startswith(f"{mount.path}/")]
+
+    async with mavftpfs.trio.connect(str(mount.path)) as drone:
+        for path, mode in (("/f", "wb"), ("/f", "rb"), ("/fresh", "xb")):
+            with silent(sim), trio.move_on_after(0.5) as scope:
+                await drone.open(path, mode)
+            assert scope.cancelled_caught
+            await trio.sleep(2)
+        assert open_here() == []
+    assert on_card(sim) == {"f": OLD}
