@@ -80,6 +80,7 @@ class _Supervisor:
         self._finished = trio.Event()
         self._control: ControlServer | None = None
         self._scope = trio.CancelScope()
+        self._loop_scope = trio.CancelScope()
 
     async def run(self) -> int:
         """Serve until unmounted."""
@@ -116,7 +117,8 @@ class _Supervisor:
                     tasks.start_soon(self._hear, link)
                     tasks.start_soon(self._keep_members, tasks)
                     tasks.start_soon(self._tell_when_up)
-                    await fuse_loop()
+                    with self._loop_scope:
+                        await fuse_loop()
                     await self._end_members()  # the root alone was unmounted, lazily
 
     async def _tell_when_up(self) -> None:
@@ -174,8 +176,8 @@ class _Supervisor:
 
     async def _keep_members(self, nursery: trio.Nursery) -> None:
         """Start a mount for each vehicle that is heard and has none."""
-        while not self._ending:
-            for member in self._roster.due(trio.current_time()):
+        while True:
+            for member in () if self._ending else self._roster.due(trio.current_time()):
                 member.start()
                 nursery.start_soon(self._keep_mounted, member)
             await trio.sleep(PERIOD)
@@ -222,8 +224,6 @@ class _Supervisor:
             for member in self._roster:
                 if member.name in self._processes:
                     nursery.start_soon(self._end_member, member, lazy, problems)
-        if problems:
-            self._ending = False
         return problems
 
     async def _end_member(self, member: Member, lazy: bool, problems: list[str]) -> None:
@@ -262,6 +262,7 @@ class _Supervisor:
     async def _leave(self) -> None:
         await self._end_members()
         await trio.to_thread.run_sync(unmount_what_is_left, self._request.mountpoint)
+        self._loop_scope.cancel()  # the kernel ends it only with its last user, which may be never
 
     # -- control
 
@@ -283,9 +284,15 @@ class _Supervisor:
     async def _umount(self, request: Reply) -> Reply:
         lazy = bool(request.get("lazy"))
         problems = await self._end_members(lazy=lazy)
-        if problems:
-            raise MountFailed("; ".join(problems))
-        await trio.to_thread.run_sync(partial(unmount, self._request.mountpoint, lazy=lazy))
+        try:
+            if problems:
+                raise MountFailed("; ".join(problems))
+            await trio.to_thread.run_sync(partial(unmount, self._request.mountpoint, lazy=lazy))
+        except MountFailed:
+            self._ending = False  # something is in use: what is still mounted goes on
+            raise
+        if lazy:
+            self._loop_scope.cancel()  # as in _leave
         await self._finished.wait()
         return {"exit_code": int(self._code), "pid": os.getpid(), "message": self._message}
 

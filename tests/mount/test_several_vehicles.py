@@ -281,7 +281,13 @@ def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Flee
         assert "in use" in said
         assert mounted_at(mounts.path / "1")
         holder.kill()
-    assert mounts.end_by(signal.SIGTERM) == 0
+    fleet.launch(3)
+    mounts.await_up("3")
+    with mounts.started("sleep", "100", cwd=mounts.path) as holder:
+        assert "in use" in mavftpfs("umount", mounts.path, code=3)[1]
+        assert mounts.facts()["state"] == "mounted"
+        assert mounts.end_by(signal.SIGTERM) == 0
+        holder.kill()
     assert not mounted_at(mounts.path)
 
 
