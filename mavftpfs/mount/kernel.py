@@ -238,7 +238,7 @@ class _Life:
                 status=lambda: self.status(vehicle, operations),
             )
             try:
-                with kernel_mount(operations, self.request, invalidator):
+                with kernel_mount(operations, self.request, busy=lambda: invalidator.busy):
                     self.mounted = True
                     await self._start_control(vehicle, operations, invalidator, nursery)
                     await self._serve(invalidator, vehicle.notice)
@@ -354,7 +354,7 @@ class _Life:
             self._bound_the_loop()
 
     def _bound_the_loop(self) -> None:
-        """Nobody gets an answer any more: a read may wait for a lost vehicle as long as op_deadline."""
+        """No program gets an answer any more, and a read may wait for a lost vehicle as long as op_deadline."""
         assert self._loop_scope is not None
         self._loop_scope.deadline = min(self._loop_scope.deadline, trio.current_time() + GRACE)
 
@@ -374,9 +374,11 @@ async def fuse_loop(on_gone: Callable[[], None] = lambda: None) -> None:
 
 @contextmanager
 def kernel_mount(
-    operations: pyfuse3.Operations, request: MountRequest, invalidator: Invalidator
+    operations: pyfuse3.Operations, request: MountRequest, *, busy: Callable[[], bool] = lambda: False
 ) -> Iterator[None]:
     """Have the kernel show `operations` at the mountpoint for the length of the body.
+
+    busy: returns whether a thread is inside a call of the library.
 
     Raises:
         MountFailed: with what libfuse or fusermount3 said.
@@ -392,8 +394,8 @@ def kernel_mount(
     try:
         yield
     finally:
-        if invalidator.busy:
-            # A thread is still inside the library; freeing the library's session would pull it away.
+        if busy():
+            # Freeing the library's session would pull it away from that thread.
             unmount_what_is_left(request.mountpoint)
         else:
             pyfuse3.close(unmount=True)

@@ -31,8 +31,7 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_ONBOARD_CONTROLLER, Address, Heartbeat
 from mavftpfs.link.sharing import own_environment
 from mavftpfs.mount.daemon import Report
-from mavftpfs.mount.handles import InodeTable
-from mavftpfs.mount.kernel import Invalidator, MountRequest, fuse_loop, kernel_mount, presentation
+from mavftpfs.mount.kernel import MountRequest, fuse_loop, kernel_mount, presentation
 from mavftpfs.mount.root import RootOperations
 from mavftpfs.mount.roster import Member, Roster, State
 from mavftpfs.session.connection import connected, signing_now
@@ -104,11 +103,10 @@ class _Supervisor:
     async def _serve(self, nursery: trio.Nursery) -> None:
         request = self._request
         operations = RootOperations(self._roster, presentation(request.options), self._look, self.status)
-        invalidator = Invalidator(InodeTable(), lambda ino, attr_only: None)
         async with opened(request.spec, request.options.client, beats=True) as link:
             with ExitStack() as stack:
                 try:
-                    stack.enter_context(kernel_mount(operations, request, invalidator))
+                    stack.enter_context(kernel_mount(operations, request))
                 except MountFailed as exc:
                     raise _explained(exc) from exc
                 self._mounted = True
