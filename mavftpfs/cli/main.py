@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import NoReturn
 import mavftpfs
 from mavftpfs.cli import commands
 from mavftpfs.mount.options import option_help
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
+from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 
 _DESCRIPTION = "Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory."
@@ -37,15 +38,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "-d" in words or "--debug" in words
     try:
-        return _run(words)
+        code = _run(words)
+        print(end="", flush=True)
+        return code
     except MavftpfsError as exc:
         return _complain(str(exc), exit_code_for(exc))
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
-        # `mavftpfs ls ... | head`: the reader is gone, and the interpreter must not try to flush again
+        # `mavftpfs ls ... | head`: the reader is gone. The interpreter must not try to flush again, and not all
+        # was done: a `put` ends there, too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return ExitCode.OK
+        return SIGNALLED + signal.SIGPIPE
     except Exception as exc:
         if debug:
             raise

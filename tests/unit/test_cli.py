@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -154,7 +155,7 @@ def test_a_bug_is_one_line_without_d(
         cli.main([SOURCE, "/mnt", "-d"])
 
 
-def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
+def test_a_reader_that_leaves_ends_a_command_as_sigpipe_would(tmp_path: Path) -> None:
     code = (
         "import sys; from mavftpfs.cli import commands, main as cli\n"
         "def crowd(args):\n    [print('x' * 1000) for _ in range(1000)]\n"
@@ -169,7 +170,7 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         child.stdout.close()
         assert child.stderr is not None
         assert child.stderr.read() == b""
-        assert child.wait(90) == 0
+        assert child.wait(90) == 128 + signal.SIGPIPE, "it did not do all that it was asked for"
 
 
 def test_ctrl_c_while_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
