@@ -46,8 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
-        # `mavftpfs ls ... | head`: the reader is gone. The interpreter must not try to flush again, and not all
-        # was done: a `put` ends there, too.
+        # `mavftpfs ls ... | head`: the reader is gone, and the interpreter must not try to flush again.
+        # Not all was done: a `put` ends here, too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return SIGNALLED + signal.SIGPIPE
     except Exception as exc:

@@ -354,7 +354,7 @@ class _Life:
             self._bound_the_loop()
 
     def _bound_the_loop(self) -> None:
-        """No program gets an answer any more, and a read may wait for a lost vehicle as long as op_deadline."""
+        """No program gets an answer now, and a read may wait for a lost vehicle as long as op_deadline."""
         assert self._loop_scope is not None
         self._loop_scope.deadline = min(self._loop_scope.deadline, trio.current_time() + GRACE)
 
