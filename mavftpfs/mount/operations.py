@@ -1,9 +1,5 @@
 """pyfuse3's handlers: translate, delegate to the tree, map errors. Layer: mount.
 
-Rules (all held by `handler`): only FUSEError leaves a handler, because anything else ends pyfuse3's main
-loop and with it the mount; every handler has a deadline, because a caller that waits in the kernel cannot be
-killed; trio.Cancelled passes.
-
 Inodes are touched only between awaits: reserve, reply and count form one atomic step.
 
 flush is called for every closed descriptor, also of programs that wrote nothing. So it asks the handle, and a
@@ -15,15 +11,14 @@ with `ro` is refused changes by the kernel, and by the tree.
 from __future__ import annotations
 
 import errno
-import functools
 import json
 import logging
 import mmap
 import os
 import stat as stat_bits
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from typing import Any, Concatenate, NoReturn, ParamSpec, TypeVar
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, NoReturn
 
 import pyfuse3
 import trio
@@ -33,6 +28,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Space
 from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.mount.guard import handler
 from mavftpfs.mount.handles import (
     ROOT_INO,
     DirectoryHandle,
@@ -52,27 +48,6 @@ from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.fuse")
 
-
-DEADLINE_MARGIN = 3.0
-"""Seconds the tree gets beyond op_deadline to report its own, better error."""
-
-CRC_BUDGET = 120.0
-"""Seconds for a checksum: the drone reads the whole file for it (promise 2)."""
-
-DELIVERY_BUDGET = 4 * 3600.0
-"""Seconds for calls that move bytes. The tree itself ends them when there is no progress, so this only ends a
-trickle."""
-
-NAMESPACE_BUDGET = 240.0
-"""Seconds for a change of names: it may have to finish a delivery, and to look whether it was done."""
-
-_DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
-_NAMING = frozenset({"create", "mknod", "mkdir", "rmdir", "unlink", "rename"})
-
-SLOWEST_RATE = 256
-"""Bytes/s of the slowest link worth waiting for. The tree ends a read without progress by itself; this
-only keeps a read that trickles from lasting for ever."""
-
 DOTS = (b".", b"..")
 """The kernel takes number and kind of these entries, and counts no lookup."""
 _ANY_DIRECTORY = Stat(EntryKind.DIRECTORY, 0, 0, 0.0)
@@ -82,39 +57,12 @@ STAT_BLOCK = 512
 UNKNOWN_SPACE = 1000 << 30
 """Bytes shown as total and free where the vehicle did not say: programs refuse to copy into 0 free bytes."""
 
-P = ParamSpec("P")
-T = TypeVar("T")
-S = TypeVar("S", bound="Operations")
-Handler = Callable[Concatenate[S, P], Coroutine[Any, Any, T]]
-
-
 Refresh = Callable[[int], Awaitable[None]]
 """Makes the kernel forget an inode's attributes (not its pages)."""
 
 
 async def _no_refresh(ino: int) -> None:
     """For callers without a kernel."""
-
-
-def handler(method: Handler[S, P, T]) -> Handler[S, P, T]:
-    """Guard a handler: let only FUSEError out, within the time that `Operations.budget` allows."""
-
-    async def guarded(self: S, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        with trio.move_on_after(self.budget(method.__name__, args)):
-            try:
-                return await method(self, *args, **kwargs)
-            except FUSEError:
-                raise
-            except MavftpfsError as exc:
-                log.debug("%s: %s", method.__name__, exc)
-                raise FUSEError(errno_for(exc)) from exc
-            except Exception as exc:
-                log.exception("bug in %s; the caller gets EIO", method.__name__)
-                raise FUSEError(errno.EIO) from exc
-        log.warning("%s took longer than its deadline", method.__name__)
-        raise FUSEError(errno.ETIMEDOUT)
-
-    return functools.update_wrapper(guarded, method)
 
 
 class Operations(pyfuse3.Operations):
@@ -137,7 +85,8 @@ class Operations(pyfuse3.Operations):
         """`now_ns()`: the time of day, nanoseconds since 1970 UTC."""
         super().__init__()
         self._tree = tree
-        self._look = presentation
+        self.op_deadline = presentation.op_deadline
+        self._presentation = presentation
         self._refresh = refresh
         self._space = space
         self._status = status
@@ -146,18 +95,6 @@ class Operations(pyfuse3.Operations):
         self.inodes = InodeTable() if inodes is None else inodes
         self.files: HandleTable[FileHandle] = HandleTable()
         self.directories: HandleTable[DirectoryHandle] = HandleTable()
-
-    def budget(self, name: str, args: Sequence[Any]) -> float:
-        """Return the seconds a handler may take."""
-        if name in _DELIVERING:
-            return DELIVERY_BUDGET
-        if name in _NAMING:
-            return NAMESPACE_BUDGET
-        if name == "read":
-            return self._look.op_deadline + DEADLINE_MARGIN + int(args[2]) / SLOWEST_RATE
-        if name == "getxattr" and args[1] == XATTR_CRC32:
-            return CRC_BUDGET + self._look.op_deadline + DEADLINE_MARGIN
-        return self._look.op_deadline + DEADLINE_MARGIN
 
     def counts(self) -> dict[str, int]:
         """Return how many inodes and handles the kernel has; excess forgets are a bug, here or there."""
@@ -262,14 +199,13 @@ class Operations(pyfuse3.Operations):
     @handler
     async def open(self, inode: int, flags: int, ctx: RequestContext) -> FileInfo:
         """Open a file; O_TRUNC comes in the flags and no setattr follows it."""
-        writing = flags & os.O_ACCMODE != os.O_RDONLY or bool(flags & os.O_TRUNC)
-        known = self._inode(inode)
-        path = self._path(inode)
         truncate, append = bool(flags & os.O_TRUNC), bool(flags & os.O_APPEND)
+        writing = truncate or flags & os.O_ACCMODE != os.O_RDONLY
+        known, path = self._inode(inode), self._path(inode)
         file = await self._tree.open(
             path, write=writing, truncate=truncate, append=append, program=lambda: program_of(ctx.pid)
         )
-        if flags & os.O_TRUNC:
+        if truncate:
             known.told_size = 0
         elif known.told_size not in (None, file.size):
             with closed_on_failure(file.close):
@@ -548,7 +484,7 @@ class Operations(pyfuse3.Operations):
         return entry
 
     def _attributes(self, inode: Inode, found: Stat) -> EntryAttributes:
-        look = self._look
+        look = self._presentation
         inode.told_size, inode.believed_until = found.size, trio.current_time() + found.valid_for
         entry = EntryAttributes()
         entry.st_ino = inode.ino

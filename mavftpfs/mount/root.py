@@ -21,8 +21,9 @@ import trio
 from pyfuse3 import EntryAttributes, FUSEError, RequestContext, SetattrFields, StatvfsData
 
 from mavftpfs.client.mountpoint import XATTR_STATUS
+from mavftpfs.mount.guard import handler
 from mavftpfs.mount.handles import ROOT_INO, Presentation
-from mavftpfs.mount.roster import Member, Roster, is_component, parse_name
+from mavftpfs.mount.roster import Member, Roster, parse_name
 
 FOREVER = 1e8
 """Seconds."""
@@ -46,49 +47,53 @@ class RootOperations(pyfuse3.Operations):
     ) -> None:
         super().__init__()
         self._roster = roster
+        self.op_deadline = presentation.op_deadline
         self._presentation = presentation
         self._look = look
         self._status = status
 
+    @handler
     async def lookup(self, parent_inode: int, name: bytes, ctx: RequestContext) -> EntryAttributes:
         """Find a vehicle's directory; a component is asked whether it is there."""
         if parent_inode != ROOT_INO:
             raise FUSEError(errno.EAGAIN)  # its mount is not there (yet)
         if name in (b".", b".."):
             return self._attributes(ROOT_INO)
-        member = self._roster.find(name) or await self._found(name)
+        key = parse_name(name)
+        member = None if key is None else self._roster.find(*key) or await self._found(*key)
         if member is not None:
             return self._attributes(member.ino)
         if not len(self._roster):
             raise FUSEError(errno.EAGAIN)
-        if is_component(name):
+        if key is not None and key[1]:
             nothing = EntryAttributes()  # with the number 0: the kernel remembers that there is none
             nothing.entry_timeout = ABSENT
             return nothing
         raise FUSEError(errno.ENOENT)
 
-    async def _found(self, name: bytes) -> Member | None:
-        key = parse_name(name)
-        if key is None or not is_component(name):
-            return None
+    async def _found(self, system: int, component: int) -> Member | None:
+        """Return a part of a vehicle if it answers; autopilots are only heard."""
         answered = False
         with trio.move_on_after(LOOK_PATIENCE):
-            answered = await self._look(*key)
-        return self._roster.add(*key) if answered else None
+            answered = component != 0 and await self._look(system, component)
+        return self._roster.add(system, component) if answered else None
 
     async def forget(self, inode_list: Sequence[tuple[int, int]]) -> None:
         """Nothing to do: lookups are not counted, because numbers stay."""
 
+    @handler
     async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
         """Return a directory's attributes."""
         return self._attributes(inode)
 
+    @handler
     async def opendir(self, inode: int, ctx: RequestContext) -> int:
         """Open the root, once a vehicle was heard."""
         if inode != ROOT_INO or not len(self._roster):
             raise FUSEError(errno.EAGAIN)
         return inode
 
+    @handler
     async def readdir(self, fh: int, start_id: int, token: pyfuse3.ReaddirToken) -> None:
         """Reply with the vehicles."""
         members = sorted(self._roster, key=lambda member: member.ino)
@@ -100,6 +105,7 @@ class RootOperations(pyfuse3.Operations):
     async def releasedir(self, fh: int) -> None:
         """Nothing to release."""
 
+    @handler
     async def statfs(self, ctx: RequestContext) -> StatvfsData:
         """Return that nothing can be stored here."""
         data = StatvfsData()
@@ -107,6 +113,7 @@ class RootOperations(pyfuse3.Operations):
         data.f_namemax = 255
         return data
 
+    @handler
     async def getxattr(self, inode: int, name: bytes, ctx: RequestContext) -> bytes:
         """Return the root's status."""
         if name == XATTR_STATUS and inode == ROOT_INO:

@@ -100,12 +100,6 @@ def parse_name(name: bytes) -> tuple[int, int] | None:
     return (system, component) if system <= 255 and component <= 255 else None
 
 
-def is_component(name: bytes) -> bool:
-    """Return whether a name stands for a part of a vehicle beside its autopilot."""
-    key = parse_name(name)
-    return key is not None and key[1] != 0
-
-
 class Roster:
     """The vehicles of one mount."""
 
@@ -118,10 +112,9 @@ class Roster:
     def __len__(self) -> int:
         return len(self._members)
 
-    def find(self, name: bytes) -> Member | None:
-        """Return the vehicle of a name."""
-        key = parse_name(name)
-        return None if key is None else self._members.get(key)
+    def find(self, system: int, component: int) -> Member | None:
+        """Return the vehicle, or the part of one, with these ids."""
+        return self._members.get((system, component))
 
     def at(self, ino: int) -> Member | None:
         """Return the vehicle whose directory has a number."""

@@ -23,6 +23,8 @@ from mavftpfs.mount.operations import (
     UNKNOWN_SPACE,
     Operations,
 )
+from mavftpfs.mount.root import RootOperations
+from mavftpfs.mount.roster import Roster
 from mavftpfs.shared.errors import Armed, FtpNak, ListingIncomplete, NotFound, PathTooLong, RequestTimeout
 from tests.ops.faketree import FakeTree
 
@@ -369,3 +371,16 @@ async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockC
     ops, ino, _ = await prepared(tree)
     tree.delays = {"crc32": 119.0}
     assert len(await ops.getxattr(ino, XATTR_CRC32, CTX)) == 8
+
+
+# -- the directory of several vehicles -----------------------------------------------------------------
+
+
+async def test_looking_for_a_part_of_a_vehicle_ends_no_mount() -> None:
+    async def no_descriptors(system: int, component: int) -> bool:
+        raise OSError(errno.EMFILE, "too many open files")
+
+    root = RootOperations(Roster(), LOOK, no_descriptors, dict)
+    with pytest.raises(FUSEError) as caught:
+        await root.lookup(ROOT_INO, b"1-100", CTX)
+    assert caught.value.errno == errno.EIO

@@ -11,7 +11,6 @@ from mavftpfs.mount.roster import (
     MOST,
     Roster,
     State,
-    is_component,
     parse_name,
 )
 
@@ -39,7 +38,6 @@ def beat(system: int, component: int = 1, autopilot: int = 12) -> Heartbeat:
 )
 def test_names(name: bytes, key: tuple[int, int] | None) -> None:
     assert parse_name(name) == key
-    assert is_component(name) is (key is not None and key[1] > 0)
 
 
 def test_an_autopilots_heartbeat_makes_its_vehicle_known() -> None:
@@ -51,11 +49,10 @@ def test_an_autopilots_heartbeat_makes_its_vehicle_known() -> None:
     roster.hear(beat(1), 1.0)
     assert [member.name for member in roster] == ["2", "1"]
     assert len({member.ino for member in roster} | {1}) == 3
-    member = roster.find(b"2")
+    member = roster.find(2, 0)
     assert member is not None
     assert roster.at(member.ino) is member
-    assert roster.find(b"3") is None
-    assert roster.find(b"log") is None
+    assert roster.find(3, 0) is None
 
 
 def due(roster: Roster, now: float) -> list[str]:
