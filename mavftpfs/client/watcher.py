@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable
 
 import trio
 
 from mavftpfs.client.status import Facts, is_read_only
 from mavftpfs.shared.readable import readable_time
+from mavftpfs.shared.speed import Speed
 
 log = logging.getLogger("mavftpfs.vehicle")
 
 PERIOD = 0.25
 """Seconds between two looks at the connection: a heartbeat holds until the next, about a second."""
-RATE_SPAN = 20
-"""Looks over which the traffic on the link is averaged."""
-LEAST_SPAN = 2.0
-"""Seconds of looks before an average is told."""
 
 
 class Watcher:
-    """Looks at a connection: logs each change that matters to a pilot, and measures the traffic."""
+    """Looks at a connection: logs each change that matters to a pilot, and measures the traffic.
+
+    Attributes:
+        traffic: bytes per second, both ways, over the last seconds; None while too little was seen.
+    """
 
     def __init__(self, status: Callable[[], Facts], *, writing: bool) -> None:
         """`status`: Connection.status; `writing`: the mount is not a read-only one."""
@@ -30,15 +30,9 @@ class Watcher:
         self._writing = writing
         self._seen: tuple[str, int, bool, bool] | None = None
         self._silent_since: float | None = None
-        self._bytes: deque[tuple[float, int]] = deque(maxlen=RATE_SPAN + 1)
-
-    @property
-    def traffic(self) -> float | None:
-        """Bytes per second, both ways, over the last few seconds; None while too little was seen."""
-        if len(self._bytes) < 2:
-            return None
-        (began, first), (ended, last) = self._bytes[0], self._bytes[-1]
-        return round((last - first) / (ended - began), 1) if ended - began >= LEAST_SPAN else None
+        self._speed = Speed()
+        self._moved = 0
+        self.traffic: float | None = None
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -50,7 +44,11 @@ class Watcher:
         """Look once."""
         facts = self._status()
         vehicle, link = facts["vehicle"], facts["link"]
-        self._bytes.append((now, link["received_bytes"] + link["sent_bytes"]))
+        moved = link["received_bytes"] + link["sent_bytes"]
+        self._speed.on_bytes(moved - self._moved, now)
+        self._moved = moved
+        speed = self._speed.at(now)
+        self.traffic = None if speed is None else round(speed, 1)
         before = self._seen
         self._seen = link["state"], vehicle["restarts"], bool(vehicle["armed"]), link["other_ftp_client"]
         if before is None:
