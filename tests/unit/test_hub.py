@@ -18,7 +18,9 @@ from mavftpfs.sim.vehicle import telemetry
 
 ONE, TWO = Address(1, 1), Address(2, 1)
 STATION = Address(255, 190)
-AT_ONE, AT_TWO = ("10.0.0.1", 14550), ("10.0.0.2", 14550)
+CLIENT, FAR = Address(254, 191), Address(9, 1)
+AT_ONE, AT_TWO, AT_WEST = ("10.0.0.1", 14550), ("10.0.0.2", 14550), ("127.0.0.1", 40)
+ELSEWHERE = ("10.0.0.66", 1)
 EAST, WEST, MOUNT, OTHER = 1, 2, 3, 4
 
 
@@ -30,6 +32,11 @@ def parsed(data: bytes) -> Frame:
 
 def beat(source: Address, *, autopilot: int = 12, armed: bool = False) -> Frame:
     return parsed(Framer(source, stream=False).encode_heartbeat(2, autopilot, 0x80 if armed else 0))
+
+
+def hello(source: Address) -> Frame:
+    """The heartbeat of what is no autopilot."""
+    return beat(source, autopilot=MAV_AUTOPILOT_INVALID)
 
 
 def ftp(source: Address, target: Address) -> Frame:
@@ -150,56 +157,56 @@ class Net:
 
 @pytest.fixture
 def net() -> Net:
-    """Two vehicles on the port, a ground station in the east; each client has its vehicle."""
+    """Two vehicles on the port, a ground station at each endpoint; each client has its vehicle."""
     net = Net()
     net.send(beat(ONE), PORT, AT_ONE)
     net.send(beat(TWO), PORT, AT_TWO)
-    net.send(beat(STATION, autopilot=MAV_AUTOPILOT_INVALID), EAST)
+    net.send(hello(STATION), EAST)
+    net.send(hello(Address(255, 191)), WEST, AT_WEST)
     for side, component, system in ((MOUNT, 191, 1), (OTHER, 192, 2)):
-        net.send(beat(Address(254, component), autopilot=MAV_AUTOPILOT_INVALID), side)
+        net.send(hello(Address(254, component)), side)
         net.router.focus(side, system)
         net.router.answer(side, AT_ONE if system == 1 else AT_TWO)
     net.now += 1
     return net
 
 
-def test_telemetry_goes_to_all_endpoints_and_to_the_client_of_that_vehicle(net: Net) -> None:
-    net.send(beat(Address(255, 191), autopilot=8), WEST, ("127.0.0.1", 40))
-    assert net.send(attitude(ONE), PORT, AT_ONE) == {
-        Place(EAST, None),
-        Place(WEST, ("127.0.0.1", 40)),
-        Place(MOUNT, None),
-    }
+TO_ONE, TO_TWO, TO_WEST = Place(PORT, AT_ONE), Place(PORT, AT_TWO), Place(WEST, AT_WEST)
+TO_EAST, TO_MOUNT, TO_OTHER = (Place(side, None) for side in (EAST, MOUNT, OTHER))
 
 
-def test_answers_go_where_the_asker_was_heard_and_to_clients_who_watch_the_session(net: Net) -> None:
-    assert net.sides(ftp(ONE, STATION), PORT, AT_ONE) == {EAST, MOUNT}
-    assert net.sides(ftp(ONE, Address(254, 191)), PORT, AT_ONE) == {MOUNT}
+ROUTES: dict[str, tuple[Frame, int, NetAddress | None, set[Place]]] = {
+    "telemetry": (attitude(ONE), PORT, AT_ONE, {TO_EAST, TO_WEST, TO_MOUNT}),
+    "an answer to a station": (ftp(ONE, STATION), PORT, AT_ONE, {TO_EAST, TO_MOUNT}),
+    "an answer to a client": (ftp(ONE, CLIENT), PORT, AT_ONE, {TO_MOUNT}),
+    "a station asks a vehicle": (ftp(STATION, TWO), EAST, None, {TO_TWO, TO_OTHER}),
+    "a client asks its vehicle": (ftp(CLIENT, ONE), MOUNT, None, {TO_ONE}),
+    "a station's heartbeat": (hello(STATION), EAST, None, {TO_ONE, TO_TWO, TO_WEST, TO_MOUNT, TO_OTHER}),
+    "a station's telemetry": (attitude(STATION), EAST, None, {TO_ONE, TO_TWO, TO_WEST}),
+    "a client's heartbeat": (hello(CLIENT), MOUNT, None, {TO_ONE}),
+    "the vehicle by an endpoint": (attitude(ONE), EAST, None, set()),
+    "the station by the port": (hello(STATION), PORT, ELSEWHERE, set()),
+    "a client by the port": (hello(CLIENT), PORT, AT_ONE, set()),
+    "another vehicle at an endpoint": (beat(FAR), WEST, AT_WEST, {TO_ONE, TO_TWO, TO_EAST}),
+    "it asks ours": (ftp(FAR, ONE), WEST, AT_WEST, {TO_ONE, TO_MOUNT}),
+}
 
 
-def test_requests_go_to_their_vehicle_alone(net: Net) -> None:
-    assert net.send(ftp(STATION, TWO), EAST) == {Place(PORT, AT_TWO), Place(OTHER, None)}
-    assert net.send(ftp(Address(254, 191), ONE), MOUNT) == {Place(PORT, AT_ONE)}
+@pytest.mark.parametrize("what", ROUTES)
+def test_where_a_frame_goes(net: Net, what: str) -> None:
+    frame, side, address, places = ROUTES[what]
+    assert net.send(frame, side, address) == places
 
 
-def test_what_the_station_says_to_all_goes_to_each_vehicle(net: Net) -> None:
-    assert {place for place in net.send(beat(STATION, autopilot=8), EAST) if place.side == PORT} == {
-        Place(PORT, AT_ONE),
-        Place(PORT, AT_TWO),
-    }
-    assert net.sides(attitude(STATION), EAST) == {PORT}
-
-
-def test_a_client_speaks_to_its_vehicle_only(net: Net) -> None:
-    assert net.send(beat(Address(254, 191), autopilot=8), MOUNT) == {Place(PORT, AT_ONE)}
+def test_a_client_whose_vehicle_was_not_heard_yet_speaks_to_all(net: Net) -> None:
     net.router.answer(MOUNT, None)
-    assert net.sides(beat(Address(254, 191), autopilot=8), MOUNT) == {PORT}
+    assert net.sides(hello(CLIENT), MOUNT) == {PORT}
 
 
 def test_clients_of_one_vehicle_see_each_others_sessions(net: Net) -> None:
     net.router.focus(OTHER, 1)
-    assert net.sides(ftp(Address(254, 191), ONE), MOUNT) == {PORT, OTHER}
-    assert net.sides(ftp(ONE, Address(254, 191)), PORT, AT_ONE) == {MOUNT, OTHER}
+    assert net.sides(ftp(CLIENT, ONE), MOUNT) == {PORT, OTHER}
+    assert net.sides(ftp(ONE, CLIENT), PORT, AT_ONE) == {MOUNT, OTHER}
 
 
 def test_heartbeats_of_others_are_told_to_clients_but_no_flood_of_them(net: Net) -> None:
@@ -214,34 +221,22 @@ def test_heartbeats_of_others_are_told_to_clients_but_no_flood_of_them(net: Net)
 
 @pytest.mark.holds("promise 1")
 def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> None:
-    somewhere = ("10.0.0.66", 1)
-    assert net.sides(ftp(ONE, STATION), PORT, somewhere) == {MOUNT}, "which judges for itself"
+    assert net.sides(ftp(ONE, STATION), PORT, ELSEWHERE) == {MOUNT}, "which judges for itself"
     assert net.router.doubles == {}, "it may have moved"
     net.send(attitude(ONE), PORT, AT_ONE)
-    assert net.router.doubles == {ONE: somewhere}
+    assert net.router.doubles == {ONE: ELSEWHERE}
     assert net.send(ftp(STATION, ONE), EAST) >= {Place(PORT, AT_ONE)}
     net.now += PATIENCE + 1
-    assert EAST in net.sides(attitude(ONE), PORT, somewhere), "the first one fell silent"
+    assert EAST in net.sides(attitude(ONE), PORT, ELSEWHERE), "the first one fell silent"
     assert net.router.doubles == {}
 
 
 def test_a_vehicle_that_comes_back_at_another_address_is_no_second_one(net: Net) -> None:
-    somewhere = ("10.0.0.1", 50000)
+    ELSEWHERE = ("10.0.0.1", 50000)
     for _ in range(int(PATIENCE) + 2):
-        net.send(beat(ONE), PORT, somewhere)
+        net.send(beat(ONE), PORT, ELSEWHERE)
         net.now += 1
     assert net.router.doubles == {}
-
-
-def test_what_comes_back_by_another_way_is_not_passed_on(net: Net) -> None:
-    assert net.sides(attitude(ONE), EAST) == set(), "an endpoint that leads back to the port"
-    assert net.sides(beat(STATION, autopilot=8), PORT, ("10.0.0.66", 1)) == set()
-    assert net.sides(beat(Address(254, 191), autopilot=8), PORT, AT_ONE) == set()
-
-
-def test_vehicles_at_endpoints_are_no_business_of_clients(net: Net) -> None:
-    assert not net.sides(beat(Address(9, 1)), WEST, ("127.0.0.1", 40)) & {MOUNT, OTHER}
-    assert net.sides(ftp(Address(9, 1), Address(1, 1)), WEST, ("127.0.0.1", 40)) == {PORT, MOUNT}
 
 
 def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
@@ -256,7 +251,7 @@ def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
 
 def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
     for number in range(500):
-        net.send(attitude(Address(10 + number % 200, 1 + number // 200)), WEST, ("127.0.0.1", 40))
+        net.send(attitude(Address(10 + number % 200, 1 + number // 200)), WEST, AT_WEST)
         net.now += 0.001
     assert net.router.taken(STATION, net.now)
     assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None)}
@@ -267,14 +262,14 @@ def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
 
 def test_what_cannot_be_proven_makes_nobody_known(net: Net) -> None:
     rubbish = parsed(foreign(Address(99, 1), 54_321))
-    assert net.sides(rubbish, WEST, ("127.0.0.1", 40)) == set()
+    assert net.sides(rubbish, WEST, AT_WEST) == set()
     assert not net.router.taken(Address(99, 1), net.now)
     assert EAST in net.sides(parsed(foreign(ONE, 54_321)), PORT, AT_ONE), "the vehicle itself is known"
 
 
 def test_who_left_is_forgotten(net: Net) -> None:
     net.router.remove(EAST)
-    assert net.sides(ftp(ONE, STATION), PORT, AT_ONE) == {MOUNT}
+    assert EAST not in net.sides(ftp(ONE, STATION), PORT, AT_ONE)
     assert not net.router.taken(STATION, net.now)
 
 
