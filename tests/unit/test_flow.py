@@ -14,17 +14,23 @@ from mavftpfs.protocol.flow import MOST_SERIAL, Flow
 
 
 class Path:
-    """A path of a fixed rate (replies/s) and base round trip; the window is always full."""
+    """A path of a fixed rate (replies/s) and base round trip; the window is always full. rounds: so many
+    went before."""
 
-    def __init__(self, flow: Flow, *, rate: float, base: float, start: float = 0.0) -> None:
-        self.flow = flow
+    def __init__(self, *, rate: float, base: float, rounds: int = 0, serial: bool = False) -> None:
+        self.flow = Flow(serial=serial)
         self.rate = rate
         self.base = base
-        self.now = start
+        self.now = 0.0
         self.order = 0
+        self.rounds(rounds)
+
+    @property
+    def window(self) -> int:
+        return self.flow.window
 
     def round(self, *, lost: int = 0) -> None:
-        window = self.flow.window
+        window = self.window
         rtt = max(self.base, window / self.rate)
         first = self.order
         self.order += window
@@ -41,149 +47,133 @@ class Path:
 
 
 def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
-    flow = Flow()
-    path = Path(flow, rate=2000.0, base=0.1)
-    path.rounds(40)
-    assert 200 <= flow.window <= 400, "at most a tenth of a second more"
+    path = Path(rate=2000.0, base=0.1, rounds=40)
+    assert 200 <= path.window <= 400, "at most a tenth of a second more"
 
 
 def test_random_loss_does_not_shrink_it() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(20)
+    path = Path(rate=1000.0, base=0.1, rounds=20)
     path.rounds(40, lost=10)
-    assert flow.window >= 80
-    assert flow.loss == pytest.approx(10 / flow.window, rel=0.2)
+    assert path.window >= 80
+    assert path.flow.loss == pytest.approx(10 / path.window, rel=0.2)
 
 
 def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(20)
-    before = flow.window
+    path = Path(rate=1000.0, base=0.1, rounds=20)
+    before = path.window
     path.rate = 300.0
     path.rounds(4, lost=5)
-    assert flow.window < 0.6 * before
+    assert path.window < 0.6 * before
     path.rate = 1000.0
     path.rounds(60)
-    assert flow.window >= 100, "what fills the path"
+    assert path.window >= 100, "what fills the path"
 
 
 @pytest.mark.holds("fault overflow")
 def test_a_queue_ends_the_start() -> None:
-    flow = Flow()
-    path = Path(flow, rate=200.0, base=0.1)
+    path = Path(rate=200.0, base=0.1)
     widest = 0
     for _ in range(20):
         path.round()
-        widest = max(widest, flow.window)
+        widest = max(widest, path.window)
     assert widest <= 64
-    assert 20 <= flow.window <= 40
+    assert 20 <= path.window <= 40
 
 
 def test_a_start_that_overflows_a_buffer_ends() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1e6, base=0.1)
-    while flow.window < 100:
+    path = Path(rate=1e6, base=0.1)
+    while path.window < 100:
         path.round()
-    wide = flow.window
+    wide = path.window
     path.rounds(2, lost=90)
-    assert flow.window < wide
+    assert path.window < wide
     path.rounds(4)
-    assert flow.window <= wide
+    assert path.window <= wide
 
 
 def test_a_starved_round_proves_nothing() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(20)
-    before = flow.window
+    path = Path(rate=1000.0, base=0.1, rounds=20)
+    before = path.window
     for _ in range(30):
-        flow.on_starved()
-        flow.on_replies(path.now + 1.0, 0.1, 1, path.order, path.order + 1)
+        path.flow.on_starved()
+        path.flow.on_replies(path.now + 1.0, 0.1, 1, path.order, path.order + 1)
         path.order += 1
         path.now += 1.0
-    assert flow.window == before
+    assert path.window == before
 
 
 def test_silence_probes_with_two_until_something_is_heard() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(20)
-    before = flow.window
-    flow.on_silence()
-    flow.on_silence()
-    assert flow.window == 2
-    flow.on_replies(path.now + 5.0, None, 1, 0, path.order)
-    assert flow.window == before // 2
-    flow.on_silence()
-    flow.set_queue_limit(4)
-    flow.on_replies(path.now + 6.0, None, 1, 0, path.order)
-    assert flow.window <= 4
+    path = Path(rate=1000.0, base=0.1, rounds=20)
+    before = path.window
+    path.flow.on_silence()
+    path.flow.on_silence()
+    assert path.window == 2
+    path.flow.on_replies(path.now + 5.0, None, 1, 0, path.order)
+    assert path.window == before // 2
+    path.flow.on_silence()
+    path.flow.set_queue_limit(4)
+    path.flow.on_replies(path.now + 6.0, None, 1, 0, path.order)
+    assert path.window <= 4
 
 
 def test_a_longer_way_is_noticed() -> None:
-    flow = Flow()
-    path = Path(flow, rate=1000.0, base=0.05)
-    path.rounds(30)
+    path = Path(rate=1000.0, base=0.05, rounds=30)
     path.base = 0.2
     path.rounds(400)
-    assert flow.window >= 200
+    assert path.window >= 200
 
 
 # --- a serial port
 
 
-def lose_what_overflows(flow: Flow, holds: int, rounds: int, *, loss: float = 0.0) -> list[int]:
-    """Return the windows of some rounds before a receive buffer that holds so many requests."""
-    path = Path(flow, rate=100.0, base=0.1)
+def lose_what_overflows(holds: int, rounds: int, *, loss: float = 0.0) -> list[int]:
+    """Return the windows of some rounds at a serial port before a buffer that holds so many requests."""
+    path = Path(rate=100.0, base=0.1, serial=True)
     rng = random.Random(1)
     windows = []
     for _ in range(rounds):
-        windows.append(flow.window)
-        survivors = min(flow.window, holds)
+        windows.append(path.window)
+        survivors = min(path.window, holds)
         chance = sum(rng.random() < loss for _ in range(survivors))
-        path.round(lost=min(flow.window - 1, 2 * (flow.window - survivors) + chance))
+        path.round(lost=min(path.window - 1, 2 * (path.window - survivors) + chance))
     return windows
 
 
 def test_a_serial_window_is_small_whatever_the_path_holds() -> None:
-    windows = lose_what_overflows(Flow(serial=True), 100, 60)
+    windows = lose_what_overflows(100, 60)
     assert max(windows) <= MOST_SERIAL
     assert windows[-1] >= 9
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.05])
 def test_it_stays_near_what_the_receive_buffer_holds(loss: float) -> None:
-    windows = lose_what_overflows(Flow(serial=True), 6, 200, loss=loss)
+    windows = lose_what_overflows(6, 200, loss=loss)
     assert 5 <= sum(windows[20:]) / len(windows[20:]) <= 9.5
 
 
 # --- a card that pauses
 
 
-def paused(*, base: float = 0.1) -> tuple[Flow, Path]:
-    """Return a flow that has just seen a server pause for 0.2 s."""
-    flow = Flow()
-    path = Path(flow, rate=400.0, base=base)
-    path.rounds(40)
+def paused() -> Path:
+    """Return a path whose server has just paused for 0.2 s."""
+    path = Path(rate=400.0, base=0.1, rounds=40)
     path.now += 0.2
-    flow.on_replies(path.now, path.base + 0.2, 1, path.order, path.order)
-    return flow, path
+    path.flow.on_replies(path.now, path.base + 0.2, 1, path.order, path.order)
+    return path
 
 
-def beyond(flow: Flow, now: float, *, paced: bool = True) -> int:
+def beyond(path: Path, after: float = 0.0, *, paced: bool = True) -> int:
     """Return how many requests may go out although the window is full."""
-    flow.begin()
-    return flow.room(flow.window, now, paced=paced)
+    path.flow.begin()
+    return path.flow.room(path.window, path.now + after, paced=paced)
 
 
 def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
-    flow, path = paused()
+    path = paused()
     path.rounds(30)
-    usual = flow._reserve()
+    usual = path.flow._reserve()
     path.rounds(5, lost=10)
-    assert flow._reserve() < 0.5 * usual
+    assert path.flow._reserve() < 0.5 * usual
 
 
 def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
@@ -196,23 +186,21 @@ def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
 
 
 def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
-    flow = Flow()
-    path = Path(flow, rate=400.0, base=0.1)
-    path.rounds(40)
-    flow.on_starved()
+    path = Path(rate=400.0, base=0.1, rounds=40)
+    path.flow.on_starved()
     path.now += 0.3
     path.rounds(3)
-    assert beyond(flow, path.now) <= 0
-    assert flow.starved or flow.pause == 0.0
+    assert beyond(path) <= 0
+    assert path.flow.starved or path.flow.pause == 0.0
 
 
 def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
-    flow, path = paused()
+    path = paused()
     path.rounds(10)
-    assert beyond(flow, path.now + 0.01, paced=False) <= 0
-    assert beyond(flow, path.now + 0.1, paced=False) > 0
-    assert flow.next_room_at() < path.now + 0.2
-    assert flow.room(flow.window + 200, path.now + 15.0, paced=False) <= 0
+    assert beyond(path, 0.01, paced=False) <= 0
+    assert beyond(path, 0.1, paced=False) > 0
+    assert path.flow.next_room_at() < path.now + 0.2
+    assert path.flow.room(path.window + 200, path.now + 15.0, paced=False) <= 0
 
 
 # --- a fast path
@@ -231,14 +219,13 @@ class Computer:
 
 @pytest.mark.parametrize("best", [16, 48, 128])
 def test_on_a_fast_path_the_window_is_no_wider_than_keeps_the_server_busy(best: int) -> None:
-    flow, computer = Flow(), Computer(best)
-    path = Path(flow, rate=60_000.0, base=0.0001)
+    computer, path = Computer(best), Path(rate=60_000.0, base=0.0001)
     windows, rates = [], []
     while path.now < 3.0:
-        path.rate = computer.rate(flow.window)
+        path.rate = computer.rate(path.window)
         path.round()
         if path.now > 1.0:
-            windows.append(flow.window)
+            windows.append(path.window)
             rates.append(path.rate)
     assert max(windows) <= 160
     assert sum(rates) / len(rates) >= 0.5 * computer.rate(best)
@@ -254,9 +241,8 @@ def test_bulk_goes_on_beside_what_is_waited_for_even_in_a_small_window(window: i
 @pytest.mark.parametrize("seed", range(5))
 def test_random_losses_at_the_start_are_not_taken_for_an_overflow(seed: int) -> None:
     """One request or answer in five is lost, as at 10 % each way; a false ceiling would last for minutes."""
-    flow = Flow()
-    path = Path(flow, rate=400.0, base=0.3)
+    path = Path(rate=400.0, base=0.3)
     rng = random.Random(seed)
     for _ in range(16):
-        path.round(lost=sum(rng.random() < 0.19 for _ in range(flow.window)))
-    assert flow.window > 60
+        path.round(lost=sum(rng.random() < 0.19 for _ in range(path.window)))
+    assert path.window > 60
