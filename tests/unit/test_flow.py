@@ -177,12 +177,12 @@ def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
 
 
 def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
-    flow, path = paused()
-    path.rounds(1, lost=flow.window // 2)
-    assert flow.loss == 0.0
+    path = paused()
+    path.rounds(1, lost=path.window // 2)
+    assert path.flow.loss == 0.0
     path.rounds(10)
-    path.rounds(10, lost=flow.window // 10)
-    assert 0.03 < flow.loss < 0.15
+    path.rounds(10, lost=path.window // 10)
+    assert 0.03 < path.flow.loss < 0.15
 
 
 def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
