@@ -147,21 +147,6 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(profile:
         assert await copy(tree) == NEW[: len(OLD)]
 
 
-@pytest.mark.parametrize("profile", TIMED)
-async def test_what_nobody_got_yet_is_read_anew(profile: str) -> None:
-    async with opened(profile) as (here, _, handle):
-        blocks = handle._handle._version  # type: ignore[attr-defined]
-        with trio.move_on_after(0.01):  # a read that is given up
-            await handle.read(0, STEP)
-        await trio.sleep(IDLE)
-        assert blocks.block(0) is not None
-        assert blocks.missing(0, len(OLD))
-        replace(here)
-        assert await handle.read(0, len(OLD)) == NEW[: len(OLD)]
-        await trio.sleep(IDLE)
-        assert await read_on(handle) == NEW[: len(OLD)]
-
-
 @pytest.mark.parametrize("grown", [False, True])
 @pytest.mark.parametrize("profile", EVERY)
 async def test_the_same_file_is_read_on(profile: str, grown: bool) -> None:
