@@ -235,9 +235,7 @@ class Deliverer:
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
-                if mismatches == MISMATCHES or isinstance(
-                    error.__cause__, Armed
-                ):  # a second copy could not be checked either
+                if mismatches == MISMATCHES:
                     raise
                 log.warning("%s; sending it again", error)
                 await trio.sleep(RESEND_PAUSE)
@@ -338,18 +336,13 @@ class Deliverer:
         Raises:
             As Verifier.check and _require_expected.
         """
-        crc32 = None
-
-        async def compare() -> None:
-            nonlocal crc32
-            doubted = self._context.store.in_doubt(attempt.begun_at)
-            crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
-
+        doubted = self._context.store.in_doubt(attempt.begun_at)
+        compare = partial(self.verifier.check, attempt.path, draft, doubted=doubted)
         look = partial(self._require_expected, node, draft)
         if draft.size <= SHORT:
-            await together(compare, look)
+            crc32 = await together(compare, look)
         else:
-            await compare()
+            crc32 = await compare()
             await look()
         self._require_deliverable(draft)
         return crc32

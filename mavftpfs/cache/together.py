@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import TypeVar
 
 import trio
 
+T = TypeVar("T")
 
-async def together(*calls: Callable[[], Awaitable[None]]) -> None:
-    """Await several calls at the same time. The first one starts first, so its requests go out first.
+
+async def together(first: Callable[[], Awaitable[T]], second: Callable[[], Awaitable[None]]) -> T:
+    """Await two calls at the same time, and return what the first one returned. The first one starts first,
+    so its requests go out first.
 
     Raises:
-        The error of the first call, in this order, that failed; after all have ended.
+        The error of the first call, else that of the second; after both have ended.
     """
-    failures: dict[int, Exception] = {}
+    failures: list[Exception] = []
 
-    async def run(index: int) -> None:
+    async def run_second() -> None:
         try:
-            await calls[index]()
+            await second()
         except Exception as error:  # raised again below
-            failures[index] = error
+            failures.append(error)
 
     async with trio.open_nursery() as nursery:
-        for index in range(1, len(calls)):
-            nursery.start_soon(run, index)
-        await run(0)
+        nursery.start_soon(run_second)
+        try:
+            result = await first()
+        except Exception as error:  # raised again below
+            failures.insert(0, error)
     if failures:
-        raise failures[min(failures)]
+        raise failures[0]
+    return result
