@@ -424,20 +424,25 @@ def test_an_error_is_said_in_the_same_words_over_a_mount(field: Field) -> None:
         (card / "d" / name).touch()
     vehicle = field.sim(card)
     mount = field.mount(vehicle.source, "op_deadline=1")
-    for name, call in {**{name: CALLS[name] for name in NAMED}, "crc32": crc32_of}.items():
-        said = []
-        for use_mount in (False, True):
-            with mavftpfs.connect(vehicle.source, use_mount=use_mount) as drone:
-                assert (drone.mountpoint == str(mount.path)) == use_mount
-                with pytest.raises(OSError, match="/") as caught:
-                    call(drone, "/d")
-                said.append((type(caught.value), str(caught.value)))
-        assert said[0] == said[1], name
+    calls = {**{name: CALLS[name] for name in NAMED}, "crc32": crc32_of}
+    said: list[dict[str, tuple[type, str]]] = []
+    for use_mount in (False, True):
+        with mavftpfs.connect(vehicle.source, use_mount=use_mount) as drone:
+            assert (drone.mountpoint == str(mount.path)) == use_mount
+            said.append({name: refusal(call, drone) for name, call in calls.items()})
+    assert said[0] == said[1]
     with mavftpfs.connect(str(mount.path)) as drone:
         vehicle.pause()
         with pytest.raises(TimeoutError, match=r"/n: .*the vehicle does not answer"):
             CALLS["mkdir"](drone, "")
         vehicle.resume()
+
+
+def refusal(call: Call, drone: mavftpfs.Drone) -> tuple[type, str]:
+    """Return the error that a call ends with."""
+    with pytest.raises(OSError, match="/") as caught:
+        call(drone, "/d")
+    return type(caught.value), str(caught.value)
 
 
 @pytest.mark.mount

@@ -22,7 +22,7 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from tests.mount.conftest import Field
 from tests.support.flown import PARAMETERS
-from tests.support.mounts import Mount, hub_of, mavftpfs, wait_until
+from tests.support.mounts import Mount, command, hub_of, wait_until
 from tests.support.vehicles import HOST, PROJECT, Process, free_udp_port
 
 CONTENT = random.Random(1).randbytes(15_000)
@@ -331,7 +331,7 @@ def test_dead_endpoints_and_loops_harm_nobody(field: Field) -> None:
         harms_nothing(field, mount, root)
         wait_until("frames came back", lambda: loop.sent > 100)
         for words in (("hub", f"udpin:{HOST}:{port}"), ("status", mount.path)):
-            assert "or a router sends frames back: ignored at" in mavftpfs(*words)[0]
+            assert "or a router sends frames back: ignored at" in command(*words)[0]
 
 
 def test_two_stations_with_one_id_both_work(field: Field) -> None:
@@ -393,13 +393,13 @@ def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) 
             assert mount.unmount() == 0
         else:
             mount.kill()
-            mavftpfs("umount", mount.path)
+            command("umount", mount.path)
         until = len(listener.beats) + 4
         wait_until("the station hears it on", lambda: len(listener.beats) >= until)
         facts = hub_of(flown.source)
         assert facts is not None
         assert facts["armed"] == [1]
-        said, _ = mavftpfs("hub", "--stop", flown.source, code=1)
+        said, _ = command("hub", "--stop", flown.source, code=1)
         assert "ARMED" in said
         assert f"udpout:{HOST}:{port}" in said
         again = field.mount(flown.source)
@@ -408,7 +408,7 @@ def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) 
         gaps = [after - before for before, after in zip(listener.beats, listener.beats[1:], strict=False)]
         assert len(gaps) >= 6
         assert sorted(gaps)[len(gaps) // 2] < 2, gaps
-        mavftpfs("hub", "--stop", "--force", flown.source)
+        command("hub", "--stop", "--force", flown.source)
     wait_until("the hub is gone", lambda: hub_of(flown.source) is None)
 
 
@@ -461,5 +461,5 @@ def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
             (line,) = done.stderr.splitlines()
             assert said in line
         mount = field.mount(flown.source, f"forward=udpin::{free_udp_port()}")
-        assert "udpin:127.0.0.1:" in mavftpfs("hub", flown.source)[0]
+        assert "udpin:127.0.0.1:" in command("hub", flown.source)[0]
         assert mount.read_bytes(mount.path / "log.bin") == CONTENT

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import mavftpfs
+from tests.support.mounts import command
 from tests.support.terminal import Terminal
 
 
@@ -28,12 +28,12 @@ THROUGH_A_MOUNT = pytest.mark.parametrize("source", ["mount"], scope="module", i
 
 def param(source: str, *words: object, code: int = 0) -> list[str]:
     """Return the lines of stdout."""
-    return mavftpfs("param", source, *words, code=code)[0].splitlines()
+    return command("param", source, *words, code=code)[0].splitlines()
 
 
 def said(source: str, *words: object, code: int = 0) -> str:
     """Return what went to stderr."""
-    return mavftpfs("param", source, *words, code=code)[1]
+    return command("param", source, *words, code=code)[1]
 
 
 def test_printing(source: str) -> None:

@@ -23,7 +23,7 @@ from mavftpfs.client.status import status_of, with_vehicles
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
-from tests.support.mounts import PATIENCE, Mount, mavftpfs, mounted_at, wait_until
+from tests.support.mounts import PATIENCE, Mount, command, mavftpfs, mounted_at, wait_until
 from tests.support.vehicles import HOST, PROJECT, Process, SimVehicle, free_udp_port
 
 PROFILES = {1: "px4", 2: "ardupilot5", 3: "mavsdk"}
@@ -84,7 +84,7 @@ class Mounts(Mount):
     def unmount(self) -> int:
         """Unmount all, by our own command."""
         assert self.process is not None
-        mavftpfs("umount", self.path)
+        command("umount", self.path)
         return self.process.wait(60)
 
     def finish(self) -> None:
@@ -148,7 +148,7 @@ def test_three_vehicles_are_copied_at_once_one_dies_and_one_is_armed(fleet: Flee
         else:
             assert copy.returncode == 0, errors
         assert same(fleet.cards[system], locals_[system])
-    assert "ARMED" in mavftpfs("status", mounts.path)[0]
+    assert "ARMED" in command("status", mounts.path)[0]
     code = "open(sys.argv[1], 'w')"
     assert mounts.errno_of(code, mounts.path / "3" / "new") == "EROFS"
     assert mounts.errno_of(code, mounts.path / "2" / "new") == ""
@@ -215,7 +215,7 @@ def test_a_killed_supervisor_leaves_the_mounts_and_loses_nothing(fleet: Fleet) -
         code = "open(sys.argv[1], 'wb').write(bytes.fromhex(sys.argv[2]))"
         mounts.run(sys.executable, "-c", f"import sys; {code}", mounts.path / f"{system}/new", data.hex())
         assert (fleet.cards[system] / "new").read_bytes() == data
-    mavftpfs("umount", mounts.path)
+    command("umount", mounts.path)
     assert not mounted_at(mounts.path)
     again = mount_all(fleet)
     again.await_up("1", "2")
@@ -247,26 +247,26 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
     fleet.launch(1)
     mounts = mount_all(fleet)
     mounts.await_up("1")
-    assert "0.bin" in mavftpfs("ls", mounts.path, "/log")[0], "there is only one"
+    assert "0.bin" in command("ls", mounts.path, "/log")[0], "there is only one"
     fleet.launch(2)
     mounts.await_up("1", "2")
-    said = mavftpfs("ls", mounts.path, "/log", code=1)[1]
+    said = command("ls", mounts.path, "/log", code=1)[1]
     assert "(1, 2)" in said
     for system in (1, 2):
         local = fleet.field.local(f"sync{system}")
-        mavftpfs("sync", mounts.path, local, "-o", f"target_system={system}", "--from", "/log")
+        command("sync", mounts.path, local, "-o", f"target_system={system}", "--from", "/log")
         assert same(fleet.cards[system], local)
         shutil.rmtree(local)
-        mavftpfs("sync", mounts.path / str(system), local, "--from", "/log")
+        command("sync", mounts.path / str(system), local, "--from", "/log")
         assert same(fleet.cards[system], local)
-        assert "0.bin" in mavftpfs("ls", fleet.source, "/log", "-o", f"target_system={system}")[0]
-    assert "no vehicle 9" in mavftpfs("ls", mounts.path, "/", "-o", "target_system=9", code=1)[1]
-    assert "9" in mavftpfs("ls", mounts.path / "9", code=1)[1]
+        assert "0.bin" in command("ls", fleet.source, "/log", "-o", f"target_system={system}")[0]
+    assert "no vehicle 9" in command("ls", mounts.path, "/", "-o", "target_system=9", code=1)[1]
+    assert "9" in command("ls", mounts.path / "9", code=1)[1]
     for source in (mounts.path, fleet.source):
-        found = json.loads(mavftpfs("scan", "--json", source)[0])
+        found = json.loads(command("scan", "--json", source)[0])
         assert [entry["system"] for entry in found if entry["answers"]] == [1, 2]
-    assert len(json.loads(mavftpfs("status", "--json", mounts.path)[0])["vehicles"]) == 2
-    lines = mavftpfs("status", mounts.path)[0].splitlines()
+    assert len(json.loads(command("status", "--json", mounts.path)[0])["vehicles"]) == 2
+    lines = command("status", mounts.path)[0].splitlines()
     assert lines[0] == f"{mounts.path}: 2 vehicles of {fleet.source}"
 
 
@@ -277,7 +277,7 @@ def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Flee
     mounts.await_up("1", "2")
     nothing_can_be_made_beside_the_vehicles(mounts)
     with mounts.started("sleep", "100", cwd=mounts.path / "1") as holder:
-        said = mavftpfs("umount", mounts.path, code=3)[1]
+        said = command("umount", mounts.path, code=3)[1]
         assert "in use" in said
         assert mounted_at(mounts.path / "1")
         holder.kill()
@@ -320,9 +320,9 @@ def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
     thread.start()
     try:
         wait_until("it is known", lambda: bool(mounts.facts()["vehicles"][0]["link"]["second"]))
-        assert "a second vehicle" in mavftpfs("status", mounts.path)[0]
-        assert "a second vehicle" in mavftpfs("scan", fleet.source)[0]
-        assert "a second vehicle" in mavftpfs("hub", fleet.source)[0]
+        assert "a second vehicle" in command("status", mounts.path)[0]
+        assert "a second vehicle" in command("scan", fleet.source)[0]
+        assert "a second vehicle" in command("hub", fleet.source)[0]
         assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
     finally:
         stop.set()

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import stat
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,7 @@ from mavftpfs.link.rendezvous import HUB, hubs, knock
 from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import parse_source
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, hub_of, wait_until
+from tests.support.mounts import Mount, command, hub_of, wait_until
 from tests.support.vehicles import HOST, free_udp_port
 
 CONTENT = bytes(range(256)) * 400
@@ -42,14 +41,9 @@ def two_vehicles(field: Field) -> tuple[list[Path], str]:
     return cards, f"udpin:{HOST}:{port}"
 
 
-def command(mount: Mount, *words: str, code: int | None = 0) -> str:
-    """Run one of our commands and return what it says."""
-    return mount.run(sys.executable, "-m", "mavftpfs", *words, code=code).stdout
-
-
 def reads_right(mount: Mount, root: Path) -> bool:
     """Return whether a file is read anew, and right."""
-    command(mount, "ls", str(mount.path))
+    command("ls", mount.path)
     return mount.read_bytes(mount.path / "log.bin") == (root / "log.bin").read_bytes()
 
 
@@ -66,12 +60,12 @@ def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Fiel
     cards, source = two_vehicles(field)
     one = field.mount(source, "target_system=1")
     assert hub_of(source) is None, "a mount alone has its port itself"
-    found = json.loads(command(one, "scan", "--json", source))
+    found = json.loads(command("scan", "--json", source)[0])
     assert {entry["system"] for entry in found if entry["answers"]} == {1, 2}
     two = field.mount(source, "target_system=2")
-    listed = command(one, "ls", source, "/", "-o", "target_system=2")
+    listed = command("ls", source, "/", "-o", "target_system=2")[0]
     assert "log.bin" in listed
-    (facts,) = json.loads(command(one, "hub", "--json", source))
+    (facts,) = json.loads(command("hub", "--json", source)[0])
     assert len({tuple(client["address"]) for client in facts["clients"]}) == 2
     for mount, root in ((one, cards[0]), (two, cards[1])):
         assert reads_right(mount, root)
@@ -142,7 +136,7 @@ def test_a_killed_mount_disturbs_nobody(field: Field) -> None:
     cards, source = two_vehicles(field)
     one, two = (field.mount(source, f"target_system={number}") for number in (1, 2))
     one.kill()
-    command(two, "umount", str(one.path))
+    command("umount", one.path)
     assert reads_right(two, cards[1])
     again = field.mount(source, "target_system=1")
     assert reads_right(again, cards[0])

@@ -15,7 +15,7 @@ import pytest
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support import terminal
-from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, wait_until
+from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, command, wait_until
 from tests.support.vehicles import PROJECT, Process, free_udp_port
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
@@ -43,7 +43,7 @@ def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tr
     logged(mount, "1/1 is disarmed")
     vehicle.send_signal(signal.SIGUSR2)
     logged(mount, "is lost")
-    assert ": PX4 1/1, disarmed, LOST: last heard " in mount.run(*STATUS, mount.path).stdout
+    assert ": PX4 1/1, disarmed, LOST: last heard " in command("status", mount.path)[0]
     vehicle.send_signal(signal.SIGUSR2)
     logged(mount, "is back")
     vehicle.send_signal(signal.SIGPWR)
@@ -104,12 +104,12 @@ def test_status_is_for_programs_too(field: Field, small_tree: Path) -> None:
         assert second["uptime"] > first["uptime"] >= 0
         watch.send_signal(signal.SIGINT)
         assert watch.wait(COMMAND_TIMEOUT) == 130
-    shown = mount.run(*STATUS, mount.path).stdout
+    shown = command("status", mount.path)[0]
     assert re.sub(r"RTT \d+ ms|loss [0-9<]+ %|, [0-9.]+ k?B/s", "", shown).splitlines() == [
         f"{mount.path}: PX4 1/1, disarmed, link fine: , ",
         "  nothing is held back: all that was written is on the vehicle",
     ]
-    for text in (shown, mount.run(*STATUS, "--verbose", mount.path).stdout):
+    for text in (shown, command("status", "--verbose", mount.path)[0]):
         assert text.isascii(), text  # no boxes, no colours
         assert "\x1b" not in text
 
@@ -129,12 +129,12 @@ def test_a_dead_mount_is_said_to_be_dead_and_watching_it_ends_when_it_is_cleared
         try:
             assert any("DEAD: its program is gone" in line for line in watch.stdout)
             line = f"{mount.path}: DEAD: its program is gone; run: mavftpfs umount {mount.path}"
-            assert mount.run(*STATUS, mount.path, code=ExitCode.MOUNT_FAILED).stdout == f"{line}\n"
-            assert line in mount.run(*STATUS).stdout.splitlines()
-            facts = json.loads(mount.run(*STATUS, "--json", mount.path).stdout)
+            assert command("status", mount.path, code=ExitCode.MOUNT_FAILED)[0] == f"{line}\n"
+            assert line in command("status")[0].splitlines()
+            facts = json.loads(command("status", "--json", mount.path)[0])
             assert (facts["state"], facts["source"]) == ("dead", vehicle.source)
-            mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
-            assert str(mount.path) not in mount.run(*STATUS).stdout
+            command("umount", mount.path)
+            assert str(mount.path) not in command("status")[0]
         finally:
             abort_mount(mount.path)
         assert watch.wait(COMMAND_TIMEOUT) == ExitCode.MOUNT_FAILED
@@ -150,7 +150,7 @@ def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
         for name in ("HOME", "XDG_RUNTIME_DIR"):
             elsewhere.setenv(name, str(field.local(name)))
         mount.start()
-    assert mount.run(*STATUS).stdout.count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
+    assert command("status")[0].count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
 
 
 def by_nobody(mount: Mount, *argv: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:

@@ -26,8 +26,8 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
 from tests.support import terminal
-from tests.support.mounts import COMMAND_TIMEOUT, wait_until
-from tests.support.mounts import mavftpfs as run
+from tests.support.mounts import COMMAND_TIMEOUT, mavftpfs, wait_until
+from tests.support.mounts import command as run
 from tests.support.places import start_place
 from tests.support.vehicles import HOST, PROJECT, SimVehicle, free_udp_port
 
@@ -484,7 +484,7 @@ def test_a_port_of_a_mount_that_cannot_share_it_is_said_by_its_name(
 def test_who_waits_for_a_vehicle_is_told_so(command: str, tmp_path: Path) -> None:
     source = f"udpin:{HOST}:{free_udp_port()}"
     local = [] if command == "scan" else [tmp_path]
-    said = run(command, "-o", "connect_timeout=2", source, *local, code=2)[1]
+    said = mavftpfs(command, "-o", "connect_timeout=2", source, *local, code=2)[1]
     first, last = said.splitlines()
     assert first == f"mavftpfs: waiting for a heartbeat on {source} (2 s)"
     assert last.startswith(f"mavftpfs: no vehicle on {source} within 2 s")

@@ -15,7 +15,7 @@ from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.mount.test_writing_ends import QUICK, write_to_nobody
 from tests.support.mounts import Mount, wait_until
-from tests.support.mounts import mavftpfs as run
+from tests.support.mounts import command as run
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import mavftpfs
+from tests.support.mounts import command
 from tests.support.places import FOLDERS, NO_RENAME, start_place
 from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
@@ -160,22 +160,22 @@ def test_many_writers_at_once(twins: Twins, brought: Path) -> None:
 def test_put_mv_and_rm_without_a_mount(field: Field, tiny_tree: Path) -> None:
     card, local = field.local("card"), field.local("twin")
     source = field.mavsdk(card).source
-    said, _ = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", "/")
+    said, _ = command("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", "/")
     count = len(list((tiny_tree / "sizes").iterdir())) + 1
     assert said.count(", verified by size") == count
     assert said.count(", verified by size and CRC32\n") == count - 1, "one is empty"
     argv = [sys.executable, "-m", "mavftpfs", "put", source, "-", "/from_stdin"]
     subprocess.run(argv, input=b"piped", check=True, capture_output=True, cwd=PROJECT, timeout=60)
     assert (card / "from_stdin").read_bytes() == b"piped"
-    mavftpfs("rm", source, "/from_stdin")
-    mavftpfs("mkdir", "-p", source, "/new/deep")
-    mavftpfs("mv", source, "/README.txt", "mftp:///new/deep")
-    mavftpfs("rm", "-r", source, "/sizes/1.bin", "/sizes/239.bin")
+    command("rm", source, "/from_stdin")
+    command("mkdir", "-p", source, "/new/deep")
+    command("mv", source, "/README.txt", "mftp:///new/deep")
+    command("rm", "-r", source, "/sizes/1.bin", "/sizes/239.bin")
     shutil.copytree(tiny_tree / "sizes", local / "sizes")
     (local / "new/deep").mkdir(parents=True)
     shutil.copy(tiny_tree / "README.txt", local / "new/deep/README.txt")
     for name in ("1.bin", "239.bin"):
         (local / "sizes" / name).unlink()
     subprocess.run(["diff", "-r", local, card], check=True, timeout=30)
-    mavftpfs("rm", "-r", source, "/new", "/sizes")
+    command("rm", "-r", source, "/new", "/sizes")
     assert list(card.iterdir()) == []

@@ -19,7 +19,7 @@ from mavftpfs.client import control
 from mavftpfs.client.files import session_on
 from mavftpfs.shared.errors import MavftpfsError
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, wait_until
+from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, wait_until
 from tests.support.trees import content
 from tests.support.vehicles import Process, SimVehicle
 
@@ -94,14 +94,14 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
         assert mount.errno_of(code, mount.path / "APM") == "EROFS", code
     assert mount.run("cat", mount.path / "APM/old.txt").stdout == "old\n"
     assert (card / "APM" / "old.txt").read_text() == "old\n"
-    status = json.loads(mavftpfs("status", mount.path, "--json")[0])
+    status = json.loads(command("status", mount.path, "--json")[0])
     assert status["vehicle"]["armed"] is True
     assert (status["held"]["files"], status["held"]["bytes"]) == (1, taken)
     (transfer,) = status["transfers"]
     assert (transfer["path"], transfer["size"]) == ("/APM/flight.bin", taken)
     assert (transfer["direction"], transfer["state"]) == ("write", "waiting")
     assert 0 <= transfer["done"] < taken
-    assert "flight.bin" in mavftpfs("status", mount.path)[0]
+    assert "flight.bin" in command("status", mount.path)[0]
     wait_until("the log says so", lambda: "is armed" in mount.alive().text())
     vehicle.send_signal(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
@@ -203,7 +203,7 @@ def test_what_a_killed_daemon_held_is_named_by_umount_and_by_the_next_mount_in_t
     _, refused = mavftpfs(vehicle.source, mount.path, code=3)
     assert "is a dead mount whose program is gone" in refused
     assert "1 file(s) did not reach the vehicle when a mount was killed" in refused
-    _, told = mavftpfs("umount", mount.path, code=4)
+    _, told = command("umount", mount.path, code=4)
     assert "1 file(s) did not reach the vehicle" in told
     assert not mounted_at(mount.path)
     vehicle.resume()
@@ -211,7 +211,7 @@ def test_what_a_killed_daemon_held_is_named_by_umount_and_by_the_next_mount_in_t
         place = recovered(mavftpfs(vehicle.source, mount.path)[1])
         assert state_home in place.parents
         assert (place / "lost.bin").read_bytes() == data.read_bytes()
-        mavftpfs("umount", mount.path)
+        command("umount", mount.path)
     finally:
         abort_mount(mount.path)
 
@@ -304,7 +304,7 @@ def test_a_put_that_is_refused_leaves_nothing_behind(
     vehicle = field.sim(field.local("card"), "px4-nuttx")
     state = field.local("state")
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
-    assert "protected" in mavftpfs("put", vehicle.source, data, "/outside-its-card", code=4)[1]
+    assert "protected" in command("put", vehicle.source, data, "/outside-its-card", code=4)[1]
     assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
 
 
