@@ -23,7 +23,7 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from tests.mount.conftest import Field
 from tests.support.flown import PARAMETERS
 from tests.support.mounts import Mount, command, hub_of, wait_until
-from tests.support.vehicles import HOST, PROJECT, Process, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, Process, Program, free_udp_port
 
 CONTENT = random.Random(1).randbytes(15_000)
 OURS = 254
@@ -31,27 +31,27 @@ KEY = bytes(range(32))
 STATION = Address(255, 190)
 
 
-class Flown(Process):
+class Flown(Program):
     """A vehicle that a ground station can fly. record: each frame on its link."""
 
     def __init__(self, field: Field, root: Path, link: str, *options: str) -> None:
         folder = field.local("vehicle")
         self.record = folder / "frames"
         words = ["--link", link, "--record", str(self.record), "--telemetry", "1000", *options]
-        argv = [sys.executable, "-m", "tests.support.flown", str(root), *words]
+        argv = ["tests.support.flown", str(root), *words]
         super().__init__("flown", argv, folder)
         field.own(self)
         wait_until("the vehicle speaks", lambda: bool(self.output.read_text()))
         self.source = self.output.read_text().split()[1]
 
 
-class Station(Process):
+class Station(Program):
     """A real ground station."""
 
     def __init__(self, field: Field, program: str, port: int, *words: str) -> None:
         folder = field.local("station")
         self.record = folder / "frames"
-        argv = [sys.executable, "-m", f"tests.support.{program}", str(port), *words]
+        argv = [f"tests.support.{program}", str(port), *words]
         if program == "station":
             argv += ["--record", str(self.record)]
         super().__init__(program, argv, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,9 @@ def test_a_mount_that_fails_takes_no_news_away(
     dead.close()
     source = field.sim(field.local("card")).source
     failing = Mount(source, field.local("mnt"), field.local("out"), ("root=/nothing",))
-    ended = subprocess.run(failing.argv(), capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-m", *failing.argv()], capture_output=True, text=True, timeout=60, check=False
+    )
     assert ended.returncode == ExitCode.USAGE, ended.stderr
     assert "earlier mount" not in ended.stderr
     assert (dead.path / "000001.data").read_bytes() == b"held"

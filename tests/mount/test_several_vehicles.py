@@ -24,7 +24,7 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
 from tests.support.mounts import PATIENCE, Mount, command, mavftpfs, mounted_at, wait_until
-from tests.support.vehicles import HOST, PROJECT, Process, SimVehicle, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, Program, SimVehicle, free_udp_port
 
 PROFILES = {1: "px4", 2: "ardupilot5", 3: "mavsdk"}
 
@@ -227,8 +227,8 @@ def test_a_component_is_looked_for_when_it_is_named(field: Field, fleet: Fleet) 
     (card / "photo.jpg").write_bytes(b"photo" * 1000)
     record = field.local("record") / "frames"
     words = ["--system", "1", "--component", "100", "--link", f"udpout:{HOST}:{fleet.port}"]
-    argv = [sys.executable, "-m", "tests.support.flown", str(card), "--record", str(record), *words]
-    camera = Process("camera", [*argv, "--telemetry", "500"], field.local("output"))
+    argv = ["tests.support.flown", str(card), "--record", str(record), *words]
+    camera = Program("camera", [*argv, "--telemetry", "500"], field.local("output"))
     try:
         mounts = mount_all(fleet)
         mounts.await_up("1")

@@ -8,6 +8,9 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -16,7 +19,7 @@ from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, command, wait_until
-from tests.support.vehicles import PROJECT, Process, free_udp_port
+from tests.support.vehicles import PROJECT, Program, free_udp_port
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
@@ -60,8 +63,8 @@ def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tr
 def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     ports = (vehicle.vehicle_port, free_udp_port(), free_udp_port())
-    words = [sys.executable, "-m", "tests.support.proxy", *map(str, ports)]
-    fanout = Process("fanout", words, field.local("fanout"))
+    words = ["tests.support.proxy", *map(str, ports)]
+    fanout = Program("fanout", words, field.local("fanout"))
     try:
         mount = field.mount(f"udpin:127.0.0.1:{ports[1]}")
         other = (sys.executable, "-m", "mavftpfs", "ls", f"udpin:127.0.0.1:{ports[2]}", "/")
@@ -153,22 +156,27 @@ def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
     assert command("status")[0].count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
 
 
+@pytest.fixture
+def open_field() -> Iterator[Field]:
+    """A field in a directory that other users may enter; they may not enter those of pytest."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name, ExitStack() as stack:
+        Path(name).chmod(0o755)
+        field = Field(Path(name))
+        stack.callback(field.close)
+        yield field
+
+
 def by_nobody(mount: Mount, *argv: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run a command as another user, who may reach the mountpoint: pytest makes directories that only their
-    owner enters, and each run of it closes the outermost one again."""
-    for path in mount.path.parents:
-        if path == Path("/tmp"):
-            break
-        path.chmod(0o755)
+    """Run a command as another user."""
     return mount.run(*NOBODY, *argv, cwd=Path("/"), code=code)
 
 
 @pytest.mark.holds("promise 10")
 def test_another_user_is_told_in_a_line(
-    field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
+    open_field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """He may neither unmount it nor read the state directory, which a careless su left in his environment."""
-    mount = field.mount(field.sim(small_tree).source, "allow_other")
+    mount = open_field.mount(open_field.sim(small_tree).source, "allow_other")
     state = mount.folder / "state"
     state.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
@@ -189,7 +197,7 @@ def test_another_user_is_told_in_a_line(
     assert f"mounted on {mount.path}" in by_nobody(mount, *own, "scan", mount.source).stdout
 
 
-def test_another_user_does_not_see_what_he_may_not_read(field: Field, small_tree: Path) -> None:
-    mount = field.mount(field.sim(small_tree).source)
+def test_another_user_does_not_see_what_he_may_not_read(open_field: Field, small_tree: Path) -> None:
+    mount = open_field.mount(open_field.sim(small_tree).source)
     assert str(mount.path) not in by_nobody(mount, *STATUS).stdout
     by_nobody(mount, *STATUS, mount.path, code=ExitCode.MOUNT_FAILED)

@@ -13,7 +13,7 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
 from tests.support.places import FOLDERS, OPTIONS
-from tests.support.vehicles import HOST, Process, free_udp_port
+from tests.support.vehicles import HOST, Program, free_udp_port
 
 COPIER = """
 import json, os, sys
@@ -67,8 +67,8 @@ def test_two_mounts_at_once_confirm_nothing_wrong(field: Field, kind: str) -> No
     card.mkdir(parents=True, exist_ok=True)
     (card / "shared.bin").write_bytes(b"shared" * 2000)
     ports = [free_udp_port() for _ in range(3)]
-    argv = [sys.executable, "-m", "tests.support.proxy", *map(str, ports)]
-    router = Process("router", argv, field.local("router"))
+    argv = ["tests.support.proxy", *map(str, ports)]
+    router = Program("router", argv, field.local("router"))
     vehicle = field.sim(root, kind, link=f"udpout:{HOST}:{ports[0]}")
     vehicle.left_alone = True  # each may have taken the other's session
     options = (*OPTIONS.get(kind, ()), "op_deadline=8")

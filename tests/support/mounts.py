@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 from mavftpfs.cli import main, ports
 from mavftpfs.client.control import ControlError, ask, find_socket, own_directories
 from tests.support.logs import assert_clean, suspects
-from tests.support.vehicles import PROJECT, Process
+from tests.support.vehicles import PROJECT, Process, Program
 
 COMMAND_TIMEOUT = 120.0
 END_TIMEOUT = 60.0
@@ -127,7 +127,7 @@ def processes_in(path: Path) -> list[int]:
 
 
 class Mount:
-    """`python -m mavftpfs SOURCE MOUNTPOINT -f`, ended and judged by `finish`."""
+    """`mavftpfs SOURCE MOUNTPOINT -f`, ended and judged by `finish`."""
 
     def __init__(
         self, source: str, path: Path, folder: Path, options: Sequence[str] = (), argv: Sequence[str] = ()
@@ -141,10 +141,9 @@ class Mount:
         self.process: Process | None = None
 
     def argv(self) -> list[str]:
-        """Return the command line."""
-        base = [sys.executable, "-W", "default", "-m", "mavftpfs", self.source, str(self.path), "-f"]
+        """Return the module that mounts, and the words for it."""
         options = ["-o", ",".join(self.options)] if self.options else []
-        return [*base, *options, *self.extra]
+        return ["mavftpfs.__main__", self.source, str(self.path), "-f", *options, *self.extra]
 
     def start(self) -> None:
         """Start it and wait until it serves; a daemon that ends instead fails the test."""
@@ -153,7 +152,7 @@ class Mount:
 
     def begin(self) -> None:
         """Start it."""
-        self.process = Process("mount", self.argv(), self.folder)
+        self.process = Program("mount", self.argv(), self.folder)
 
     def await_serving(self) -> None:
         """Wait until it serves; a daemon that ends instead fails the test."""

@@ -10,12 +10,12 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.support.forked import Forked
 from tests.support.logs import assert_clean
 
 HOST = "127.0.0.1"
@@ -80,10 +80,13 @@ class Process:
         self.name = name
         self.log = folder / f"{name}.log"
         self.output = folder / f"{name}.out"
+        self.log.touch()
+        self.output.touch()
+        self.popen = self._started(argv)
+
+    def _started(self, argv: Sequence[str]) -> subprocess.Popen[bytes] | Forked:
         with self.log.open("ab") as log, self.output.open("ab") as output:
-            self.popen = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=log, cwd=PROJECT
-            )
+            return subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=log, cwd=PROJECT)
 
     @property
     def running(self) -> bool:
@@ -131,6 +134,13 @@ class Process:
         return self.log.read_text(errors="replace") + self.output.read_text(errors="replace")
 
 
+class Program(Process):
+    """The same for a Python program; argv: its module, and the words for it."""
+
+    def _started(self, argv: Sequence[str]) -> Forked:
+        return Forked(argv[0], argv[1:], self.output, self.log, PROJECT)
+
+
 class UdpVehicle:
     """What both kinds of vehicle share: a port of the mount, a process, perhaps a bad link between."""
 
@@ -151,15 +161,14 @@ class UdpVehicle:
         return f"udpin:{HOST}:{self.client_port}"
 
     def argv(self) -> list[str]:
-        """Return the command line of the vehicle."""
+        """Return the vehicle's module, and the words for it."""
         raise NotImplementedError
 
     def start(self) -> None:
         if self.bad_link and self.proxy is None:
             ports = [str(self.vehicle_port), str(self.client_port)]
-            proxy = [sys.executable, "-m", "tests.support.proxy", *ports, *self.bad_link]
-            self.proxy = Process("proxy", proxy, self.folder)
-        self.process = Process(self.name, self.argv(), self.folder)
+            self.proxy = Program("proxy", ["tests.support.proxy", *ports, *self.bad_link], self.folder)
+        self.process = Program(self.name, self.argv(), self.folder)
 
     def kill(self) -> None:
         if self.process is not None:
@@ -212,7 +221,7 @@ class MavsdkVehicle(UdpVehicle):
 
     def argv(self) -> list[str]:
         url = f"udpout://{HOST}:{self.vehicle_port}"
-        return [sys.executable, "-m", "tests.support.mavsdk_server", str(self.root), url]
+        return ["tests.support.mavsdk_server", str(self.root), url]
 
 
 class SimVehicle(UdpVehicle):
@@ -248,7 +257,7 @@ class SimVehicle(UdpVehicle):
 
     def argv(self) -> list[str]:
         link = self.link or f"udpout:{HOST}:{self.vehicle_port}"
-        base = [sys.executable, "-m", "mavftpfs", "sim", str(self.root)]
+        base = ["mavftpfs.__main__", "sim", str(self.root)]
         return [*base, "--profile", self.profile, "--link", link, *self.options]
 
     def check_end(self, process: Process) -> None:
