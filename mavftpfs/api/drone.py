@@ -242,7 +242,7 @@ class Drone:
         recursive: bool = False,
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Fetch a file, or with `recursive` a directory, proven; return what is here now."""
+        """Fetch a file, or with `recursive` a directory, proven; return the local files."""
 
         async def work() -> list[Path]:
             return await self._drone.get(path, local, recursive=recursive, verify=verify)

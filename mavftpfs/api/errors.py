@@ -27,12 +27,12 @@ class NotDelivered(OSError):
     on_vehicle: bool | None = None
 
 
-def os_error(error: MavftpfsError) -> Exception:
-    """Return the error that a program gets in place of one of ours.
+def os_error(error: MavftpfsError, text: str = "") -> Exception:
+    """Return the error that a program gets in place of one of ours; with its text, unless another is given.
 
     A UsageError stays one, which is a ValueError, unless the operating system is behind it.
     """
-    number, text = _number(error), readable(str(error))
+    number, text = _number(error), readable(text or str(error))
     if isinstance(error, errors.NotDelivered):
         told = _undelivered(type(OSError(number, text)))(number, f"{text} ({whereabouts(error.there)})")
         told.on_vehicle = error.there

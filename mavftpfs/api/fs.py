@@ -40,8 +40,6 @@ class _Connection:
     def used(self) -> Iterator[Drone]:
         """Give the drone to the body, connected."""
         with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
             if self._drone is None or self._drone.closed:
                 self._drone = self._connect()
             self._users += 1
@@ -58,6 +56,8 @@ class _Connection:
         return self._drone is not None
 
     def _close_later(self) -> None:
+        if self._timer is not None:  # else each call of many threads would leave one
+            self._timer.cancel()
         self._timer = threading.Timer(self._idle, self.close)
         self._timer.daemon = True
         self._timer.start()

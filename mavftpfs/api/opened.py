@@ -10,7 +10,7 @@ import trio
 from mavftpfs.api.errors import translated, whereabouts
 from mavftpfs.client.files import File, written
 from mavftpfs.client.mounted import CLOSING_TIME, WITHDRAWAL_TIME
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import MavftpfsError, NotDelivered
 
 log = logging.getLogger("mavftpfs.api")
 
@@ -22,8 +22,8 @@ class Opened:
     """An open file. All methods raise OSErrors (see api.errors). All but `size` run in the event loop.
 
     Attributes:
-        name: for people. writable: whether it may be changed by this. there: after a close that was
-            interrupted, as NotDelivered.on_vehicle.
+        name: for people. writable: whether it may be changed by this. there: after a close that failed, as
+            NotDelivered.on_vehicle.
     """
 
     def __init__(self, name: str, file: File, *, writable: bool, forget: Callable[[Opened], None]) -> None:
@@ -34,6 +34,7 @@ class Opened:
         self._forget = forget
         self._failure: BaseException | None = None
         self._closed = False
+        self._abandoned = False
         self._changed = False
         self.there: bool | None = None
 
@@ -60,7 +61,7 @@ class Opened:
             offset += len(data)
         return b"".join(parts)
 
-    async def write(self, offset: int | None, data: bytes) -> int:
+    async def write(self, offset: int | None, data: bytes | memoryview) -> int:
         """Take all of `data`, at the end if no offset is given; return the offset behind it."""
         with translated():
             self._changed = True
@@ -70,6 +71,10 @@ class Opened:
             except BaseException as exc:
                 self._failure = exc
                 raise
+
+    def fail(self, error: BaseException) -> None:
+        """Have `close` withdraw what was written, because of this error."""
+        self._failure = self._failure or error
 
     async def truncate(self, size: int) -> None:
         """Cut or extend it."""
@@ -85,9 +90,11 @@ class Opened:
         """Deliver what was written; or have nothing of it on the card, and raise NotDelivered.
 
         Raises:
-            NotDelivered.
+            NotDelivered. Also if the file was abandoned.
         """
         if self._closed:
+            with translated():
+                self._require_not_abandoned()
             return
         self._closed = True
         self._forget(self)
@@ -109,15 +116,18 @@ class Opened:
         if self._failure is not None:
             raise MavftpfsError(f"{self.name}: writing it was interrupted")
 
+    def _require_not_abandoned(self) -> None:
+        if self._abandoned and self.writable:
+            raise NotDelivered(f"{self.name} was given up before it was closed", there=self.there)
+
     async def abandon(self) -> None:
         """Close it, and withdraw what was written; log it if that cannot be done. Twice is harmless. Raises
         no MavftpfsError."""
         if self._closed:
             return
-        self._closed = True
+        self._closed = self._abandoned = True
         self._forget(self)
-        there: bool | None = None
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
-            there = await self._file.give_up()
-        if self._changed and there is not False:
+            self.there = await self._file.give_up()
+        if self._changed and self.there is not False:
             log.error("%s: %s", self.name, whereabouts(None))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, ValuesView
+from collections.abc import Callable, Iterator, Mapping
 from numbers import Integral, Real
 
 from mavftpfs.client import parameters as client
@@ -53,48 +53,41 @@ async def set_values(session: Session, values: Mapping[str, Number]) -> None:
     try:
         await client.set_values(session, wish.changes, Progress())
     except NotTaken as exc:
-        told = [line.removeprefix("# ") for line in await client.last_error(session)]
-        raise NotTaken("; ".join([str(exc), *told])) from exc
+        raise NotTaken("; ".join(await client.last_error(session)) or str(exc)) from exc
 
 
 class Params(Mapping[str, Number]):
-    """The parameters of a Drone. Reading one asks the vehicle for all, which takes a moment: use
-    `dict(drone.params)` for many. Setting one, or several by `update`, returns when the new values were read
-    back."""
+    """The parameters of a Drone, as they were at the first look. `drone.params` is a new one each time, which
+    asks the vehicle again. Setting one, or several by `update`, returns when the new values were read back.
+    """
 
     def __init__(
         self, read: Callable[[], dict[str, Number]], write: Callable[[Mapping[str, Number]], None]
     ) -> None:
         self._read = read
         self._write = write
+        self._seen: dict[str, Number] | None = None
+
+    def _all(self) -> dict[str, Number]:
+        if self._seen is None:
+            self._seen = self._read()
+        return self._seen
 
     def __getitem__(self, name: str) -> Number:
         """Return a value. Raises KeyError."""
-        return self._read()[name]
+        return self._all()[name]
 
     def __setitem__(self, name: str, value: Number) -> None:
         """Set a value; see update."""
-        self._write({name: value})
+        self.update({name: value})
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names, in the vehicle's order."""
-        return iter(self._read())
+        return iter(self._all())
 
     def __len__(self) -> int:
         """Return how many there are."""
-        return len(self._read())
-
-    def keys(self) -> KeysView[str]:
-        """Return the names, by one look."""
-        return self._read().keys()
-
-    def items(self) -> ItemsView[str, Number]:
-        """Return names and values, by one look."""
-        return self._read().items()
-
-    def values(self) -> ValuesView[Number]:
-        """Return the values, by one look."""
-        return self._read().values()
+        return len(self._all())
 
     def update(self, values: Mapping[str, Number]) -> None:
         """Set several at once.
@@ -103,4 +96,5 @@ class Params(Mapping[str, Number]):
             UsageError (a ValueError), OSError of EINVAL: a name or value is invalid, and nothing is set.
             OSError: the vehicle did not take some, and the text names them; EROFS: it is armed.
         """
+        self._seen = None
         self._write(values)

@@ -157,6 +157,8 @@ class LoopThread(Generic[T]):
             self._start(call)
             self._wait(call)
             return call.result()
+        except trio.RunFinishedError:
+            raise self._closed() from None
         finally:
             self._calls.discard(call)
 
@@ -197,13 +199,10 @@ class LoopThread(Generic[T]):
             raise RuntimeError("a call from the connection's own thread would wait for itself")
 
     def _start(self, call: _Call[Any]) -> None:
-        token, nursery = self._token, self._nursery
+        """Raises: trio.RunFinishedError."""
+        token = self._token
         assert token is not None
-        assert nursery is not None
-        try:
-            token.run_sync_soon(self._spawn, call)
-        except trio.RunFinishedError:
-            raise self._closed() from None
+        token.run_sync_soon(self._spawn, call)
 
     def _spawn(self, call: _Call[Any]) -> None:
         assert self._nursery is not None

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from mavftpfs.api.errors import NotDelivered, whereabouts
 from mavftpfs.api.opened import Opened
-from mavftpfs.api.portal import Portal
+from mavftpfs.api.portal import Closed, Portal
 
 log = logging.getLogger("mavftpfs.api")
 
@@ -140,7 +140,11 @@ class RawFile(_Ending, io.RawIOBase):
         taken = bytes(memoryview(data))  # a copy: the program may interrupt the call, and change the buffer
         self._require(self._mode.writes, "writable")
         at = None if self._mode.plain[0] == "a" else self._at
-        self._at = self._portal.call(self._opened.write, at, taken)
+        try:
+            self._at = self._portal.call(self._opened.write, at, taken)
+        except BaseException as exc:  # it may be written already, and Python's buffer will write it again
+            self._opened.fail(exc)
+            raise
         return len(taken)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
@@ -179,6 +183,9 @@ class RawFile(_Ending, io.RawIOBase):
         super().close()
         try:
             self._portal.call(self._opened.close)
+        except Closed:
+            if self._mode.writes:
+                raise
         except KeyboardInterrupt as exc:
             if self._mode.writes:
                 exc.add_note(f"{self.name} was not closed: {whereabouts(self._opened.there)}")

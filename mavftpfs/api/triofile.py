@@ -24,6 +24,8 @@ class AsyncFile:
     def __init__(self, wrapped: IO[Any], opened: Opened) -> None:
         self.wrapped = wrapped
         self._opened = opened
+        # Of its own: the thread waits for the event loop, which needs threads of the common limit.
+        self._limit = trio.CapacityLimiter(1)
 
     @property
     def name(self) -> str:
@@ -37,44 +39,44 @@ class AsyncFile:
 
     async def read(self, size: int = -1) -> Any:
         """See io.TextIOBase.read and io.BufferedIOBase.read."""
-        return await _in_thread(self.wrapped.read, size)
+        return await self._in_thread(self.wrapped.read, size)
 
     async def readline(self, size: int = -1) -> Any:
         """See io.IOBase.readline."""
-        return await _in_thread(self.wrapped.readline, size)
+        return await self._in_thread(self.wrapped.readline, size)
 
     async def readlines(self) -> list[Any]:
         """See io.IOBase.readlines."""
-        return await _in_thread(self.wrapped.readlines)
+        return await self._in_thread(self.wrapped.readlines)
 
     async def readinto(self, buffer: Any) -> int:
         """See io.BufferedIOBase.readinto."""
         readinto: Callable[[Any], int] = self.wrapped.readinto  # type: ignore[attr-defined]
-        return await _in_thread(readinto, buffer)
+        return await self._in_thread(readinto, buffer)
 
     async def write(self, data: Any) -> int:
         """See io.TextIOBase.write and io.BufferedIOBase.write."""
-        return await _in_thread(self.wrapped.write, data)
+        return await self._in_thread(self.wrapped.write, data)
 
     async def writelines(self, lines: Iterable[Any]) -> None:
         """See io.IOBase.writelines."""
-        await _in_thread(self.wrapped.writelines, lines)
+        await self._in_thread(self.wrapped.writelines, lines)
 
     async def seek(self, offset: int, whence: int = 0) -> int:
         """See io.IOBase.seek."""
-        return await _in_thread(self.wrapped.seek, offset, whence)
+        return await self._in_thread(self.wrapped.seek, offset, whence)
 
     async def tell(self) -> int:
         """See io.IOBase.tell."""
-        return await _in_thread(self.wrapped.tell)
+        return await self._in_thread(self.wrapped.tell)
 
     async def truncate(self, size: int | None = None) -> int:
         """See io.IOBase.truncate."""
-        return await _in_thread(self.wrapped.truncate, size)
+        return await self._in_thread(self.wrapped.truncate, size)
 
     async def flush(self) -> None:
         """Hand on what is buffered; it is delivered by aclose."""
-        await _in_thread(self.wrapped.flush)
+        await self._in_thread(self.wrapped.flush)
 
     async def aclose(self) -> None:
         """Return when what was written is on the card, checked.
@@ -83,7 +85,7 @@ class AsyncFile:
             NotDelivered: it is not; `on_vehicle` says what is there.
         """
         try:
-            await _in_thread(self.wrapped.close)
+            await self._in_thread(self.wrapped.close)
         except trio.Cancelled:
             await self._opened.abandon()
             raise
@@ -109,6 +111,5 @@ class AsyncFile:
             raise StopAsyncIteration
         return line
 
-
-async def _in_thread(function: Callable[..., ResultT], *args: Any) -> ResultT:
-    return await trio.to_thread.run_sync(function, *args)
+    async def _in_thread(self, function: Callable[..., ResultT], *args: Any) -> ResultT:
+        return await trio.to_thread.run_sync(function, *args, limiter=self._limit)

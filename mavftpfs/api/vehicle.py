@@ -33,7 +33,6 @@ from mavftpfs.client.proof import Verify
 from mavftpfs.client.source import target_of
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound, UsageError
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
-from mavftpfs.shared.readable import name_text
 
 log = logging.getLogger("mavftpfs.api")
 logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
@@ -256,6 +255,8 @@ class Drone:
             else:
                 await self._files.unlink(wanted)
 
+    unlink = remove
+
     async def rename(self, old: PathLike, new: PathLike) -> None:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
         with translated():
@@ -295,9 +296,10 @@ class Drone:
         Raises:
             NotDelivered: it is not; see there.
         """
+        view = memoryview(data).cast("B")
         opened = await self.open_raw(path, "w")
         try:
-            await opened.write(0, data)
+            await opened.write(0, view)
         finally:
             await opened.close()
 
@@ -319,7 +321,7 @@ class Drone:
         recursive: bool = False,
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Fetch a file, or with `recursive` a directory, proven; return what came.
+        """Fetch a file, or with `recursive` a directory, proven; return the local files.
 
         A file goes into `local` if that is a directory, else it gets that name. A directory goes into
         `local`.
@@ -336,7 +338,7 @@ class Drone:
                 raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True") from exc
 
         outcome = await self._download(verify, work)
-        return [fetched.wanted.local for fetched in outcome.fetched]
+        return [*(fetched.wanted.local for fetched in outcome.fetched), *(one.local for one in outcome.here)]
 
     async def sync(
         self,
@@ -367,14 +369,9 @@ class Drone:
         fetcher = Fetcher(self._session, Progress(), verify)
         with translated():
             await work(download.Downloads(fetcher, outcome, _ignore, _ignore))
-            for path, error in outcome.failed.items():
-                count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
-                failure = os_error(error)
-                failure.args = (
-                    failure.args[0],
-                    f"{name_text(path)}: {failure.args[-1]}; {count} of {of} files are here",
-                )
-                raise failure from error
+        for path, error in outcome.failed.items():
+            count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
+            raise os_error(error, f"{download.named(path, error)}; {count} of {of} files are here") from error
         return outcome
 
     async def put(

@@ -18,6 +18,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DataUnproven,
+    InvalidMove,
     IsADirectory,
     LocalProtocolError,
     NotADirectory,
@@ -364,8 +365,10 @@ async def copy(files: Files, old: bytes, new: bytes) -> None:
     """Copy a file by way of this computer, which verifies it.
 
     Raises:
-        NotDelivered. Else as Files.open.
+        InvalidMove: onto itself. NotDelivered. Else as Files.open.
     """
+    if old == new:  # to open the new one for writing would empty the old one
+        raise InvalidMove(f"{old!r} cannot be copied onto itself")
     async with reading(files, old) as source:
         file = await emptied(files, new)
         async with written(file):

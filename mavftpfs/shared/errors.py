@@ -123,7 +123,7 @@ class DirectoryNotEmpty(MavftpfsError):
 
 
 class InvalidMove(MavftpfsError):
-    """A directory cannot become a part of itself (EINVAL)."""
+    """A directory cannot become a part of itself, nor a file a copy of itself (EINVAL)."""
 
 
 class CrossDevice(MavftpfsError):

@@ -7,6 +7,7 @@ import errno
 import os
 import socket
 import threading
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy
 import pytest
 
 import mavftpfs
+from mavftpfs.api.params import Params
 from mavftpfs.client.mounted import MountedFiles
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
@@ -89,6 +91,7 @@ CALLS: dict[str, Call] = {
     "truncate nothing": lambda on, d: on.truncate(d + "/nothing", 3),
     "text": lambda on, d: (on.write_text(d + "/n", "größe"), on.read_text(d + "/n")),
     "bytes": lambda on, d: (on.write_bytes(d + "/a", DATA), on.read_bytes(d + "/a") == DATA),
+    "an array": lambda on, d: (on.write_bytes(d + "/n", array("i", [1, 2])), on.read_bytes(d + "/n")),
     "read nothing": lambda on, d: on.read_bytes(d + "/nothing"),
     "read a directory": lambda on, d: on.read_bytes(d + "/e"),
     "open a directory": lambda on, d: on.open(d + "/e").close(),
@@ -204,6 +207,35 @@ def test_get_and_put(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None
         shared.copy(f"{card.name}/d/e/f", f"{card.name}/nothing/")
 
 
+def test_what_is_here_already_is_returned_by_get_too(
+    shared: mavftpfs.Drone, card: Path, tmp_path: Path
+) -> None:
+    (card / "f").write_bytes(DATA)
+    for _ in range(2):
+        assert shared.get(f"{card.name}/f", tmp_path / "f") == [tmp_path / "f"]
+
+
+@pytest.mark.parametrize(("blocked", "kind"), [("d/x", mavftpfs.UsageError), ("d/x.part", IsADirectoryError)])
+def test_get_says_what_did_not_come_and_how_much_did(
+    shared: mavftpfs.Drone, card: Path, tmp_path: Path, blocked: str, kind: type[Exception]
+) -> None:
+    (card / "d").mkdir()
+    for name in ("x", "y"):
+        (card / "d" / name).write_bytes(DATA)
+    (tmp_path / blocked).mkdir(parents=True)
+    with pytest.raises(kind) as caught:
+        shared.get(f"{card.name}/d", tmp_path, recursive=True)
+    assert str(caught.value).endswith("irectory; 1 of 2 files are here")
+
+
+@pytest.mark.holds("promise 3")
+def test_a_file_is_not_copied_onto_itself(shared: mavftpfs.Drone, card: Path) -> None:
+    (card / "f").write_bytes(DATA)
+    with pytest.raises(OSError, match="onto itself"):
+        shared.copy(f"/{card.name}/f", f"{card.name}//f")
+    assert (card / "f").read_bytes() == DATA
+
+
 def test_sync(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:
     (card / "1.ulg").write_bytes(DATA)
     assert shared.sync(tmp_path / "logs", place=card.name) == [tmp_path / "logs" / "1.ulg"]
@@ -275,6 +307,20 @@ def test_parameters(field: Field, profile: str) -> None:
             drone.params["NO_SUCH"]
 
 
+def test_a_look_at_all_parameters_is_one_look() -> None:
+    """dict() asks a mapping for each value."""
+    looks: list[int] = []
+
+    def read() -> dict[str, int | float]:
+        looks.append(1)
+        return {"A": len(looks), "B": len(looks)}
+
+    params = Params(read, print)
+    assert dict(params) == {"A": 1, "B": 1}
+    params["A"] = 5
+    assert list(params.items()) == [("A", 2), ("B", 2)]
+
+
 def test_a_vehicle_without_parameters_in_ftp(shared: mavftpfs.Drone) -> None:
     with pytest.raises(FileNotFoundError, match="no parameters in MAVLink FTP"):
         dict(shared.params)
@@ -323,15 +369,17 @@ def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
 
 
 def test_closed(field: Field) -> None:
-    vehicle = field.sim(field.local("card"))
-    drone = mavftpfs.connect(vehicle.source)
-    file = drone.open("/f", "w")
+    card = field.local("card")
+    (card / "g").touch()
+    drone = mavftpfs.connect(field.sim(card).source)
+    file, read = drone.open("/f", "w"), drone.open("/g")
     drone.close()
     drone.close()
+    read.close()
     for call in (drone.listdir, file.close):
         with pytest.raises(ValueError, match="is closed"):
             call()
-    assert list(vehicle.root.iterdir()) == []
+    assert list(card.iterdir()) == [card / "g"]
 
 
 # -- through a mount ------------------------------------------------------------------------------

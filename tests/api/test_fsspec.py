@@ -196,6 +196,26 @@ def test_threads_share_a_connection(source: str, fs: DroneFileSystem) -> None:
     assert found == 4 * [DATA]
 
 
+def test_calls_of_many_threads_leave_no_threads(source: str) -> None:
+    fs = DroneFileSystem(source, idle=600)
+
+    def work() -> None:
+        for _ in range(50):
+            fs.exists("/nothing")
+
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    wait_until("one timer is left", lambda: timers() <= 1)
+    fs.close()
+
+
+def timers() -> int:
+    return sum(isinstance(thread, threading.Timer) for thread in threading.enumerate())
+
+
 def test_a_connection_that_is_idle_is_closed_and_made_again(source: str) -> None:
     fs = DroneFileSystem(source, idle=0.5)
     file = fs.open("/d/f", "rb")

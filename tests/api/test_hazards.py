@@ -20,6 +20,7 @@ import trio
 
 import mavftpfs
 import mavftpfs.trio
+from mavftpfs.api.triofile import AsyncFile
 from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
 from tests.support.trees import content
@@ -246,6 +247,28 @@ def test_ctrl_c_while_connecting() -> None:
     wait_until("the thread ended", lambda: threading.active_count() == before)
 
 
+def test_ctrl_c_just_after_a_write_does_not_append_twice(
+    sim: SimVehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python's buffer keeps the bytes of a write that was interrupted, and writes them again at the close."""
+    with mavftpfs.connect(sim.source) as drone:
+        file = drone.open("/f", "ab")
+        file.write(NEW)
+        wait = drone._loop._wait
+
+        def wait_and_interrupt(call: Any) -> None:
+            wait(call)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(drone._loop, "_wait", wait_and_interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            file.flush()
+        monkeypatch.undo()
+        with pytest.raises(mavftpfs.NotDelivered, match="withdrawn"):
+            file.close()
+    assert on_card(sim) == {"f": OLD}
+
+
 # -- garbage --------------------------------------------------------------------------------------
 
 
@@ -391,6 +414,33 @@ async def test_the_same_for_trio(sim: SimVehicle, tmp_path: Path) -> None:
                 return
             await trio.sleep(0.1)
         raise AssertionError("it is not withdrawn")
+
+
+async def test_a_file_that_was_given_up_is_not_closed_as_if_it_were_there(sim: SimVehicle) -> None:
+    async with mavftpfs.trio.connect(sim.source) as drone:
+        file = await drone.open("/f", "wb", buffering=0)
+        await file.write(NEW)
+    with pytest.raises(mavftpfs.NotDelivered, match="given up before it was closed") as caught:
+        await file.aclose()
+    assert caught.value.on_vehicle is False
+    assert on_card(sim) == {"f": OLD}
+
+
+@pytest.mark.mount
+async def test_many_files_at_once_through_a_mount(sim: SimVehicle, field: Field) -> None:
+    """Each waits in a thread for the event loop, and that needs threads of its own: there are 40."""
+    mount = field.mount(sim.source)
+    came = []
+
+    async def read(file: AsyncFile) -> None:
+        came.append(await file.read())
+        await file.aclose()
+
+    with trio.fail_after(PATIENCE):
+        async with mavftpfs.trio.connect(str(mount.path)) as drone, trio.open_nursery() as nursery:
+            for file in [await drone.open("/f", "rb") for _ in range(50)]:
+                nursery.start_soon(read, file)
+    assert came == 50 * [OLD]
 
 
 async def test_trio_cancels_a_call(sim: SimVehicle) -> None:
