@@ -37,7 +37,7 @@ LAST_ERROR = b"last_error.txt"
 MOST = 4 << 20
 """Bytes of a file that is loaded."""
 
-_DEFAULT = re.compile(r"^(\w+),\S+ # default (\S+)$", re.MULTILINE)
+_DEFAULT = re.compile(r"^([^,#\n]+),\S+ # default (\S+)$", re.MULTILINE)
 
 
 def at_root(target: Target) -> Target:
@@ -109,7 +109,7 @@ async def split_by_component(
     told = next(iter(parse(await read_text(session, QGC))[0]), None)
     component = None if told is None else told.component
     others = [line for line in lines if line.component not in (None, component)]
-    return [line for line in lines if line not in others], others
+    return [line for line in lines if line.component in (None, component)], others
 
 
 def matching(parameters: Sequence[Parameter], patterns: Sequence[str]) -> list[Parameter]:

@@ -206,10 +206,10 @@ def _float(text: str) -> float:
 
 def _scaled(text: str, scale: float) -> int:
     number = parse_number(text)
-    scaled = number * scale
-    if not math.isfinite(scaled) or not -(2**31) <= scaled < 2**31:
+    scaled = round(number * scale) if abs(number) <= 2**31 else 2**31
+    if not -(2**31) <= scaled < 2**31:
         raise BadValue(f"{text} is no place")
-    return round(scaled)
+    return scaled
 
 
 # -- what came of it ------------------------------------------------------------------------------

@@ -129,7 +129,7 @@ def fit(kind: Kind, number: Number) -> Number:
         except OverflowError:
             raise BadValue(f"{str(number)[:20]} is too large for a 32-bit float") from None
     most = 1 << (8 * kind.width - 1)
-    if not math.isfinite(number) or number != int(number):
+    if isinstance(number, float) and not number.is_integer():
         raise BadValue(f"{number} is not a whole number, and this is {_SAID[kind]}")
     if not -most <= number < most:
         raise BadValue(f"{int(number)} does not fit {_SAID[kind]} ({-most} to {most - 1})")

@@ -196,6 +196,8 @@ def test_missions_come_back(items: list[Item]) -> None:
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 90.1 1 2 1\n", 2, "90.1 is no latitude"),
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 90 -181 2 1\n", 2, "-181 is no longitude"),
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 nan 1 2 1\n", 2, "no place"),
+        (f"QGC WPL 110\n0 0 0 16 0 0 0 0 {10**400} 1 2 1\n", 2, "no place"),
+        ("QGC WPL 110\n0 0 2 178 0 0 0 0 2147483647.6 1 2 1\n", 2, "no place"),
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 9 1 nan 1\n", 2, "nan is no height"),
         ("QGC WPL 110\n0 0 0 16 0 0 0 0 9 1 -inf 1\n", 2, "-inf is no height"),
         ("QGC WPL 110\n1 0 0 16 0 0 0 0 9 1 2 1\n", 2, "this is item 0, and its number is 1"),

@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from itertools import accumulate
+from typing import cast
 
 import pytest
 
+from mavftpfs.client.files import Files, Session
+from mavftpfs.client.parameters import read_with_defaults
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, pack_upload, unpack
 from mavftpfs.parameters.text import parse, render_all, render_changed, render_qgc
@@ -26,6 +30,7 @@ from mavftpfs.parameters.values import (
 )
 from mavftpfs.protocol.writing import Pieces
 from mavftpfs.shared.errors import RemoteProtocolError
+from tests.ops.faketree import FakeTree
 from tests.support.recordings import data_of, load_recording
 
 # --- values
@@ -79,11 +84,20 @@ def test_what_fits_a_type() -> None:
         (Kind.INT32, 2**31),
         (Kind.INT32, 2.9),
         (Kind.INT16, math.nan),
+        (Kind.INT16, -math.inf),
+        (Kind.INT32, 10**400),
         (Kind.FLOAT, 1e39),
         (Kind.FLOAT, 10**400),
     ):
         with pytest.raises(BadValue):
             fit(kind, number)
+
+
+async def test_the_default_of_each_name_is_found() -> None:
+    one = Parameter("A-B.1", Kind.INT8, 2)
+    tree = FakeTree({b"/@PARAM/param.pck": b"".join(pack_upload([one]))})
+    tree.files[b"/@PARAM/changed.parm"] = render_changed([replace(one, default=3)]).encode()
+    assert await read_with_defaults(Session(cast(Files, tree))) == [replace(one, default=3)]
 
 
 # --- packed files
