@@ -9,6 +9,7 @@ from mavftpfs.client.files import Target, mountpoint_of
 from mavftpfs.client.options import Options, with_root
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.model import ROOT
 
 
 def target_of(source: str, options: Options) -> Target:
@@ -19,6 +20,8 @@ def target_of(source: str, options: Options) -> Target:
     """
     mount = mountpoint_of(source)
     if mount is not None:
+        if options.root != ROOT:
+            raise UsageError(f"{source} is a mount: name the directory below it, not by root=")
         return Target(None, options, mount=mount)
     place = source.partition("#")[0]
     no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import trio
 
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, written
+from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, written
 from mavftpfs.client.mounted import WITHDRAWAL_TIME
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
@@ -220,18 +220,28 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     files = session.files
     beside = join(split(remote)[0], f"{BESIDE}{secrets.token_hex(4)}".encode())
     file = await files.create(beside, exclusive=True)
-    async with watched(session, beside, progress), written(file):
-        size = await _copy(source, file)
+    try:
+        async with watched(session, beside, progress), written(file):
+            size = await _copy(source, file)
+    except NotDelivered as exc:
+        if exc.there is not False:
+            await _remove(files, beside)
+        raise NotDelivered(str(exc), there=False) from exc.__cause__  # `remote` was not touched
     try:
         await files.rename(beside, remote)
     except BaseException as exc:
-        with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
-            patience.shield = True
-            await files.unlink(beside)
-        if isinstance(exc, RequestTimeout):
+        await _remove(files, beside)
+        if isinstance(exc, RequestTimeout | LinkError):
             raise NotDelivered(str(exc), there=None) from exc
         raise
     return size
+
+
+async def _remove(files: Files, path: bytes) -> None:
+    """Remove a file that is not wanted any more, if that can be done."""
+    with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
+        patience.shield = True
+        await files.unlink(path)
 
 
 async def _copy(source: BinaryIO, file: File) -> int:
@@ -249,7 +259,9 @@ async def watched(session: Session, path: bytes, progress: Progress) -> AsyncIte
     async def watch() -> None:
         while True:
             await trio.sleep(ASK_PERIOD)
-            acknowledged = (await session.acknowledged()).get(name)
+            acknowledged = None
+            with suppress(LinkError):  # if the mount is gone, the body gets the error
+                acknowledged = (await session.acknowledged()).get(name)
             if acknowledged is not None:
                 progress.at(min(acknowledged, progress.size))
                 if acknowledged >= progress.size:

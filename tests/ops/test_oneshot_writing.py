@@ -8,6 +8,7 @@ from typing import cast
 
 import pytest
 import trio
+import trio.testing
 
 from mavftpfs.client import names
 from mavftpfs.client.files import Files, Session
@@ -19,6 +20,7 @@ from mavftpfs.shared.errors import (
     DirectoryNotEmpty,
     ExitCode,
     IsADirectory,
+    LinkClosed,
     MavftpfsError,
     NotADirectory,
     NotDelivered,
@@ -29,7 +31,7 @@ from mavftpfs.shared.errors import (
     exit_code_for,
 )
 from mavftpfs.shared.model import EntryKind, split
-from tests.ops.faketree import FakeTree
+from tests.ops.faketree import FakeFile, FakeTree
 
 BIG = bytes(range(251)) * 2000
 
@@ -269,6 +271,53 @@ async def test_by_a_mount_an_error_names_the_file_and_not_what_is_written_beside
     with pytest.raises(NotDelivered) as caught:
         await put_paths(session, [batch], b"/x", Progress(), print)
     assert str(caught.value) == ("/x was not delivered: Read-only file system (the vehicle is armed)")
+
+
+@pytest.mark.parametrize(
+    ("fails", "error", "there"),
+    [
+        ("fsync", RequestTimeout("no answer"), False),
+        ("rename", RequestTimeout("no answer"), None),
+        ("rename", LinkClosed("the mount is gone"), None),
+        ("rename", ReadOnly("armed"), False),
+    ],
+)
+async def test_by_a_mount_what_is_there_is_said_of_the_file_and_not_of_what_is_written_beside(
+    local: Path, monkeypatch: pytest.MonkeyPatch, fails: str, error: MavftpfsError, there: bool | None
+) -> None:
+    """Even if all of the file beside got there at last."""
+    tree = Card({b"/x": b"old"})
+
+    def fail(name: str, path: bytes) -> None:
+        if name == fails:
+            raise error
+
+    async def give_up(file: FakeFile) -> bool:
+        file.tree.files[file.path] = file.content
+        return True
+
+    monkeypatch.setattr(FakeFile, "give_up", give_up)
+    tree.on_call = fail
+    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    batch = (local / "a", collect(local / "a", recursive=False))
+    with pytest.raises(NotDelivered) as caught:
+        await put_paths(session, [batch], b"/x", Progress(), print)
+    assert caught.value.there is there
+    assert tree.files == {b"/x": b"old"}
+
+
+async def test_a_mount_that_does_not_tell_how_far_it_is_ends_no_put(
+    local: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    tree = Card(delays={"fsync": 5.0})
+
+    async def acknowledged() -> dict[str, int]:
+        raise LinkClosed("the mount does not answer")
+
+    session = Session(cast(Files, tree), acknowledged=acknowledged, mountpoint="/mnt/drone")
+    batch = (local / "a", collect(local / "a", recursive=False))
+    await put_paths(session, [batch], b"/x", Progress(), print)
+    assert tree.files == {b"/x": BIG}
 
 
 async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> None:
