@@ -136,7 +136,7 @@ def _report_in_foreground(code: int, message: str) -> None:
     if code == 0:
         logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")
     elif message:
-        print(f"mavftpfs: {readable(message)}", file=sys.stderr)
+        say(message)
 
 
 def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:
@@ -184,11 +184,11 @@ def umount(args: argparse.Namespace) -> int:
         mountpoint.unmount(place, lazy=args.lazy)
         return max([*codes, _after_a_killed_mount()])
     except KeyboardInterrupt:
-        print("mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status", file=sys.stderr)
+        say("the mount goes on delivering, and then ends; see: mavftpfs status")
         return ExitCode.INTERRUPTED
     _wait_for_end(int(reply["pid"]))
     if reply.get("message"):
-        print(f"mavftpfs: {reply['message']}", file=sys.stderr)
+        say(reply["message"])
     return int(reply["exit_code"])
 
 
@@ -223,7 +223,7 @@ class _Delivery:
             shown = line[: shutil.get_terminal_size().columns - 1]
             print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
         else:
-            print(f"mavftpfs: {line}", file=sys.stderr, flush=True)
+            say(line)
 
     def end(self) -> None:
         """Leave the line."""
@@ -234,13 +234,11 @@ class _Delivery:
         from mavftpfs.client.leftovers import recovered_directory
         from mavftpfs.mount.farewell import DRAIN_LIMIT
 
-        print(
-            "mavftpfs: not everything is on the vehicle yet: it is delivered for at most "
-            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory()}\n"
-            "mavftpfs: Ctrl-C ends only the waiting, not the delivery",
-            file=sys.stderr,
-            flush=True,
+        say(
+            "not everything is on the vehicle yet: it is delivered for at most "
+            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory()}"
         )
+        say("Ctrl-C ends only the waiting, not the delivery")
 
 
 def _after_a_killed_mount() -> int:
@@ -248,7 +246,7 @@ def _after_a_killed_mount() -> int:
     line = left_by_killed_mounts_line()
     if not line:
         return ExitCode.OK
-    print(f"mavftpfs: {line}", file=sys.stderr)
+    say(line)
     return ExitCode.UNDELIVERED
 
 

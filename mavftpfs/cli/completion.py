@@ -14,7 +14,7 @@ from importlib.resources import files
 import shtab
 
 from mavftpfs.client.options import Choice
-from mavftpfs.mount.options import FLAGS, VALUES
+from mavftpfs.mount.options import VALUES, option_help
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -75,16 +75,10 @@ def _filling(shell: str, commands: Mapping[str, argparse.ArgumentParser]) -> Map
     values = [f"{name}={word}" for name, words in _choices().items() for word in words]
     if shell == "bash":
         paths = "|".join(f"{name}=*" for name in _LOCAL_PATHS)
-        return {"@WORDS@": " ".join(_words()), "@VALUES@": " ".join(values), "@FILES@": paths}
-    described = (shlex.quote(f"{word}\t{text}") for word, text in _words().items())
+        return {"@WORDS@": " ".join(option_help()), "@VALUES@": " ".join(values), "@FILES@": paths}
+    described = (shlex.quote(f"{word}\t{text}") for word, text in option_help().items())
     paths = " ".join(f"{name}=" for name in _LOCAL_PATHS)
     return {"@WORDS@": " ".join(described), "@VALUES@": " ".join(values), "@FILES@": paths}
-
-
-def _words() -> dict[str, str]:
-    """Return how each option begins -> what it does."""
-    flags = {name: flag.help for name, flag in FLAGS.items() if flag.help}
-    return flags | {f"{name}=": value.help for name, value in VALUES.items()}
 
 
 def _choices() -> dict[str, tuple[str, ...]]:
@@ -95,7 +89,7 @@ def _choices() -> dict[str, tuple[str, ...]]:
 def _zsh_specs() -> Iterator[str]:
     """Yield the words of each option for zsh's _values."""
     choices = _choices()
-    for word, text in _words().items():
+    for word, text in option_help().items():
         name, value, _ = word.partition("=")
         said = "".join(f"\\{letter}" if letter in "[]:" else letter for letter in text)
         wanted = (

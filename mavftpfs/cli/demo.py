@@ -1,4 +1,4 @@
-"""`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: cli, beside cli.
+"""`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: cli.
 
 It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, sed,
 diff, `mavftpfs status`), each as its own process, in one temporary directory, and leaves nothing behind: no

@@ -17,6 +17,7 @@ from typing import Any
 import trio
 
 from mavftpfs.cli import verbs
+from mavftpfs.cli.commands import say
 from mavftpfs.cli.showing import shown
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session, Target
@@ -36,7 +37,7 @@ def param(args: Args) -> int:
     except InvalidText as exc:  # one line of text for each invalid line of a file
         *others, last = str(exc).split("\n")
         for line in others:
-            verbs.say(line)
+            say(line)
         raise InvalidText(last) from exc
 
 
@@ -142,7 +143,7 @@ async def _diff(args: Args, lines: Sequence[Line], session: Session) -> int:
     current = await client.read_parameters(session)
     lines, others = await client.split_by_component(session, lines)
     if others:
-        verbs.say(f"left out: {_of_others(others)}")
+        say(f"left out: {_of_others(others)}")
     found = client.compare(lines, current)
     if args.json:
         facts = [{"name": one.name, "vehicle": one.vehicle, "file": one.file} for one in found]
@@ -220,7 +221,7 @@ class _Setting:
             self._require_known(wish)
         await self._set(session, wish.changes)
         for note in wish.notes:
-            verbs.say(note)
+            say(note)
         return ExitCode.OK
 
     async def _compare(self, session: Session) -> Wish:
@@ -233,7 +234,7 @@ class _Setting:
         if others and not self.args.skip_unknown:
             raise InvalidText(f"{_of_others(others)}; --skip-unknown leaves them out")
         if others and not self.done:
-            verbs.say(f"left out: {_of_others(others)}")
+            say(f"left out: {_of_others(others)}")
         return client.wish(lines, current, self.name, meant=self.meant)
 
     def _require_known(self, wish: Wish) -> None:
@@ -247,7 +248,7 @@ class _Setting:
             hint = "; --skip-unknown leaves them out" if self.name else ""
             raise InvalidText(f"the vehicle has no {names}{hint}")
         if wish.unknown:
-            verbs.say(f"left out, because the vehicle does not have them: {names}")
+            say(f"left out, because the vehicle does not have them: {names}")
 
     async def _ask(self, wish: Wish) -> None:
         """Before more than one parameter is set, say what will change, and ask on a terminal.
@@ -277,6 +278,6 @@ class _Setting:
         except MavftpfsError as error:
             for line in await client.last_error(session):
                 if line != str(error):
-                    verbs.say(line)
+                    say(line)
             raise
         self.done += changes

@@ -1,4 +1,4 @@
-"""Progress is drawn where somebody looks. Layer: cli."""
+"""Progress on a terminal; nothing is drawn where there is none. Layer: cli."""
 
 from __future__ import annotations
 

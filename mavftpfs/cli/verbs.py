@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import trio
 
 from mavftpfs.cli import watching
-from mavftpfs.cli.commands import left_by_killed_mounts_line
+from mavftpfs.cli.commands import left_by_killed_mounts_line, say
 from mavftpfs.cli.report import count_files
 from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
@@ -37,7 +37,7 @@ from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, NotDelivered, UsageError, exit_code_for
 from mavftpfs.shared.private import make_private_directory
-from mavftpfs.shared.readable import printable, readable, readable_size
+from mavftpfs.shared.readable import printable, readable_size
 
 ResultT = TypeVar("ResultT")
 Args = argparse.Namespace
@@ -102,10 +102,6 @@ async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]
 
 
 STDIN = STDOUT = "-"
-
-
-def say(line: str) -> None:
-    print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -36,12 +36,10 @@ class Splitter:
 
     Attributes:
         waiting: a stream ended in what may be the beginning of a frame.
-        garbage: bytes that were in no frame.
     """
 
     def __init__(self, *, stream: bool) -> None:
         self.waiting = False
-        self.garbage = 0
         self._stream = stream
         self._tail = b""
 
@@ -55,7 +53,6 @@ class Splitter:
 
     def reset(self) -> None:
         """Forget a half-received frame."""
-        self.garbage += len(self._tail)
         self._tail = b""
         self.waiting = False
 
@@ -65,9 +62,7 @@ class Splitter:
         out: list[Frame] = []
         while self._tail:
             out += self._split(self._tail, stream=False)
-            if self._tail:
-                self.garbage += 1
-                self._tail = self._tail[1:]
+            self._tail = self._tail[1:]
         self.waiting = False
         return out
 
@@ -78,9 +73,7 @@ class Splitter:
             verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
             if verdict is Verdict.PARTIAL:
                 break
-            if verdict is Verdict.GARBAGE:
-                self.garbage += stop - position
-            else:
+            if verdict is not Verdict.GARBAGE:
                 crc_fits = verdict is Verdict.WHOLE and is_known(message_id)
                 out.append(_frame(data[position:stop], message_id, crc_fits=crc_fits))
             position = stop

@@ -277,7 +277,6 @@ class InodeTable:
 
 MAX_KEPT = 100_000
 """Paths for which attributes that were set are remembered."""
-NANO = 1_000_000_000
 
 
 @dataclass(slots=True)
