@@ -38,6 +38,7 @@ _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
 _NO_PLACE = (
     "no private directory for the hub's socket; set XDG_RUNTIME_DIR to a directory that only you can read"
 )
+_NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a port"
 _PAUSE = 0.1
 _LONG_PAUSE = 1.0
 _START_PATIENCE = 60.0
@@ -156,7 +157,7 @@ class SharedLink:
         """
         if door is None:
             if self._needs_hub() and self._inner is not link:
-                raise LinkClosed(_NO_PLACE)
+                raise LinkClosed(_NO_PLACE if self._has_name else _NO_NUMBER)
             await trio.sleep_forever()
         assert door is not None
         alone = self._inner is link

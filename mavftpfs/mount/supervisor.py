@@ -184,14 +184,19 @@ class _Supervisor:
         """Run a vehicle's mount until it ends."""
         place = self._place(member)
         # In a session of its own: Ctrl-C reaches only us, and we end it in order.
-        process = await trio.lowlevel.open_process(
-            self._command(member),
-            stdin=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            cwd="/",
-            env=own_environment(),
-            start_new_session=True,
-        )
+        try:
+            process = await trio.lowlevel.open_process(
+                self._command(member),
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                cwd="/",
+                env=own_environment(),
+                start_new_session=True,
+            )
+        except OSError as exc:
+            member.ended(1, f"its mount cannot be started: {exc.strerror}", trio.current_time())
+            log.warning("vehicle %s: %s", member.name, member.problem)
+            return
         self._processes[member.name] = process
         said: list[str] = []
         async with trio.open_nursery() as nursery:

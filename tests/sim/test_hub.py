@@ -30,7 +30,9 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.rendezvous import ALONE, Door, knock, open_door
+from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
+from mavftpfs.shared.errors import LinkClosed
 from tests.support.vehicles import free_udp_port
 
 HOST = "127.0.0.1"
@@ -218,3 +220,10 @@ async def test_the_full_queue_of_a_stopped_program_does_not_stop_others(
     for sock in waiting:
         sock.close()
     door.remove()
+
+
+async def test_a_port_without_a_number_cannot_be_shared() -> None:
+    wish = Wish(US, (f"udpout:{HOST}:{free_udp_port()}",))
+    with pytest.raises(LinkClosed, match="name a port"):
+        async with open_shared(parse_source(f"udpin:{HOST}:0"), wish):
+            pass
