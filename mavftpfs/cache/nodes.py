@@ -135,7 +135,7 @@ class Node:
         self.removed = True
         if self.draft is not None:
             self.draft.content.name = None
-            self.draft.content.restate()
+            self.draft.content.mark_unneeded()
 
     def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
         """Make a draft, because the file is going to be changed. base: the vehicle's file, None for a new

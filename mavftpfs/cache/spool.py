@@ -84,7 +84,6 @@ class SpoolContent:
         self._stored = ExtentSet()
         self._told: dict[str, Any] | None = None  # what is written down beside the file
         self._durable = False
-        self._settled = False
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes.
@@ -100,12 +99,11 @@ class SpoolContent:
                 memory.extend(bytes(offset - len(memory)))
             memory[offset : offset + len(data)] = data
             spool.in_memory += more
-            self._settled = False
             return
         said = spool.full  # a failed attempt resets it as it cleans up
         try:
             self._spill()
-            self._write_down(settled=False)
+            self._write_down(needed=True)
             self._put_on_disk(offset, data)
         except NoSpace as error:
             if not said:  # a program takes ENOSPC for a full card
@@ -135,7 +133,7 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        self._write_down(settled=False)
+        self._write_down(needed=True)
         if self._file is None:
             before = len(self._memory)
             del self._memory[size:]
@@ -149,14 +147,11 @@ class SpoolContent:
         self._stored.discard(size, max(size, self._stored.end))
         self._spool.on_disk += self._stored.total - before
 
-    def restate(self, *, delivered: bool = False) -> None:
-        """Write down that its name changed, or that no program wants it any more. A failure is only logged.
-
-        delivered: the vehicle has all of it. The next mount need not offer it, until more is put.
-        """
-        self._settled |= delivered
+    def mark_unneeded(self) -> None:
+        """Write down that the next mount need not offer it, until more is put: the vehicle has all of it, or
+        no program wants it any more. A failure is only logged."""
         try:
-            self._write_down(settled=self._settled)
+            self._write_down(needed=False)
         except (NoSpace, SpoolFailed) as exc:
             log.warning("what %s is cannot be written down: %s", self._path, exc)
 
@@ -199,17 +194,15 @@ class SpoolContent:
 
     # --- inside
 
-    def _write_down(self, *, settled: bool) -> None:
-        """Update the description beside the local file, if there is one. It never calls a file needless that
-        is needed.
-
-        settled: the vehicle has all of it.
+    def _write_down(self, *, needed: bool) -> None:
+        """Update the description beside the local file, if there is one. needed: the vehicle lacks something
+        of it.
 
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
         facts: dict[str, Any] = {"needed": False}
-        if self.name is not None and not settled:
+        if self.name is not None and needed:
             facts = {"path": self.name.decode(errors="surrogateescape")}
         if self._path is not None and facts != self._told:
             try:
@@ -217,7 +210,6 @@ class SpoolContent:
             except OSError as exc:
                 raise disk_error(exc, self._path) from exc
             self._told, self._durable = facts, False
-        self._settled = settled
 
     def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         """Write new bytes before bytes that replace others: a full disk refuses the new ones, and nothing is
@@ -252,7 +244,7 @@ class SpoolContent:
         try:
             try:
                 self._path = self._spool.new_file()
-                self._write_down(settled=self._settled)
+                self._write_down(needed=True)
                 self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             except (OSError, NoSpace, SpoolFailed) as exc:
                 raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc

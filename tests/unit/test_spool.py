@@ -203,7 +203,7 @@ def test_what_could_not_be_written_down_is_tried_again(
 ) -> None:
     """The text still says that the vehicle has it all."""
     directory, content = spilled(tmp_path)
-    content.restate(delivered=True)
+    content.mark_unneeded()
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "full")
