@@ -92,7 +92,7 @@ class Context:
                 continue
             if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue
-            if compare(draft.base.known, Listed(entry)) is Sameness.OTHER:
+            if compare(draft.base, Listed(entry)) is Sameness.OTHER:
                 self.on_replaced(node, draft)
             elif draft.base.mtime is None and entry.size == draft.base.size:
                 draft.base = replace(draft.base, mtime=entry.mtime)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
 
@@ -114,29 +113,13 @@ class Where(Enum):
     ZERO = "zero"
 
 
-@dataclass(frozen=True, slots=True)
-class Base:
-    """What is known of the vehicle's file below a draft: size in bytes; mtime in seconds UTC and CRC32 where
-    they were told."""
-
-    size: int
-    mtime: int | None = None
-    crc32: int | None = None
-
-    @property
-    def known(self) -> Known:
-        """What it is compared by. If its CRC32 is known, that tells more than its time: we wrote it, or no
-        time was told."""
-        return Known(self.size, self.mtime, self.crc32, ours=self.crc32 is not None)
-
-
 class Draft:
     """The local content of one file.
 
     Attributes:
         content: keeps what is held.
         size: bytes, as programs see it.
-        base: the file on the vehicle, None if there is none.
+        base: what is known of the file on the vehicle, None if there is none.
         base_limit: below this, bytes that are not held are the base's.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
@@ -144,7 +127,7 @@ class Draft:
         sent_in_place: the file may exist under its own name because of us (cards that cannot rename).
     """
 
-    def __init__(self, content: Content, base: Base | None) -> None:
+    def __init__(self, content: Content, base: Known | None) -> None:
         self.content = content
         self.size = 0 if base is None else base.size
         self.base = base
@@ -288,7 +271,7 @@ class Draft:
         self.on(Event.REFUSED)
         self.base_limit = 0
         if ours:
-            self.base = Base(self.size)
+            self.base = Known(self.size)
 
     def delivered(self, crc32: int | None = None) -> None:
         """Note that the vehicle has it, verified: from now on that is the base. crc32: of the content, if
@@ -296,7 +279,7 @@ class Draft:
         if self.state is State.SENDING:  # a card that cannot rename
             self.on(Event.COMMITS)
         self.on(Event.PLACED)
-        self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
+        self.base, self.base_limit = Known(self.size, crc32=crc32), self.size
         self.sent_in_place = False
         self._changed = ExtentSet()
         self.content.mark_unneeded()

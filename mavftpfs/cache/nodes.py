@@ -14,12 +14,13 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
+from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import SendBuffer
 
 
@@ -137,7 +138,7 @@ class Node:
             self.draft.content.name = None
             self.draft.content.mark_unneeded()
 
-    def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
+    def begin_draft(self, spool: Spool, base: Known | None, now: float) -> Draft:
         """Make a draft, because the file is going to be changed. base: the vehicle's file, None for a new
         one."""
         self.draft = Draft(SpoolContent(spool, self.path), base)

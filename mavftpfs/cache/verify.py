@@ -14,7 +14,7 @@ import logging
 from contextlib import suppress
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Base, Draft
+from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
@@ -26,7 +26,7 @@ from mavftpfs.shared.errors import (
     SessionBusy,
     VerificationFailed,
 )
-from mavftpfs.shared.sameness import Listed, Opened, Sameness, Summed, compare
+from mavftpfs.shared.sameness import Known, Listed, Opened, Sameness, Summed, compare
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -87,7 +87,7 @@ class Verifier:
             self.counts["verified_by_size"] += 1
         return crc32
 
-    async def is_same(self, path: bytes, base: Base) -> bool:
+    async def is_same(self, path: bytes, base: Known) -> bool:
         """Return whether a file on the vehicle is still the base.
 
         Raises:
@@ -97,18 +97,18 @@ class Verifier:
         timed = context.directories.tells_times or base.mtime is not None
         if timed:
             entry = await context.directories.current(path)
-            if compare(base.known, Listed(entry)) in (Sameness.OTHER, Sameness.GREW):
+            if compare(base, Listed(entry)) in (Sameness.OTHER, Sameness.GREW):
                 return False
         if base.crc32 is not None and base.size <= options.verify_max and options.verify in ("auto", "crc"):
             with suppress(FtpNak, RequestTimeout, Armed):
                 told = Summed(await context.store.crc32(path, size=base.size))
-                answer = compare(base.known, told)
+                answer = compare(base, told)
                 if answer is not Sameness.UNPROVEN:
                     return answer is Sameness.SAME
         if timed:
             return True
         size = await self._size(path)
-        return size is not None and compare(base.known, Opened(size)) is Sameness.SAME
+        return size is not None and compare(base, Opened(size)) is Sameness.SAME
 
     # --- inside
 

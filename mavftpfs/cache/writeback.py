@@ -18,7 +18,6 @@ import trio
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.draft import Base
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
@@ -35,6 +34,7 @@ from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
 from mavftpfs.shared.model import EntryKind, require_listable
 from mavftpfs.shared.readable import readable
+from mavftpfs.shared.sameness import Known
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -157,12 +157,12 @@ class Writeback:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:
             # If the size is 0 there is nothing to do: so it has to be true, not remembered.
-            base = Base(entry.size or await context.store.stat_size(path))
+            base = Known(entry.size or await context.store.stat_size(path))
         else:
             handle = await context.files.open(path)  # its ACK tells the size better than a listing
             listed = context.directories.entry(path)
             told = listed is not None and listed.size == handle.size
-            base = Base(handle.size, listed.mtime if listed and told else None)
+            base = Known(handle.size, listed.mtime if listed and told else None)
         try:
             context.require_idle(path)
             node = context.nodes.need(path)

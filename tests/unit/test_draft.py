@@ -9,16 +9,17 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import TRANSITIONS, Base, Draft, Event, State, Where
+from mavftpfs.cache.draft import TRANSITIONS, Draft, Event, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError
+from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import AHEAD, SendBuffer
 
 SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
 
 def draft_over(base: bytes | None) -> Draft:
-    return Draft(SpoolContent(SPOOL), None if base is None else Base(len(base)))
+    return Draft(SpoolContent(SPOOL), None if base is None else Known(len(base)))
 
 
 def sending_of(data: bytes) -> tuple[Draft, SendBuffer]:
