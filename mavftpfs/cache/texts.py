@@ -25,7 +25,7 @@ import trio
 from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.virtual import VirtualTrees
+from mavftpfs.cache.virtual import SnapshotHandle, VirtualTrees
 from mavftpfs.parameters.text import Problem
 from mavftpfs.shared.errors import (
     FtpNak,
@@ -210,7 +210,7 @@ class Texts(ABC, Generic[B]):
 
     async def open(
         self, name: bytes, *, write: bool, truncate: bool, append: bool, program: Program | None
-    ) -> TextHandle[B] | ErrorHandle:
+    ) -> TextHandle[B] | SnapshotHandle:
         """Open one.
 
         Raises:
@@ -219,7 +219,7 @@ class Texts(ABC, Generic[B]):
         if name == LAST_ERROR:
             if write:
                 raise ReadOnly(f"{name.decode()} is only read")
-            return ErrorHandle(self.error_text)
+            return SnapshotHandle(self.error_text)
         if write:
             try:
                 self._require_writable()
@@ -377,27 +377,6 @@ class Refused(Exception):
         self.error = error
         self.lines = lines
         self.known = known
-
-
-class ErrorHandle(OpenFile):
-    """One open() of last_error.txt."""
-
-    direct_io = True
-
-    def __init__(self, text: bytes) -> None:
-        self._text = text
-
-    @property
-    def size(self) -> int:
-        """Bytes."""
-        return len(self._text)
-
-    async def read(self, offset: int, size: int) -> bytes:
-        """Return bytes, fewer only at the end."""
-        return self._text[offset : offset + size]
-
-    def close(self) -> None:
-        """Nothing is to be released."""
 
 
 class TextHandle(OpenFile, Generic[B]):

@@ -83,7 +83,7 @@ UNSEEN = Seen(None, -math.inf)
 
 
 class SnapshotHandle(OpenFile):
-    """One open() of an `@` file."""
+    """One open() of an `@` file that is only read."""
 
     size = 0
     direct_io = True
