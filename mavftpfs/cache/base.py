@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import replace
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
 
 STEP = 128 * 1024
@@ -74,9 +74,9 @@ async def fetch(context: Context, node: Node, draft: Draft) -> None:
             for at in range(start, stop, STEP):
                 draft.fill(at, await read_base(context, node, at, min(at + STEP, stop)))
         return
-    value = 0xFFFFFFFF
+    value = 0
     for at in range(0, draft.base.size, STEP):
         data = await read_base(context, node, at, min(at + STEP, draft.base.size))
-        value = zlib.crc32(data, value)
+        value = crc32(data, value)
         draft.fill(at, data)
-    draft.base = replace(draft.base, crc32=value ^ 0xFFFFFFFF)
+    draft.base = replace(draft.base, crc32=value)

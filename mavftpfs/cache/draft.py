@@ -12,11 +12,11 @@ are appended while it is sent join it. Writers wait while a close delivers it.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from enum import Enum
 from typing import Any, Protocol
 
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.sameness import Known
@@ -194,10 +194,10 @@ class Draft:
         Raises:
             SpoolFailed.
         """
-        value = 0xFFFFFFFF
+        value = 0
         for at in range(0, self.size, STEP):
-            value = zlib.crc32(self.local_bytes(at, min(at + STEP, self.size)), value)
-        return value ^ 0xFFFFFFFF
+            value = crc32(self.local_bytes(at, min(at + STEP, self.size)), value)
+        return value
 
     # --- what programs do
 

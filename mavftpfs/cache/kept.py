@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import logging
 import time
-import zlib
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -30,6 +29,7 @@ import trio
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
 from mavftpfs.cache.versions import BLOCK_SIZE, NEVER, BlockCache, Version
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import DirEntry, is_virtual
 from mavftpfs.shared.sameness import Listed, Sameness, compare
@@ -262,10 +262,10 @@ def _marker(key: FileKey) -> str:
 
 def _crc32(blocks: Mapping[int, bytearray]) -> int:
     """Return the CRC32 of a whole file, as the vehicle computes it: start value 0, no final xor."""
-    value = 0xFFFFFFFF
+    value = 0
     for index in sorted(blocks):
-        value = zlib.crc32(blocks[index], value)
-    return value ^ 0xFFFFFFFF
+        value = crc32(blocks[index], value)
+    return value
 
 
 def _of_crc32(key: FileKey, crc32: int) -> FileKey:

@@ -11,7 +11,6 @@ what a program read is remembered, for each program, until it saves.
 
 from __future__ import annotations
 
-import zlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -27,6 +26,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.virtual import SnapshotHandle, VirtualTrees
 from mavftpfs.parameters.text import Problem
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     FtpNak,
     InvalidText,
@@ -232,7 +232,7 @@ class Texts(ABC, Generic[B]):
     async def crc32(self, name: bytes) -> int:
         """Return the CRC32 (start value 0, no final xor) of what a reader gets. Raises as show."""
         text = self.error_text if name == LAST_ERROR else (await self.show(name, reread=False)).text
-        return zlib.crc32(text, 0xFFFFFFFF) ^ 0xFFFFFFFF
+        return crc32(text)
 
     def note_other_file(self, program: Program | None) -> None:
         """Note that a program tried to make a file beside the texts."""

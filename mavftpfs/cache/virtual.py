@@ -10,7 +10,6 @@ and the open that follows reuses it, so that stat, open and read agree and rsync
 from __future__ import annotations
 
 import math
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -25,7 +24,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
@@ -271,7 +270,7 @@ class VirtualTrees:
             As open.
         """
         handle = await self.open(path)
-        return zlib.crc32(await handle.read(0, handle.size), 0xFFFFFFFF) ^ 0xFFFFFFFF
+        return crc32(await handle.read(0, handle.size))
 
     def forget(self) -> None:
         """Forget all snapshots, and what opened or did not."""
