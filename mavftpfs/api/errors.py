@@ -55,7 +55,7 @@ def translated() -> Iterator[None]:
 def whereabouts(there: bool | None) -> str:
     """Return the words about a file that was not delivered; see NotDelivered.on_vehicle."""
     if there is None:
-        return "nobody can tell what is on the vehicle now: look before you use it"
+        return "it is not known what the vehicle has now: look before you use it"
     if there:
         return "it is on the vehicle, whole"
     return "withdrawn: the vehicle has what it had, and nothing of it is sent later"

@@ -181,9 +181,11 @@ class Part:
             if not stat.S_ISREG(os.fstat(fd).st_mode):
                 raise UsageError(f"{self.path} is no file")
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.lstat(self.path).st_ino != os.fstat(fd).st_ino:
+                raise FileNotFoundError
         except BaseException as exc:
             os.close(fd)
-            if isinstance(exc, BlockingIOError):
+            if isinstance(exc, BlockingIOError | FileNotFoundError):  # it has, or just finished the file
                 raise UsageError(f"{self.path} is being written by another program") from None
             raise
         self._file = os.fdopen(fd, "r+b")

@@ -15,7 +15,6 @@ from mavftpfs.client.fetch import known_time
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, reading, walk, written
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import (
-    AlreadyExists,
     CrossDevice,
     DataUnproven,
     InvalidMove,
@@ -232,16 +231,13 @@ async def emptied(files: Files, path: bytes) -> File:
 
 
 async def make_directory(files: Files, path: bytes, *, may_exist: bool) -> None:
-    """Make one directory.
+    """Make one directory. may_exist: unless it is there already, which is no change.
 
     Raises:
-        AlreadyExists: the name is taken (by a file, where an existing directory is welcome).
+        AlreadyExists: the name is taken (with `may_exist`: by a file).
     """
-    try:
+    if not (may_exist and await is_directory(files, path)):
         await files.mkdir(path)
-    except AlreadyExists:
-        if not may_exist or not await is_directory(files, path):
-            raise
 
 
 async def make_directories(session: Session, paths: Sequence[bytes], *, parents: bool) -> None:
@@ -250,11 +246,9 @@ async def make_directories(session: Session, paths: Sequence[bytes], *, parents:
     Raises:
         As make_directory and Files.mkdir.
     """
-    files = session.files
     for path in paths:
         for wanted in [*ancestors(path), path] if parents else [path]:
-            if not (parents and await is_directory(files, wanted)):
-                await make_directory(files, wanted, may_exist=parents)
+            await make_directory(session.files, wanted, may_exist=parents)
 
 
 def ancestors(path: bytes) -> list[bytes]:

@@ -186,7 +186,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
         known = "nothing" if before is None else f"{before} bytes"
         raise UsageError(
             f"{name_text(path)} has {found.size} bytes on the vehicle, and had {known} when this was kept: "
-            "somebody changed it; --force replaces it"
+            "it was changed since; --force replaces it"
         )
     return False
 

@@ -357,11 +357,13 @@ def test_a_port_that_is_taken() -> None:
 
 def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
     card = field.local("card")
-    (card / "sub").mkdir()
+    (card / "sub" / "e").mkdir(parents=True)
     (card / "sub" / "f").write_bytes(DATA)
     other = field.sim(card, "px4")
     with mavftpfs.connect(other.source + "#/sub", ro=True, trace=card / "trace") as drone:
         assert drone.read_bytes("f") == DATA
+        drone.mkdir("/", parents=True, exist_ok=True)
+        drone.mkdir("/e", exist_ok=True)
         with pytest.raises(OSError, match="only read") as caught:
             drone.write_bytes("f", b"")
         assert caught.value.errno == errno.EROFS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
     NotProvenYet,
+    Part,
     Wanted,
     known_time,
     part_of,
@@ -220,6 +222,23 @@ async def test_two_programs_do_not_write_one_part(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="another program"):
             await get(tree, b"/big", tmp_path / "big")
     assert (tmp_path / "big").read_bytes() == BIG
+
+
+async def test_a_part_that_just_got_its_name_is_not_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another program finishes the file between our open and our lock."""
+    local, lock = tmp_path / "big", fcntl.flock
+    part_of(local).write_bytes(BIG)
+
+    def finish_and_lock(fd: int, how: int) -> None:
+        part_of(local).replace(local)
+        lock(fd, how)
+
+    monkeypatch.setattr(fcntl, "flock", finish_and_lock)
+    with pytest.raises(UsageError, match="another program"):
+        Part(part_of(local), local)
+    assert local.read_bytes() == BIG
 
 
 async def test_neither_a_link_nor_a_pipe_is_taken_for_a_part(tmp_path: Path) -> None:
