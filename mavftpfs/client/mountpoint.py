@@ -238,7 +238,7 @@ def _describe_unmount(path: str, said: str) -> str:
         return f"{path} is in use; close what has it open (fuser -vm {path}) and try again"
     mount = mounts().get(path)
     if mount is not None and mount.uid not in (None, os.getuid()) and os.getuid() != 0:
-        return f"cannot unmount {path}: only root, or the user that mounted it (uid {mount.uid}), may do that"
+        return f"cannot unmount {path}: another user mounted it, and only uid {mount.uid} or root may"
     return f"cannot unmount {path}: {_first_line(said)}"
 
 
