@@ -7,9 +7,7 @@ import os
 import random
 import signal
 import socket
-import subprocess
 import sys
-import threading
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -23,7 +21,8 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from tests.mount.conftest import Field
 from tests.support.flown import PARAMETERS
 from tests.support.mounts import Mount, command, hub_of, wait_until
-from tests.support.vehicles import HOST, PROJECT, Process, Program, free_udp_port
+from tests.support.neighbours import Neighbour
+from tests.support.vehicles import HOST, Process, Program, free_udp_port
 
 CONTENT = random.Random(1).randbytes(15_000)
 OURS = 254
@@ -168,30 +167,16 @@ def test_signed_frames_pass_unchanged(field: Field) -> None:
 # -- stations that do harm --------------------------------------------------------------------------
 
 
-class Pest:
-    """An endpoint of the mount that floods it with what it likes until the end of the body."""
+class Pest(Neighbour):
+    """An endpoint of the mount that floods it with what it likes."""
 
     def __init__(self, port: int, datagram: bytes) -> None:
-        self.sent = 0
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind((HOST, port))
-        self._sock.settimeout(30)
+        super().__init__(port, 30)
         self._datagram = datagram
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Pest:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._sock.close()
 
     def _run(self) -> None:
         _, hub = self._sock.recvfrom(2048)
-        while not self._stop.is_set():
+        while not self._over.is_set():
             with suppress(OSError):
                 self._sock.sendto(self._datagram, hub)
                 self.sent += 1
@@ -230,41 +215,29 @@ def test_endpoints_that_flood_harm_nobody(field: Field) -> None:
         assert all(pest.sent > 1000 for pest in pests)
 
 
-class Flood:
-    """A vehicle that sends 20,000 frames a second, as far as the machine has time for them, in the body."""
+class Flood(Neighbour):
+    """A vehicle that sends 20,000 frames a second, as far as the machine has time for them."""
 
     RATE = 20_000
     _UDP_SEGMENT = 103  # linux/udp.h: one call sends many datagrams
 
     def __init__(self, system: int, port: int) -> None:
-        self.sent = 0
-        self._port = port
+        super().__init__()
+        self._sock.connect((HOST, port))
         self._framer = Framer(Address(system, 1), stream=False)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Flood:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
 
     def _run(self) -> None:
         frame = self._framer.encode("attitude", 1, 0.1, 0.2, 0.3, 0, 0, 0)
         beat = self._framer.encode_heartbeat(2, 12)
         cut = [(socket.IPPROTO_UDP, self._UDP_SEGMENT, len(frame).to_bytes(2, sys.byteorder))]
         began = time.monotonic()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.connect((HOST, self._port))
-            while not self._stop.wait(0.001):
-                if self.sent % 1000 < 20:
-                    sock.send(beat)
-                due = min(20, int((time.monotonic() - began) * self.RATE) - self.sent)
-                if due > 0:
-                    sock.sendmsg([frame * due], cut)
-                    self.sent += due
+        while not self._over.wait(0.001):
+            if self.sent % 1000 < 20:
+                self._sock.send(beat)
+            due = min(20, int((time.monotonic() - began) * self.RATE) - self.sent)
+            if due > 0:
+                self._sock.sendmsg([frame * due], cut)
+                self.sent += due
 
 
 def test_a_flood_of_one_vehicle_does_not_reach_the_mount_of_another(field: Field) -> None:
@@ -293,29 +266,15 @@ def test_a_flood_of_one_vehicle_does_not_reach_the_mount_of_another(field: Field
     assert flooded - quiet < 4 * flood.sent  # a tenth of its bytes
 
 
-class Mirror:
+class Mirror(Neighbour):
     """A router beside the mount that sends what it gets back to SOURCE's port."""
 
     def __init__(self, port: int, back: int) -> None:
-        self.sent = 0
+        super().__init__(port)
         self._back = back
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind((HOST, port))
-        self._sock.settimeout(0.5)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Mirror:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._sock.close()
 
     def _run(self) -> None:
-        while not self._stop.is_set():
+        while not self._over.is_set():
             with suppress(TimeoutError):
                 self._sock.sendto(self._sock.recv(65536), (HOST, self._back))
                 self.sent += 1
@@ -347,30 +306,17 @@ def test_two_stations_with_one_id_both_work(field: Field) -> None:
 # -- the end of the mount ---------------------------------------------------------------------------
 
 
-class Listener:
+class Listener(Neighbour):
     """A ground station that only listens and sends heartbeats; notes when the vehicle's heartbeats came."""
 
     def __init__(self, port: int) -> None:
+        super().__init__(port)
         self.beats: list[float] = []
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind((HOST, port))
-        self._sock.settimeout(0.5)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Listener:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._sock.close()
 
     def _run(self) -> None:
         framer = Framer(STATION, stream=False)
         told = 0.0
-        while not self._stop.is_set():
+        while not self._over.is_set():
             with suppress(TimeoutError):
                 data, hub = self._sock.recvfrom(65536)
                 frames = Splitter(stream=False).feed(data)
@@ -455,10 +401,10 @@ def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
             ("forward=nonsense", 1, "forward=nonsense"),
             (f"forward=udpout:{HOST}:{taken}#/dir", 1, "no directory"),
         ):
-            argv = [sys.executable, "-m", "mavftpfs", flown.source, str(place), "-o", option]
-            done = subprocess.run(argv, capture_output=True, text=True, timeout=60, cwd=PROJECT, check=False)
-            assert done.returncode == code, (option, done.stderr)
-            (line,) = done.stderr.splitlines()
+            failing = Mount(flown.source, place, field.local("out"), (option,))
+            process = Program("mount", failing.argv(), failing.folder)
+            assert process.wait() == code, (option, process.text())
+            (line,) = process.text().splitlines()
             assert said in line
         mount = field.mount(flown.source, f"forward=udpin::{free_udp_port()}")
         assert "udpin:127.0.0.1:" in command("hub", flown.source)[0]

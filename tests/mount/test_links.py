@@ -46,7 +46,7 @@ def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
     mount = field.mount(vehicle.source)
     with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
         wait_until("it is under way", lambda: size_of(tmp_path / "copy") > 0)
-        vehicle.send_signal(signal.SIGPWR)
+        vehicle.react(signal.SIGPWR)
         _, errors = copy.communicate(timeout=120)
     assert (copy.returncode, errors) == (0, "")
     assert (tmp_path / "copy").read_bytes() == data

@@ -8,11 +8,9 @@ import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -20,10 +18,10 @@ from typing import Any
 import pytest
 
 from mavftpfs.client.status import status_of, with_vehicles
-from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
 from tests.support.mounts import PATIENCE, Mount, command, mavftpfs, mounted_at, wait_until
+from tests.support.neighbours import Beating
 from tests.support.vehicles import HOST, PROJECT, Program, SimVehicle, free_udp_port
 
 PROFILES = {1: "px4", 2: "ardupilot5", 3: "mavsdk"}
@@ -307,26 +305,11 @@ def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
     fleet.launch(1)
     mounts = mount_all(fleet)
     mounts.await_up("1")
-    stop = threading.Event()
-
-    def be_another() -> None:
-        framer = Framer(Address(1, 1), stream=False)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.bind((HOST, 0))
-            while not stop.wait(0.3):
-                sock.sendto(framer.encode_heartbeat(2, 12), (HOST, fleet.port))
-
-    thread = threading.Thread(target=be_another)
-    thread.start()
-    try:
+    with Beating(fleet.port, (Address(1, 1), 2, 12)):
         wait_until("it is known", lambda: bool(mounts.facts()["vehicles"][0]["link"]["second"]))
-        assert "a second vehicle" in command("status", mounts.path)[0]
-        assert "a second vehicle" in command("scan", fleet.source)[0]
-        assert "a second vehicle" in command("hub", fleet.source)[0]
+        for words in (("status", mounts.path), ("scan", fleet.source), ("hub", fleet.source)):
+            assert "a second vehicle" in command(*words)[0]
         assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
-    finally:
-        stop.set()
-        thread.join()
     assert "give each a system id of its own" in mounts.alive().text()
 
 

@@ -40,16 +40,16 @@ def news(mount: Mount) -> list[str]:
 def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     mount = field.mount(vehicle.source)
-    vehicle.send_signal(signal.SIGUSR1)
+    vehicle.react(signal.SIGUSR1)
     logged(mount, "is armed")
-    vehicle.send_signal(signal.SIGUSR1)
+    vehicle.react(signal.SIGUSR1)
     logged(mount, "1/1 is disarmed")
-    vehicle.send_signal(signal.SIGUSR2)
+    vehicle.react(signal.SIGUSR2)
     logged(mount, "is lost")
     assert ": PX4 1/1, disarmed, LOST: last heard " in command("status", mount.path)[0]
-    vehicle.send_signal(signal.SIGUSR2)
+    vehicle.react(signal.SIGUSR2)
     logged(mount, "is back")
-    vehicle.send_signal(signal.SIGPWR)
+    vehicle.react(signal.SIGPWR)
     logged(mount, "restarted")
     assert news(mount) == [
         "mavftpfs: vehicle 1/1 is armed: nothing is written to it until it is disarmed",

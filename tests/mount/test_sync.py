@@ -7,7 +7,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -21,13 +20,13 @@ import pytest
 
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import is_wanted
-from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
 from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, mavftpfs, wait_until
 from tests.support.mounts import command as run
+from tests.support.neighbours import Beating
 from tests.support.places import start_place
 from tests.support.vehicles import HOST, PROJECT, SimVehicle, free_udp_port
 
@@ -310,10 +309,10 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
         wait_until("the first log was handed on", lambda: handed.read_text() == "1.BIN\n")
         if mounted == "later":
             field.mount(vehicle.source)
-        vehicle.send_signal(signal.SIGUSR1)  # armed
+        vehicle.react(signal.SIGUSR1)  # armed
         wait_until("that is noticed", lambda: "vehicle 1 is armed" in said.read_text())
         write_log(card / "2.BIN", 60_000, 2, 2)
-        vehicle.send_signal(signal.SIGUSR1)
+        vehicle.react(signal.SIGUSR1)
         wait_until("the second, too", lambda: handed.read_text() == "1.BIN\n2.BIN\n")
         child.send_signal(signal.SIGTERM)
         assert child.wait(COMMAND_TIMEOUT) == 0
@@ -390,9 +389,9 @@ def test_a_vehicle_that_is_lost_under_a_mount_is_waited_for_on_the_screen(
     write_log(tmp_path / "a.bin", 50_000, 2, 1)
     screen = terminal.mavftpfs(command, *words, columns=100, rows=8)
     screen.read_until(lambda shown: "kB/s" in shown.raw)
-    vehicle.send_signal(signal.SIGUSR2)  # the link is cut
+    vehicle.react(signal.SIGUSR2)  # the link is cut
     screen.read_until(lambda shown: "waiting for the vehicle" in shown.raw)
-    vehicle.send_signal(signal.SIGUSR2)
+    vehicle.react(signal.SIGUSR2)
     assert screen.finish() == 0
 
 
@@ -413,32 +412,13 @@ def test_ls_on_a_terminal_and_in_a_pipe(field: Field) -> None:
 # -- scan -----------------------------------------------------------------------------------------
 
 
-@contextmanager
-def heartbeats(port: int, *senders: tuple[Address, int]) -> Iterator[None]:
-    """Have components that know nothing but heartbeats speak to a port; each is (address, MAV_TYPE)."""
-    over = threading.Event()
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    framers = [(Framer(address, stream=False), kind) for address, kind in senders]
-
-    def speak() -> None:
-        while not over.wait(0.3):
-            for framer, kind in framers:
-                sock.sendto(framer.encode_heartbeat(kind, MAV_AUTOPILOT_INVALID), (HOST, port))
-
-    speaker = threading.Thread(target=speak)
-    speaker.start()
-    try:
-        yield
-    finally:
-        over.set()
-        speaker.join()
-        sock.close()
+STATION = (Address(255, 190), MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID)
 
 
 def test_scan_of_a_camera_and_a_ground_station_ends_in_its_time() -> None:
     """No autopilot is there, and connect_timeout is not waited for where somebody else is heard."""
     port = free_udp_port()
-    with heartbeats(port, (Address(1, 100), 30), (Address(255, 190), MAV_TYPE_GCS)):
+    with Beating(port, (Address(1, 100), 30, MAV_AUTOPILOT_INVALID), STATION):
         out, _ = run("scan", "-o", "connect_timeout=3000", f"udpin:{HOST}:{port}")
     camera, station = (line.split("\t") for line in out.splitlines())
     assert camera[:4] == ["1/100", "camera", "-", "-"]
@@ -450,7 +430,7 @@ def test_scan_beside_a_mount_shows_who_else_is_there(field: Field) -> None:
     vehicle = field.sim(field.local("card"))
     mount = field.mount(vehicle.source)
     port = int(vehicle.source.rpartition(":")[2])
-    with heartbeats(port, (Address(255, 190), MAV_TYPE_GCS)):
+    with Beating(port, STATION):
         wait_until(
             "the mount hears the ground station", lambda: len(mount.status()["connection"]["heard"]) > 1
         )

@@ -13,9 +13,9 @@ import pytest
 
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
-from tests.mount.test_writing_ends import QUICK, write_to_nobody
-from tests.support.mounts import Mount, wait_until
+from tests.mount.test_writing_ends import QUICK, holding
 from tests.support.mounts import command as run
+from tests.support.mounts import wait_until
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
 
@@ -42,10 +42,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
     field: Field, data: Path, state: Path
 ) -> None:
-    card = field.local("card")
-    vehicle = field.sim(card)
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
+    mount, vehicle, card = holding(field, data)
     process = mount.alive()
     with mount.started(*MAVFTPFS, "umount", mount.path) as child:
         assert child.stderr is not None
@@ -70,10 +67,8 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
 def test_a_signal_ends_the_delivery_of_a_mount_that_is_unmounted(
     field: Field, data: Path, state: Path
 ) -> None:
-    vehicle = field.sim(field.local("card"))
+    mount, vehicle, _ = holding(field, data)
     vehicle.left_alone = True
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
     process, mount.process = mount.alive(), None
     with mount.started(*MAVFTPFS, "umount", mount.path) as child:
         wait_until("it delivers before it ends", lambda: "delivering" in process.text())
@@ -99,13 +94,10 @@ def test_what_came_from_stdin_and_was_not_delivered_is_kept(field: Field, data: 
     assert kept.read_bytes() == data.read_bytes()
 
 
-def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
-    """Have a mount end with a file that is not delivered; return it, a vehicle that answers, and its card."""
-    card = field.local("card")
-    vehicle = field.sim(card)
+def left_behind(field: Field, data: Path) -> tuple[SimVehicle, Path]:
+    """Have a mount end with a file that is not delivered; return a vehicle that answers, and its card."""
+    mount, vehicle, card = holding(field, data)
     vehicle.left_alone = True
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
     process, mount.process = mount.alive(), None
     process.send_signal(signal.SIGTERM)
     wait_until("it delivers before it ends", lambda: "delivering" in process.text())
@@ -113,13 +105,13 @@ def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
     assert process.wait() == 4
     vehicle.kill()
     vehicle.start()  # a paused one would still answer what it was asked before
-    return mount, vehicle, card
+    return vehicle, card
 
 
 @pytest.mark.holds("promise 3")
 def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path, state: Path) -> None:
     assert run("recover")[0] == "nothing was kept\n"
-    _, vehicle, card = left_behind(field, data)
+    vehicle, card = left_behind(field, data)
     (directory,) = state.iterdir()
     assert (directory / "lost.bin").read_bytes() == data.read_bytes()
     assert directory.stat().st_mode & 0o777 == 0o700

@@ -83,7 +83,7 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
     vehicle = field.sim(card, "px4", ("--rate", "60000"))
     mount = field.mount(vehicle.source, "dirty_max=64K")
     writer = start_writer(mount, "APM/flight.bin", 100)
-    vehicle.send_signal(signal.SIGUSR1)
+    vehicle.react(signal.SIGUSR1)
     results = said(writer, mount)
     assert set(results["write"][:-1]) == {"ok"}
     assert results["write"][-1] == "EROFS"
@@ -103,7 +103,7 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
     assert 0 <= transfer["done"] < taken
     assert "flight.bin" in command("status", mount.path)[0]
     wait_until("the log says so", lambda: "is armed" in mount.alive().text())
-    vehicle.send_signal(signal.SIGUSR1)
+    vehicle.react(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
     place = card / "APM" / "flight.bin"
     wait_until("what was held is delivered", lambda: place.read_bytes() == expected)
@@ -134,6 +134,15 @@ def write_to_nobody(mount: Mount, vehicle: SimVehicle, data: Path) -> None:
     assert result.returncode == 1
     assert "timed out" in result.stderr or "Input/output error" in result.stderr
     assert mount.errno_of("open(sys.argv[1], 'ab').close()", mount.path / "confirmed") in ("ETIMEDOUT", "")
+
+
+def holding(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
+    """Return a mount that holds lost.bin, its vehicle, which is silent, and that one's card."""
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    return mount, vehicle, card
 
 
 @pytest.fixture
@@ -173,10 +182,7 @@ def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: P
 
 @pytest.mark.holds("promise 3")
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
-    card = field.local("card")
-    vehicle = field.sim(card)
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
+    mount, vehicle, card = holding(field, data)
     subprocess.run(["fusermount3", "-u", mount.path], check=True, timeout=60)
     wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
     path = control.find_socket(str(mount.path), control.own_directories())
@@ -195,10 +201,8 @@ def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: 
 def test_what_a_killed_daemon_held_is_named_by_umount_and_by_the_next_mount_in_the_background(
     field: Field, data: Path, state_home: Path
 ) -> None:
-    vehicle = field.sim(field.local("card"))
+    mount, vehicle, _ = holding(field, data)
     vehicle.left_alone = True
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
     mount.kill()
     _, refused = mavftpfs(vehicle.source, mount.path, code=3)
     assert "is a dead mount whose program is gone" in refused

@@ -175,11 +175,6 @@ class UdpVehicle:
             self.process.kill()
             self.process = None
 
-    def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal to the vehicle's process."""
-        assert self.process is not None
-        self.process.send_signal(number)
-
     def pause(self) -> None:
         """Let the vehicle fall silent without ending, as behind a dead link."""
         assert self.process is not None
@@ -254,6 +249,19 @@ class SimVehicle(UdpVehicle):
         words = self.process.output.read_text().split()
         assert words[:1] == ["mavftpfs"], self.process.text()
         return words[1]
+
+    def react(self, number: signal.Signals) -> None:
+        """Have it arm or disarm (SIGUSR1), cut or mend its link (SIGUSR2), or reboot (SIGPWR); returns when
+        it has: of two equal signals that come quickly, one is lost."""
+        assert self.process is not None
+        self.await_ready(self.process)
+        before = self.process.output.read_text()
+        self.process.send_signal(number)
+        deadline = time.monotonic() + STOP_TIMEOUT
+        while self.process.output.read_text() == before:
+            assert self.process.running, self.process.text()
+            assert time.monotonic() < deadline, "it does not react"
+            time.sleep(0.02)
 
     def argv(self) -> list[str]:
         link = self.link or f"udpout:{HOST}:{self.vehicle_port}"
