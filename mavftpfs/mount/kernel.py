@@ -47,6 +47,9 @@ MIN_TASKS = 10
 MAX_TASKS = 2000
 """Requests under way at once. With pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
 
+MAX_DROPS = 16
+"""Files of which the kernel is told at once to drop its pages; each takes a thread."""
+
 GRACE = 2.0
 """Seconds that requests under way get to finish after a signal, or once the kernel mount is gone."""
 
@@ -131,6 +134,7 @@ class Invalidator:
         self._pending: set[int] = set()
         self._wake = trio.Event()
         self._calls: set[object] = set()
+        self._drops = trio.CapacityLimiter(MAX_DROPS)
         # Without a limit: a call that queued and was cancelled would count as running.
         self._limiter = trio.CapacityLimiter(math.inf)
 
@@ -148,12 +152,19 @@ class Invalidator:
 
     async def run(self) -> None:
         """Work until cancelled."""
-        while True:
-            await self._wake.wait()
-            self._wake = trio.Event()
-            pending, self._pending = self._pending, set()
-            for ino in pending:
-                await self._tell(ino, attr_only=False)
+        async with trio.open_nursery() as nursery:
+            while True:
+                await self._wake.wait()
+                self._wake = trio.Event()
+                pending, self._pending = self._pending, set()
+                for ino in pending:
+                    nursery.start_soon(self._drop, ino)
+
+    async def _drop(self, ino: int) -> None:
+        """Make the kernel drop a file's pages and attributes. Other files do not wait for it, since one of
+        its pages may be read from a lost vehicle just now."""
+        async with self._drops:
+            await self._tell(ino, attr_only=False)
 
     async def forget_attributes(self, ino: int) -> None:
         """Make the kernel ask for attributes again; return when it has forgotten them."""

@@ -68,6 +68,28 @@ async def test_busy_while_a_thread_is_in_the_kernel_even_if_nobody_waits() -> No
     await idle(lambda: not invalidator.busy)
 
 
+async def test_a_file_of_which_a_page_is_being_read_delays_no_other_file() -> None:
+    inodes, kernel, gate = InodeTable(), Kernel(), threading.Event()
+    slow, other = inodes.lookup(b"/slow").ino, inodes.lookup(b"/other").ino
+
+    def notify(ino: int, attr_only: bool) -> None:
+        kernel.notify(ino, attr_only)
+        if ino == slow:
+            gate.wait(90)
+
+    invalidator = Invalidator(inodes, notify)
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(invalidator.run)
+        invalidator.on_changed(b"/slow")
+        await idle(lambda: bool(kernel.calls))
+        invalidator.on_changed(b"/other")
+        with trio.move_on_after(5):
+            await idle(lambda: len(kernel.calls) == 2)
+        gate.set()
+        nursery.cancel_scope.cancel()
+    assert kernel.calls == [(slow, False), (other, False)]
+
+
 def test_the_socket_by_which_fusermount3_hears_of_our_end_lies_below_the_device() -> None:
     """Linux lets go of the highest descriptor first. Opened in the order of libfuse's."""
     with watcher_told_last():
