@@ -239,7 +239,7 @@ class Drone:
     async def rmdir(self, path: PathLike) -> None:
         """Remove an empty directory."""
         with translated():
-            await self._files.rmdir(remote(path))
+            await names.remove_directories(self._session, [remote(path)])
 
     async def remove(self, path: PathLike, *, recursive: bool = False) -> None:
         """Remove a file; with `recursive` a directory with all below, too.

@@ -263,8 +263,9 @@ async def remove_directories(session: Session, paths: Sequence[bytes]) -> None:
     """Remove empty directories.
 
     Raises:
-        As Files.rmdir.
+        UsageError: the root. Else as Files.rmdir.
     """
+    refuse_root(paths)
     for path in paths:
         await session.files.rmdir(path)
 
@@ -339,7 +340,13 @@ async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, int
 
 
 async def move(files: Files, old: bytes, new: bytes) -> None:
-    """Rename. If the server cannot, copy (which is verified) and delete, as mv does between disks."""
+    """Rename. If the server cannot, copy (which is verified) and delete, as mv does between disks.
+
+    Raises:
+        InvalidMove: the root. Else as Files.rename and copy.
+    """
+    if old == ROOT:  # the kernel calls a mountpoint another device
+        raise InvalidMove("the root itself cannot be moved")
     try:
         await files.rename(old, new)
         return

@@ -19,6 +19,7 @@ from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
     ExitCode,
+    InvalidMove,
     IsADirectory,
     LinkClosed,
     MavftpfsError,
@@ -217,6 +218,18 @@ async def test_mv_copies_where_the_server_cannot_rename() -> None:
     assert tree.files == {b"/new/a": BIG, b"/new/e/b": b"", b"/x": b"1"}
     assert b"/d" not in tree.directories
     assert all(file.closed for file in tree.opened)
+
+
+@pytest.mark.holds("promise 3")
+@pytest.mark.parametrize("renames", [True, False])
+async def test_the_root_is_not_moved_into_a_part_of_itself(renames: bool) -> None:
+    """The kernel says of a mountpoint what it says where a server cannot rename."""
+    tree = Card({b"/d/a": b"1", b"/e/b": b"2"})
+    tree.renames = renames
+    with pytest.raises(InvalidMove, match="root"):
+        await mv(tree, b"/", to=b"/d/new")
+    assert tree.files == {b"/d/a": b"1", b"/e/b": b"2"}
+    assert tree.directories == set()
 
 
 async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
