@@ -109,14 +109,14 @@ def _text(path: Path) -> str:
 
 
 def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
-    """Install, show or remove, for this user or, as root, for everybody.
+    """Install, show or remove, for this user; as root, or for a package, for everybody.
 
     Raises:
         UsageError: a file cannot be written or removed, or other users than root could change the program
             that all run.
     """
     program = own_program()
-    everybody = os.geteuid() == 0
+    everybody = os.geteuid() == 0 or bool(args.root)
     root = Path(args.root) if args.root else Path("/")
     pieces = list(
         for_everybody(parser, program, root) if everybody else for_user(parser, program, os.environ)

@@ -396,7 +396,7 @@ def _install_parser(name: str) -> Parser:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--print", action="store_true", help="show what would be written")
     what.add_argument("--remove", action="store_true", help="take it away again")
-    parser.add_argument("--root", metavar="DIR", help="below this directory, for packagers (as root)")
+    parser.add_argument("--root", metavar="DIR", help="all of it below this directory, for packagers")
     return parser
 
 

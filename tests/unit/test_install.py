@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -46,6 +47,16 @@ def test_what_is_written_is_removed_again(tmp_path: Path, capsys: pytest.Capture
     assert run_install("--root", str(tmp_path), "--remove") == 0
     assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
     assert run_install("--root", str(tmp_path), "--remove") == 0, "nothing is there any more"
+
+
+def test_a_packager_needs_not_be_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = tmp_path / "home"
+    for name in ("HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(name, str(home))
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert run_install("--root", str(tmp_path / "package")) == 0
+    assert (tmp_path / "package/etc/udev/rules.d/70-mavftpfs.rules").is_file()
+    assert not home.exists(), "the packager's own files are not touched"
 
 
 def test_a_user_needs_no_root(tmp_path: Path) -> None:
