@@ -35,6 +35,7 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code and prints errors as one line."""
+    _open_closed_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "-d" in words or "--debug" in words
     try:
@@ -54,6 +55,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             raise
         return _complain(f"internal error: {exc!r}; please report it with the output of -d", ExitCode.BUG)
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that the caller closed (`>&-`). Else sockets would get their numbers."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            os.dup2(null, number)
+            if null != number:
+                os.close(null)
+            setattr(sys, name, os.fdopen(number, mode))
 
 
 def _complain(message: str, code: int) -> int:

@@ -173,6 +173,15 @@ def test_a_reader_that_leaves_ends_a_command_as_sigpipe_would(tmp_path: Path) ->
         assert child.wait(90) == 128 + signal.SIGPIPE, "it did not do all that it was asked for"
 
 
+def test_streams_that_the_caller_closed_are_no_error(tmp_path: Path) -> None:
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path)}
+    command = f"{sys.executable} -m mavftpfs status <&- >&-"
+    done = subprocess.run(
+        ["sh", "-c", command], env=environment, stderr=subprocess.PIPE, text=True, timeout=90, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_ctrl_c_while_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> int:
         raise KeyboardInterrupt
