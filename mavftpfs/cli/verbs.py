@@ -35,7 +35,7 @@ from mavftpfs.client.progress import Progress, noting_losses
 from mavftpfs.client.source import target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, NotDelivered, UsageError, exit_code_for
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.private import make_private_directory
 from mavftpfs.shared.readable import printable, readable_size
 
@@ -328,19 +328,19 @@ def put(args: Args) -> int:
 def _spooled_stdin() -> Iterator[Path]:
     """Copy stdin to a file: its size has to be known before, and it may be sent twice.
 
-    Raises:
-        NotDelivered: the body did. The bytes are nowhere else, so they are kept, and the text says where.
+    If the body fails the bytes are nowhere else. So they are kept, and the text of its error says where.
     """
     with NamedTemporaryFile(prefix="mavftpfs-") as file:
         shutil.copyfileobj(sys.stdin.buffer, file)
         file.flush()
         try:
             yield Path(file.name)
-        except NotDelivered as exc:
+        except MavftpfsError as exc:
             directory = recovery_directory("stdin")
             make_private_directory(directory)
             kept = Path(shutil.copy(file.name, directory / "stdin"))
-            raise NotDelivered(f"{exc}; what came from stdin is kept in {kept}", there=exc.there) from exc
+            exc.args = (f"{exc}; what came from stdin is kept in {kept}",)
+            raise
 
 
 def _put(args: Args, component: int | None, function: Callable[..., Coroutine[Any, Any, None]]) -> int:

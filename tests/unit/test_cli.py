@@ -31,6 +31,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
     exit_code_for,
 )
+from tests.support.vehicles import free_udp_port
 
 SOURCE = "udpin:127.0.0.1:0"
 
@@ -180,6 +181,23 @@ def test_streams_that_the_caller_closed_are_no_error(tmp_path: Path) -> None:
         ["sh", "-c", command], env=environment, stderr=subprocess.PIPE, text=True, timeout=90, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_came_from_stdin_is_kept_if_there_is_no_vehicle(tmp_path: Path) -> None:
+    words = ["put", f"udpin:127.0.0.1:{free_udp_port()}", "-", "/fs/note.txt", "-o", "connect_timeout=1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mavftpfs", *words],
+        env={**os.environ, "XDG_STATE_HOME": str(tmp_path)},
+        input="made by a long computation\n",
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )
+    assert done.returncode == ExitCode.NO_VEHICLE
+    (kept,) = tmp_path.rglob("stdin")
+    assert done.stderr.rstrip().endswith(f"what came from stdin is kept in {kept}")
+    assert kept.read_text() == "made by a long computation\n"
 
 
 def test_ctrl_c_while_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
