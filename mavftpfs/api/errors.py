@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
@@ -26,6 +27,10 @@ class NotDelivered(OSError):
 
     on_vehicle: bool | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it, as pools of processes do with errors."""
+        return _not_delivered, (self.errno, self.strerror, self.on_vehicle)
+
 
 def os_error(error: MavftpfsError, text: str = "") -> Exception:
     """Return the error that a program gets in place of one of ours; with its text, unless another is given.
@@ -34,11 +39,9 @@ def os_error(error: MavftpfsError, text: str = "") -> Exception:
     """
     number, text = _number(error), readable(text or str(error))
     if isinstance(error, errors.NotDelivered):
-        told = _undelivered(type(OSError(number, text)))(number, f"{text} ({whereabouts(error.there)})")
-        told.on_vehicle = error.there
-        return told
+        return _not_delivered(number, f"{text} ({whereabouts(error.there)})", error.there)
     if isinstance(error, UsageError) and not isinstance(error.__cause__, OSError):
-        return UsageError(text)
+        return error if text == str(error) else UsageError(text)
     return OSError(number, text)
 
 
@@ -49,6 +52,8 @@ def translated() -> Iterator[None]:
         yield
     except MavftpfsError as exc:
         told = os_error(exc)
+        if told is exc:
+            raise
         raise told from (None if isinstance(told, UsageError) else exc)
 
 
@@ -75,8 +80,9 @@ def _number(error: MavftpfsError) -> int:
     return errno_for(error)
 
 
-def _undelivered(kind: type[OSError]) -> type[NotDelivered]:
-    """Return NotDelivered, of another kind of OSError, too."""
-    if kind is OSError:
-        return NotDelivered
-    return type("NotDelivered", (NotDelivered, kind), {"__module__": NotDelivered.__module__})
+def _not_delivered(number: int, text: str, there: bool | None) -> NotDelivered:
+    """Return a NotDelivered that is of the kind of an errno, too."""
+    kinds = (NotDelivered, type(OSError(number, text)))
+    error: NotDelivered = type("NotDelivered", kinds, {"__module__": NotDelivered.__module__})(number, text)
+    error.on_vehicle = there
+    return error

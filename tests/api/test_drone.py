@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import pickle
 import socket
 import threading
 from array import array
@@ -16,9 +17,12 @@ import numpy
 import pytest
 
 import mavftpfs
+from mavftpfs.api.errors import os_error
 from mavftpfs.api.params import Params
 from mavftpfs.client.mounted import MountedFiles
 from mavftpfs.protocol.payload import crc32
+from mavftpfs.shared import errors
+from mavftpfs.shared.errors import VehicleLost
 from tests.mount.conftest import Field
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
@@ -180,6 +184,16 @@ def test_errors_are_sentences(shared: mavftpfs.Drone, card: Path) -> None:
     assert caught.value.errno == errno.ENOENT
     with pytest.raises(OSError, match="may hold neither"):
         shared.stat("/a/../b")
+
+
+def test_what_was_not_delivered_can_be_pickled() -> None:
+    cause = VehicleLost("silent")
+    error = errors.NotDelivered("/f", there=False)
+    error.__cause__ = cause
+    told = pickle.loads(pickle.dumps(os_error(error)))
+    assert isinstance(told, mavftpfs.NotDelivered)
+    assert isinstance(told, TimeoutError)
+    assert (told.on_vehicle, str(told)) == (False, str(os_error(error)))
 
 
 def test_get_and_put(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:

@@ -426,6 +426,16 @@ async def test_a_file_that_was_given_up_is_not_closed_as_if_it_were_there(sim: S
     assert on_card(sim) == {"f": OLD}
 
 
+async def test_an_error_of_the_program_shows_its_own_place(sim: SimVehicle) -> None:
+    async def work(drone: mavftpfs.trio.Drone) -> None:
+        await drone.remove("/", recursive=True)
+
+    with pytest.raises(mavftpfs.UsageError) as caught:
+        async with mavftpfs.trio.connect(sim.source) as drone:
+            await work(drone)
+    assert "work" in [entry.name for entry in caught.traceback]
+
+
 @pytest.mark.mount
 async def test_many_files_at_once_through_a_mount(sim: SimVehicle, field: Field) -> None:
     """Each waits in a thread for the event loop, and that needs threads of its own: there are 40."""
