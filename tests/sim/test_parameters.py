@@ -61,6 +61,19 @@ def number(here: Rig, name: str) -> float:
     return table_of(here).number(name, here.server.firmware.now)
 
 
+def numbers(here: Rig) -> dict[str, float]:
+    """Return what the vehicle has by now, by name."""
+    return {one.name.decode(): one.number for one in table_of(here).visible(here.server.firmware.now)}
+
+
+def assert_nothing_written_back(here: Rig, before: dict[str, float], *but: str) -> None:
+    """What drifts has drifted on, and all others are what they were."""
+    drifting = {one.name.decode() for one in table_of(here).visible(here.server.firmware.now) if one.drift}
+    for name, value in numbers(here).items():
+        if name not in but:
+            assert value >= before[name] if name in drifting else value == before[name], name
+
+
 @asynccontextmanager
 async def vehicle(
     profile: str, *, link: LinkSettings = LINKS[0], parameters: list[Parameter] | None = None
@@ -77,6 +90,7 @@ class Editor:
     tree: Tree
     path: bytes = ALL
     lines: list[str] = field(default_factory=list)
+    backup: list[str] = field(default_factory=list)
     running: bool = True
 
     def ended(self) -> bool:
@@ -92,6 +106,14 @@ class Editor:
         self.lines = bytes(await file.read(0, file.size)).decode().splitlines()
         file.close()
         return self
+
+    async def back_up(self) -> None:
+        """Do what vim does before it saves: try to make a file beside it, and read the file once more."""
+        with pytest.raises(ReadOnly):
+            await self.tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: self)
+        lines = self.lines
+        self.backup = (await self.read()).lines
+        self.lines = lines
 
     def edit(self, name: str, value: str) -> Editor:
         found = [i for i, line in enumerate(self.lines) if line.partition(",")[0] == name]
@@ -112,6 +134,16 @@ class Editor:
 
 async def errors(tree: Tree) -> str:
     return (await read_file(tree, ERRORS)).decode()
+
+
+def gains(count: int) -> str:
+    """Return a text that sets as many values."""
+    return "".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(count))
+
+
+def taken(here: Rig, count: int) -> set[str]:
+    """Return which of these the vehicle has."""
+    return {f"GAIN_{i:03}" for i in range(count) if number(here, f"GAIN_{i:03}") == i + 0.5}
 
 
 def writes(here: Rig) -> int:
@@ -219,13 +251,10 @@ async def test_an_editor_sets_only_what_its_user_changed(profile: str, link: Lin
     async with vehicle(profile, link=link) as (here, tree):
         editor = await Editor(tree).read()
         await trio.sleep(30)
-        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
+        before = numbers(here)
         await editor.edit("GAIN_002", "0.5").edit("MODE_003", "77").save()
         assert (number(here, "GAIN_002"), number(here, "MODE_003")) == (0.5, 77)
-        for one in table_of(here).visible(here.server.firmware.now):
-            if one.name not in (b"GAIN_002", b"MODE_003"):
-                assert one.number >= before[one.name], one.name
-                assert one.drift or one.number == before[one.name]
+        assert_nothing_written_back(here, before, "GAIN_002", "MODE_003")
         assert await errors(tree) == ""
         assert "GAIN_002,0.5" in (await editor.read()).lines
 
@@ -242,61 +271,37 @@ async def test_a_file_unchanged_sends_nothing(profile: str) -> None:
             assert writes(here) == 0
 
 
-@MARKS
-async def test_an_editor_that_reads_again_for_its_backup(profile: str) -> None:
-    """vim tries to make a file beside it, reads the file once more, and saves what it had read first."""
-    async with vehicle(profile) as (here, tree):
-        editor = await Editor(tree).read()
-        lines = list(editor.lines)
-        for changes in (0, 1):
-            await trio.sleep(20)
-            with pytest.raises(ReadOnly):
-                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-            await editor.read()
-            editor.lines = list(lines)
-            if changes:
-                editor.edit("MODE_001", "5")
-            await editor.save()
-            assert here.count(Opcode.CREATE_FILE) == changes
-        assert number(here, "LEARNED_01") > 10
+VIM = {
+    "nothing, then one": [{}, {"MODE_001": "5"}],
+    "five each time": [{f"MODE_{5 * nth + i:03}": "77" for i in range(5)} for nth in range(3)],
+    "refused": [*[{"MODE_001": "rubbish"}] * (MAX_PROGRAM_READS + 2), {"MODE_001": "77"}],
+}
+"""What the user of a vim that stays open changes before each save."""
 
 
 @MARKS
-async def test_many_refused_saves_take_no_editor_its_base(profile: str) -> None:
-    async with vehicle(profile, parameters=many(drifting=5)) as (here, tree):
-        editor = await Editor(tree).read()
-        for value in (*["rubbish"] * (MAX_PROGRAM_READS + 2), "77"):
-            await trio.sleep(20)
-            with pytest.raises(ReadOnly):
-                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-            edited = editor.lines
-            await editor.read()
-            editor.lines = edited
-            before = [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")]
-            with pytest.raises(InvalidText) if value == "rubbish" else nullcontext():
-                await editor.edit("MODE_001", value).save()
-        assert number(here, "MODE_001") == 77
-        assert [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")] >= before
-
-
-@MARKS
-async def test_several_saves_of_one_editor_write_nothing_back(profile: str) -> None:
-    """What the user changed in the first save does not make the text less like what was read first."""
+@pytest.mark.parametrize("saves", VIM.values(), ids=VIM)
+async def test_vim_writes_nothing_back_however_often_it_saves(
+    profile: str, saves: list[dict[str, str]]
+) -> None:
+    """It reads the file anew each time, and saves what it had read first: neither what was saved nor what was
+    refused meanwhile takes it that base."""
     async with vehicle(profile, parameters=many(drifting=1)) as (here, tree):
-        editor = await Editor(tree).read()
-        for round_ in range(3):
+        vim = await Editor(tree).read()
+        for edits in saves:
             await trio.sleep(20)
-            with pytest.raises(ReadOnly):
-                await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-            edited = editor.lines
-            await editor.read()
-            editor.lines = edited
-            for number_ in range(5 * round_, 5 * round_ + 5):
-                editor.edit(f"MODE_{number_:03}", "77")
-            before = [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")]
-            await editor.save()
-            assert number(here, f"MODE_{5 * round_ + 4:03}") == 77
-            assert [number(here, name) for name in ("LEARNED_00", "STAT_RUNTIME")] >= before
+            await vim.back_up()
+            for name, value in edits.items():
+                vim.edit(name, value)
+            before, written = numbers(here), writes(here)
+            refused = "rubbish" in edits.values()
+            with pytest.raises(InvalidText) if refused else nullcontext():
+                await vim.save()
+            if edits and not refused:
+                assert {name: number(here, name) for name in edits} == {n: float(v) for n, v in edits.items()}
+                assert_nothing_written_back(here, before, *edits)
+            else:
+                assert writes(here) == written
 
 
 @MARKS
@@ -308,31 +313,24 @@ async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: 
         editor = await Editor(tree).read()
         edited = editor.edit("MODE_001", "5").edit(*bad.split(",")).lines
         await trio.sleep(20)
-        with pytest.raises(ReadOnly):
-            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-        backup = (await editor.read()).lines
-        editor.lines = edited
+        await editor.back_up()
         with pytest.raises((InvalidText, NotTaken)):
             await editor.save()
         said = await errors(tree)
         await trio.sleep(20)
-        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
-        editor.lines = backup
+        before = numbers(here)
+        editor.lines = editor.backup
         await editor.save()
-        for one in table_of(here).visible(here.server.firmware.now):
-            assert one.number >= before[one.name] or one.name in (b"MODE_001", b"CLAMPED"), one.name
+        assert_nothing_written_back(here, before, "MODE_001", "CLAMPED")
         assert (number(here, "MODE_001"), number(here, "CLAMPED")) == (1, 1)
         assert (await errors(tree)).startswith(said)
         assert ("put back" in await errors(tree)) is (bad == "CLAMPED,70")
         await trio.sleep(20)
-        before = {one.name: one.number for one in table_of(here).visible(here.server.firmware.now)}
-        with pytest.raises(ReadOnly):
-            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-        await editor.read()
+        before = numbers(here)
         editor.lines = edited
+        await editor.back_up()
         await editor.edit("MODE_002", "2").edit("CLAMPED", "1").save()
-        for one in table_of(here).visible(here.server.firmware.now):
-            assert one.number >= before[one.name], one.name
+        assert_nothing_written_back(here, before, "MODE_001")
         assert number(here, "MODE_001") == 5
         assert await errors(tree) == ""
 
@@ -344,15 +342,11 @@ async def test_many_programs_that_read_and_end_take_no_editor_its_base() -> None
         for _ in range(3 * MAX_READS):
             await trio.sleep(2)
             (await Editor(tree).read()).running = False
-        before = number(here, "LEARNED_01")
-        with pytest.raises(ReadOnly):
-            await tree.create(b"/@PARAM/4913", exclusive=True, program=lambda: editor)
-        edited = editor.edit("MODE_001", "5").lines
-        await editor.read()
-        editor.lines = edited
-        await editor.save()
+        before = numbers(here)
+        await editor.back_up()
+        await editor.edit("MODE_001", "5").save()
         assert number(here, "MODE_001") == 5
-        assert number(here, "LEARNED_01") >= before
+        assert_nothing_written_back(here, before, "MODE_001")
         (texts,) = (one for one in tree._texts if one.names[0] == b"params.parm")
         assert texts._remembered <= MAX_READS
 
@@ -570,12 +564,12 @@ async def test_arming_in_the_middle_ends_it(profile: str) -> None:
     async with vehicle(profile) as (here, tree):
         here.faults.at(Opcode.WRITE_FILE, here.vehicle.arm, nth=5)
         with pytest.raises(Armed):
-            await Editor(tree).save("".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(300)))
-        took = sum(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300))
-        assert took < 300
+            await Editor(tree).save(gains(300))
+        took = taken(here, 300)
+        assert len(took) < 300
         await here.disarm()
         await trio.sleep(120)
-        assert sum(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300)) == took
+        assert taken(here, 300) == took
 
 
 async def test_with_when_armed_ok_it_is_set_in_flight() -> None:
@@ -597,21 +591,19 @@ async def test_with_when_armed_ok_it_is_set_in_flight() -> None:
 )
 async def test_cut_in_the_middle(profile: str, opcode: Opcode, nth: int) -> None:
     """What took is said, and the next save completes it; half a value is never set."""
-    text = "".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(300))
     async with vehicle(profile) as (here, tree):
         await tree.stat(ALL)
         await trio.sleep(2)
-        before = {one.name: one.number for one in table_of(here).visible(0)}
+        before = numbers(here)
         here.faults.at(opcode, here.link.cut, nth=nth)
         with pytest.raises((RequestTimeout, VehicleLost)):
-            await Editor(tree).save(text)
+            await Editor(tree).save(gains(300))
         assert "set" in await errors(tree)
         await here.find()
         await trio.sleep(60)
-        for i in range(300):
-            assert number(here, f"GAIN_{i:03}") in (i + 0.5, before[b"GAIN_%03d" % i])
-        await Editor(tree).save(text)
-        assert all(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(300))
+        assert_nothing_written_back(here, before, *taken(here, 300))
+        await Editor(tree).save(gains(300))
+        assert len(taken(here, 300)) == 300
         assert await errors(tree) == ""
 
 
@@ -619,14 +611,12 @@ async def test_cut_in_the_middle(profile: str, opcode: Opcode, nth: int) -> None
 async def test_a_refused_upload_that_was_set_in_part_is_said(profile: str) -> None:
     async with vehicle(profile) as (here, tree):
         here.faults.refuse(Opcode.WRITE_FILE, NakCode.FAIL, nth=4)
-        text = "".join(f"GAIN_{i:03},{i + 0.5}\n" for i in range(100))
         with pytest.raises(MavftpfsError):
-            await Editor(tree).save(text)
+            await Editor(tree).save(gains(100))
         said = await errors(tree)
-        took = {name for name in said.rpartition("set: ")[2].strip().split(", ") if name != "nothing"}
-        assert took == {f"GAIN_{i:03}" for i in range(100) if number(here, f"GAIN_{i:03}") == i + 0.5}
-        await Editor(tree).save(text)
-        assert all(number(here, f"GAIN_{i:03}") == i + 0.5 for i in range(100))
+        assert taken(here, 100) == set(said.rpartition("set: ")[2].strip().split(", ")) - {"nothing"}
+        await Editor(tree).save(gains(100))
+        assert len(taken(here, 100)) == 100
 
 
 @MARKS

@@ -57,6 +57,7 @@ def test_the_size_is_learnt_from_a_later_packet_when_the_first_was_lost() -> Non
         data(1, 239, step=238),
         data(1, 239, step=240),
         data(2, 100, step=239),
+        data(2)._replace(offset=2 * 239 + 1),
         data(3)._replace(seq=SEQ + 1),
         data(0)._replace(offset=1),
         data(5)._replace(offset=0),
