@@ -9,7 +9,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, Payload, decode_request
 from mavftpfs.sim.vehicle import FtpServer
 
-_OPCODE, _REQ_OPCODE = 3, 5
+_OPCODE, _SIZE, _REQ_OPCODE = 3, 4, 5
+_TAKING = (Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME)
 
 
 @dataclass
@@ -36,11 +37,13 @@ class _Meeting:
 
 
 class Faults:
-    """Stands before a simulated vehicle's FTP server.
+    """Stands before a simulated vehicle's FTP server. Of each change of a name it asserts that neither that
+    file nor one below it is open (promise 6).
 
     Attributes:
         requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
         spoil: in so many more WriteFiles the first byte arrives as another one.
+        copies: copies of requests come late, so files are open by more than our doing.
     """
 
     def __init__(self, server: FtpServer) -> None:
@@ -54,6 +57,9 @@ class Faults:
         self._naks: list[tuple[Address, bytes]] = []
         self.spoil = 0
         self._repeated: set[int] = set()
+        self._server = server
+        self._taking: set[bytes] = set()
+        self.copies = False
         self._handle, self._outgoing = server.handle, server.outgoing
         server.handle = self._on_request  # type: ignore[method-assign]
         server.outgoing = self._on_replies  # type: ignore[method-assign]
@@ -116,6 +122,7 @@ class Faults:
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         if self._is_cut() or wire[_OPCODE] in self._deaf:
             return
+        self._require_closed(wire)
         self.requests.append(wire[_OPCODE])
         self._counted.pop(len(self.requests), lambda: None)()
         met = [meeting for meeting in self._meetings if meeting.comes(wire[_OPCODE])]
@@ -127,6 +134,14 @@ class Faults:
             self._naks.append((source, _refusal(decode_request(wire), naks[0])))
         elif not any(meeting.drop for meeting in met):
             self._handle(self._spoiled(wire), source, now)
+
+    def _require_closed(self, wire: bytes) -> None:
+        if self.copies or wire[_OPCODE] not in _TAKING or wire in self._taking:
+            return
+        self._taking.add(wire)  # the link may double it
+        for path in wire[HEADER_SIZE : HEADER_SIZE + wire[_SIZE]].split(b"\0"):
+            held = [opened for opened in self._server.open_paths if (opened + b"/").startswith(path + b"/")]
+            assert not path or not held, f"{Opcode(wire[_OPCODE]).name} of {path!r} while it is open"
 
     def _spoiled(self, wire: bytes) -> bytes:
         if wire[_OPCODE] != Opcode.WRITE_FILE or not self.spoil:
