@@ -73,7 +73,10 @@ async def open_tcp_server(spec: LinkSpec, inherited: Sequence[int] = ()) -> Asyn
         link.listener = listener
         for descriptor in inherited[1:]:
             peer = socket.socket(fileno=descriptor)
-            link.replace(peer, peer.getpeername()[:1])
+            try:
+                link.replace(peer, peer.getpeername()[:1])
+            except OSError:  # it was reset just now
+                peer.close()
 
         async def serve() -> None:
             async with trio.open_nursery() as nursery:

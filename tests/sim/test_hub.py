@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import struct
 import tracemalloc
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -29,6 +31,7 @@ from mavftpfs.link.hublink import (
     unpack_facts,
 )
 from mavftpfs.link.messages import Address
+from mavftpfs.link.opening import open_link
 from mavftpfs.link.rendezvous import ALONE, Door, knock, open_door
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
@@ -227,3 +230,16 @@ async def test_a_port_without_a_number_cannot_be_shared() -> None:
     with pytest.raises(LinkClosed, match="name a port"):
         async with open_shared(parse_source(f"udpin:{HOST}:0"), wish):
             pass
+
+
+async def test_a_connection_that_is_reset_while_it_is_handed_over_is_no_error() -> None:
+    with socket.create_server((HOST, 0)) as listener:
+        other = socket.create_connection(listener.getsockname())
+        peer, _ = listener.accept()
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        other.close()
+        spec = parse_source(f"tcpin:{HOST}:{listener.getsockname()[1]}")
+        async with open_link(spec, [os.dup(listener.fileno()), peer.detach()]) as link:
+            with socket.create_connection(listener.getsockname()) as again, trio.fail_after(60):
+                again.send(b"frame")
+                assert await link.receive() == [b"frame"]
