@@ -193,7 +193,7 @@ class LoopThread(Generic[T]):
         if os.getpid() != self._pid:
             raise RuntimeError(
                 f"the connection to {self._name} was made before a fork and belongs to the other process: "
-                "use threads, connect in each process to a link of its own, or go through a mount"
+                "connect in each process; those of one user share the port"
             )
         if threading.current_thread() is self._thread:
             raise RuntimeError("a call from the connection's own thread would wait for itself")

@@ -21,9 +21,13 @@ from mavftpfs.api.portal import Closed, Portal
 
 log = logging.getLogger("mavftpfs.api")
 
-READ_BUFFER = 256 * 1024
+READ_BUFFER = 128 * 1024
 WRITE_BUFFER = 128 * 1024
 """Bytes that are asked for, or handed on, at once."""
+
+FIRST_READ = 4 * 1024
+"""Bytes that a buffer asks for at first, and after a seek; twice as many each time, while a program reads on.
+A radio carries 5 kB in a second, and a program may want only the head of a file."""
 
 
 class Mode:
@@ -101,6 +105,7 @@ class RawFile(_Ending, io.RawIOBase):
         self._mode = mode
         self._pid = os.getpid()
         self._at = opened.size if mode.plain[0] == "a" else 0
+        self._read_to, self._ahead = -1, FIRST_READ
 
     @property
     def size(self) -> int:
@@ -120,12 +125,18 @@ class RawFile(_Ending, io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Fill the buffer as far as the file goes; returns the bytes."""
+        """Fill the buffer as far as the file goes, or less of a large one; returns the bytes."""
         self._require(self._mode.reads, "readable")
         view = memoryview(buffer).cast("B")
-        data = self._portal.call(self._opened.read, self._at, len(view))
+        size = len(view)
+        if self._mode.buffering != 0 and size <= READ_BUFFER:  # a program that wants more says how much
+            further = self._at == self._read_to
+            self._ahead = min(2 * self._ahead, READ_BUFFER) if further else FIRST_READ
+            size = min(size, self._ahead)
+        data = self._portal.call(self._opened.read, self._at, size)
         view[: len(data)] = data
         self._at += len(data)
+        self._read_to = self._at
         return len(data)
 
     def readall(self) -> bytes:

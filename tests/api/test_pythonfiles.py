@@ -142,3 +142,19 @@ def test_it_is_a_file_for_others(shared: mavftpfs.Drone, card: Path) -> None:
         assert file.name == f"/{card.name}/f"
         with pytest.raises(io.UnsupportedOperation):
             file.fileno()
+
+
+def test_a_small_read_fetches_little_and_reading_on_fetches_all(shared: mavftpfs.Drone, card: Path) -> None:
+    data = content("large", 400_000)
+    (card / "large").write_bytes(data)
+
+    def received() -> int:
+        return int(shared.status()["link"]["received_bytes"])
+
+    with shared.open(f"/{card.name}/large", "rb") as file:
+        before = received()
+        file.seek(150_000)
+        assert file.read(1000) == data[150_000:151_000]
+        assert received() - before < 20_000
+        file.seek(0)
+        assert b"".join(iter(lambda: file.read(1000), b"")) == data
