@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -152,11 +153,7 @@ class Drone:
 
     def mkdir(self, path: PathLike, *, parents: bool = False, exist_ok: bool = False) -> None:
         """Make a directory, and with `parents` those above it."""
-
-        async def work() -> None:
-            await self._drone.mkdir(path, parents=parents, exist_ok=exist_ok)
-
-        self._loop.call(work)
+        self._loop.call(partial(self._drone.mkdir, path, parents=parents, exist_ok=exist_ok))
 
     def rmdir(self, path: PathLike) -> None:
         """Remove an empty directory."""
@@ -164,11 +161,7 @@ class Drone:
 
     def remove(self, path: PathLike, *, recursive: bool = False) -> None:
         """Remove a file; with `recursive` a directory with all below, too."""
-
-        async def work() -> None:
-            await self._drone.remove(path, recursive=recursive)
-
-        self._loop.call(work)
+        self._loop.call(partial(self._drone.remove, path, recursive=recursive))
 
     unlink = remove
 
@@ -243,19 +236,11 @@ class Drone:
         verify: Verify = "auto",
     ) -> list[Path]:
         """Fetch a file, or with `recursive` a directory, proven; return the local files."""
-
-        async def work() -> list[Path]:
-            return await self._drone.get(path, local, recursive=recursive, verify=verify)
-
-        return self._loop.call(work)
+        return self._loop.call(partial(self._drone.get, path, local, recursive=recursive, verify=verify))
 
     def put(self, local: str | os.PathLike[str], path: PathLike, *, recursive: bool = False) -> list[str]:
         """Put a file, or with `recursive` a directory, on the vehicle; return the paths that are there."""
-
-        async def work() -> list[str]:
-            return await self._drone.put(local, path, recursive=recursive)
-
-        return self._loop.call(work)
+        return self._loop.call(partial(self._drone.put, local, path, recursive=recursive))
 
     def sync(
         self,
@@ -267,8 +252,5 @@ class Drone:
         verify: Verify = "auto",
     ) -> list[Path]:
         """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here."""
-
-        async def work() -> list[Path]:
-            return await self._drone.sync(local, place=place, newest=newest, since=since, verify=verify)
-
-        return self._loop.call(work)
+        call = partial(self._drone.sync, local, place=place, newest=newest, since=since, verify=verify)
+        return self._loop.call(call)

@@ -278,16 +278,10 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
 
 
 _FSSPEC_OPTIONS = {
-    *(
-        "use_listings_cache",
-        "listings_expiry_time",
-        "max_paths",
-        "skip_instance_cache",
-        "asynchronous",
-        "loop",
-    ),
-    *("batch_size", "add_docs", "add_aliases"),
+    *("use_listings_cache", "listings_expiry_time", "max_paths", "skip_instance_cache"),
+    *("asynchronous", "loop", "batch_size", "add_docs", "add_aliases"),
 }
+"""Options of every file system of fsspec's, which are not of a connection."""
 
 
 def _info(entry: Entry) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import trio
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
-from mavftpfs.client.mountpoint import enclosing_mount, is_ours, mounts
+from mavftpfs.client.mountpoint import OUR_TYPE, enclosing_mount, mounts
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import has_link, is_wanted, told_by, vehicle_below
 from mavftpfs.link.uri import LinkSpec
@@ -140,10 +140,8 @@ async def written(
         there: bool | None = None
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             there = await file.give_up()
-        if there and not whole:
-            there = (
-                None  # through a mount, a fork in mid-write closed a copy of the descriptor: a part is there
-            )
+        if there and not whole:  # a fork closed a copy of a mount's descriptor: a part is there
+            there = None
         tell(there)
         if isinstance(exc, errors.MavftpfsError):
             raise errors.NotDelivered(str(exc), there=there) from exc
@@ -261,7 +259,7 @@ async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
 async def mounts_on(spec: LinkSpec) -> list[Mapping[str, Any]]:
     """Return the status of each mount that has this link now and may be read by us."""
     found = []
-    for mountpoint in [path for path in mounts() if is_ours(path)]:
+    for mountpoint in [path for path, mount in mounts().items() if mount.type == OUR_TYPE]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await mount_status(mountpoint)
             if has_link(status, spec):
@@ -363,6 +361,8 @@ class Target:
 
 
 def session_of(vehicle: Attached, options: Options) -> Session:
+    """Return the files of a connection of our own."""
+
     async def acknowledged() -> Acknowledged:
         found: Any = vehicle.tree.status().get("transfers", [])
         return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}

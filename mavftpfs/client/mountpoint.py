@@ -138,7 +138,8 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
 
 def ours_below(path: str) -> list[str]:
     """Return the mountpoints of ours below another one."""
-    return [known for known in mounts() if known.startswith(path.rstrip("/") + "/") and is_ours(known)]
+    above = path.rstrip("/") + "/"
+    return [known for known, mount in mounts().items() if known.startswith(above) and mount.type == OUR_TYPE]
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:
