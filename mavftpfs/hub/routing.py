@@ -160,6 +160,9 @@ class Router:
             if not book.accepts(sender, where, now):
                 self._suspects[sender] = where
                 return False
+            if others is not None:  # it is silent there
+                del self._elsewhere[sender]
+                self._plans.clear()
             if before != where:
                 self._plans.clear()
                 self._suspects.pop(sender, None)

@@ -239,6 +239,14 @@ def test_a_vehicle_that_comes_back_at_another_address_is_no_second_one(net: Net)
     assert net.router.doubles == {}
 
 
+def test_a_vehicle_that_is_back_on_the_port_is_told_to_the_endpoint_that_spoke_for_it(net: Net) -> None:
+    net.now += PATIENCE + 1
+    net.send(attitude(ONE), EAST)
+    assert net.sides(attitude(ONE), PORT, AT_ONE) == set(), "it counts where it was heard last"
+    net.now += PATIENCE + 1
+    assert EAST in net.sides(attitude(ONE), PORT, AT_ONE)
+
+
 def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
     damaged = attitude(ONE)._replace(crc_fits=False)
     assert EAST in net.sides(damaged, PORT, AT_ONE)
