@@ -13,6 +13,7 @@ from typing import Any
 import trio
 
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.client.brought import NAME as MEMORY
 from mavftpfs.client.brought import Brought, Memory
 from mavftpfs.client.fetch import (
     Fetched,
@@ -401,7 +402,7 @@ async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes,
     logs = [
         _wanted(join(place, below), local / os.fsdecode(below), below, stat, keep_old=True)
         for below, stat in found
-        if stat.kind is EntryKind.FILE
+        if stat.kind is EntryKind.FILE and below != MEMORY.encode()  # local logs that were copied to the card
     ]
     return place, _apart(select(newest_first(logs), newest=wish.newest, since=wish.since)), unlisted
 

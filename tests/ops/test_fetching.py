@@ -511,6 +511,14 @@ async def test_the_logs_are_found(
     assert told
 
 
+async def test_the_card_s_copy_of_our_memory_does_not_replace_it(tmp_path: Path) -> None:
+    memory = tmp_path / ".mavftpfs-logs"
+    memory.write_text("ours\n")
+    _, told, _ = await sync(SpoiltTree({**LOGS, b"/fs/microsd/log/.mavftpfs-logs": b"theirs"}), tmp_path)
+    assert told == ["d/2.ulg", "d/1.ulg"]
+    assert memory.read_text() == "ours\n"
+
+
 async def test_a_log_that_grew_since_is_gone_on_with(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": BIG[:2000]})
     await sync(tree, tmp_path)
