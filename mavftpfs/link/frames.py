@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mavftpfs.link.framing import TARGETS, Verdict, frame_at, is_known
+from mavftpfs.link.framing import TARGETS, FrameBuffer, Verdict, frame_at, is_known
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_MODE_FLAG_SAFETY_ARMED, Address
 
 HEARTBEAT_ID = 0
@@ -31,55 +31,22 @@ class Frame(NamedTuple):
     crc_fits: bool
 
 
-class Splitter:
-    """Finds the frames in what one sender's datagrams, or a stream, bring.
+class Splitter(FrameBuffer[Frame]):
+    """Finds the frames in what one sender's datagrams, or a stream, bring."""
 
-    Attributes:
-        waiting: a stream ended in what may be the beginning of a frame.
-    """
-
-    def __init__(self, *, stream: bool) -> None:
-        self.waiting = False
-        self._stream = stream
-        self._tail = b""
-
-    def feed(self, data: bytes) -> list[Frame]:
-        """Take a datagram or a piece of the stream; return the frames that it completed."""
-        if self._tail:
-            if not self._stream and data[:1] in (b"\xfd", b"\xfe"):
-                self.reset()  # a datagram begins with a frame of its own: the cut one is lost
-            data = self._tail + data
-        return self._split(data, stream=self._stream)
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._tail = b""
-        self.waiting = False
-
-    def give_up(self) -> list[Frame]:
-        """The stream fell silent. A last frame that only lacked the byte behind it counts; the rest was no
-        frame."""
-        out: list[Frame] = []
-        while self._tail:
-            out += self._split(self._tail, stream=False)
-            self._tail = self._tail[1:]
-        self.waiting = False
-        return out
-
-    def _split(self, data: bytes, *, stream: bool) -> list[Frame]:
-        out: list[Frame] = []
+    def _take(self, data: bytes, out: list[Frame]) -> int:
         position, end = 0, len(data)
         while position < end:
-            verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
+            verdict, stop, message_id = frame_at(data, position, stream=self.stream, highest_id=_ANY_ID)
             if verdict is Verdict.PARTIAL:
                 break
-            if verdict is not Verdict.GARBAGE:
+            if verdict is Verdict.GARBAGE:
+                self.garbage += stop - position
+            else:
                 crc_fits = verdict is Verdict.WHOLE and is_known(message_id)
                 out.append(_frame(data[position:stop], message_id, crc_fits=crc_fits))
             position = stop
-        self._tail = data[position:]
-        self.waiting = self._stream and bool(self._tail)
-        return out
+        return position
 
 
 def _frame(data: bytes, message_id: int, *, crc_fits: bool) -> Frame:

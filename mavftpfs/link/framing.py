@@ -26,7 +26,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -139,18 +139,70 @@ def frame_at(
     return Verdict.WHOLE, stop, message_id
 
 
+FoundT = TypeVar("FoundT")
+
+
+class FrameBuffer(Generic[FoundT]):
+    """Keeps what came of a frame until the rest of it comes, in a stream or in a sender's datagrams.
+
+    Attributes:
+        stream: whether `feed` gets pieces of a stream instead of datagrams.
+        waiting: a stream ended in what may be the beginning of a frame.
+        garbage: bytes that were in no frame.
+    """
+
+    def __init__(self, *, stream: bool) -> None:
+        self.stream = stream
+        self.waiting = False
+        self.garbage = 0
+        self._tail = b""
+
+    def feed(self, data: bytes) -> list[FoundT]:
+        """Take a piece of the stream, or a datagram, and return what it completed."""
+        if self._tail:
+            if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
+                self.reset()  # a datagram begins with a frame of its own: the cut one is lost
+            data = self._tail + data
+        out: list[FoundT] = []
+        position = self._take(data, out)
+        self._tail = data[position:]
+        self.waiting = self.stream and position < len(data)
+        return out
+
+    def reset(self) -> None:
+        """Forget a half-received frame: the stream was reopened."""
+        self.garbage += len(self._tail)
+        self._tail = b""
+        self.waiting = False
+
+    def give_up(self) -> list[FoundT]:
+        """The stream fell silent within a frame, so that was no frame, unless it only lacked the byte behind
+        it. Return what is found in the rest."""
+        out: list[FoundT] = []
+        was_stream, self.stream = self.stream, False  # as at the end of a datagram: nothing more decides
+        while self._tail:
+            out += self.feed(b"")
+            self.garbage += bool(self._tail)
+            self._tail = self._tail[1:]
+        self.stream = was_stream
+        return out
+
+    def _take(self, data: bytes, out: list[FoundT]) -> int:
+        """Append what whole frames give; return where a frame begins that is not whole yet."""
+        raise NotImplementedError
+
+
 @dataclass(slots=True)
 class FramerStats:
     """Plain sums. bad_signature also counts unsigned frames that were refused. bad_time: frames among these
-    that the right key signed, but too long ago. garbage_bytes: in no frame."""
+    that the right key signed, but too long ago."""
 
     bad_crc: int = 0
     bad_signature: int = 0
     bad_time: int = 0
-    garbage_bytes: int = 0
 
 
-class Framer:
+class Framer(FrameBuffer[Message]):
     """Both directions of one connection.
 
     Args:
@@ -160,9 +212,6 @@ class Framer:
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
             or the vehicle refuses us.
         on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
-
-    Attributes:
-        waiting: a stream ended in what may be the beginning of a frame.
 
     Raises:
         UsageError: the key has another length.
@@ -177,11 +226,9 @@ class Framer:
         signing_clock: Callable[[], int] | None = None,
         on_frame: Callable[[bytes], None] | None = None,
     ) -> None:
+        super().__init__(stream=stream)
         self.stats = FramerStats()
         self.on_frame = on_frame
-        self.stream = stream
-        self.waiting = False
-        self._tail = b""
         self._codec = FtpFrameCodec(source, _CRC_EXTRA[FTP_MESSAGE_ID])
         self._decoder = dialect.MAVLink(None)
         self._sender = dialect.MAVLink(None, source.system, source.component)
@@ -212,13 +259,7 @@ class Framer:
 
     # ------------------------------------------------------------------ receiving
 
-    def feed(self, data: bytes) -> list[Message]:
-        """Take a piece of the stream, or a datagram, and return the messages it completed."""
-        if self._tail:
-            if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
-                self.reset()
-            data = self._tail + data
-        out: list[Message] = []
+    def _take(self, data: bytes, out: list[Message]) -> int:
         position = after = 0
         while True:
             if self._check is None:
@@ -231,28 +272,7 @@ class Framer:
             if after == position:
                 break
             position = after
-        self._tail = data[position:]
-        self.waiting = self.stream and position < len(data)
-        return out
-
-    def reset(self) -> None:
-        """Forget a half-received frame: the stream was reopened."""
-        self.stats.garbage_bytes += len(self._tail)
-        self._tail = b""
-        self.waiting = False
-
-    def give_up(self) -> list[Message]:
-        """The stream fell silent within a frame, so that was no frame. Return what is found behind its first
-        byte."""
-        out: list[Message] = []
-        self.stream = False  # as at the end of a datagram: nothing more decides
-        try:
-            while self._tail:
-                out += self.feed(b"")
-                self._tail = self._tail[self._skip(0, min(1, len(self._tail))) :]
-        finally:
-            self.stream = True
-        return out
+        return position
 
     def _report_run(self, data: bytes, start: int, stop: int) -> None:
         while start < stop and self.on_frame is not None:
@@ -265,17 +285,13 @@ class Framer:
         verdict, stop, message_id = frame_at(data, position, stream=self.stream)
         match verdict:
             case Verdict.GARBAGE:
-                return self._skip(position, stop)
+                self.garbage += stop - position
             case Verdict.DAMAGED:
                 self.stats.bad_crc += 1
             case Verdict.WHOLE:
                 frame = data[position:stop]
                 signed = frame[0] == _V2 and frame[2] == _SIGNED
                 self._accept(frame, message_id, signed, out)
-        return stop
-
-    def _skip(self, start: int, stop: int) -> int:
-        self.stats.garbage_bytes += stop - start
         return stop
 
     def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:

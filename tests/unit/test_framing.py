@@ -180,7 +180,7 @@ def damaged(at: int = 100, frame: bytes = b"") -> bytes:
 def test_damage_costs_one_frame(data: bytes, found: list[Message], bad_crc: int, garbage: int) -> None:
     framer = Framer(US, stream=True)
     assert feed(framer, data) == found
-    assert (framer.stats.bad_crc, framer.stats.garbage_bytes) == (bad_crc, garbage)
+    assert (framer.stats.bad_crc, framer.garbage) == (bad_crc, garbage)
 
 
 def test_a_damaged_last_frame_waits_for_what_follows_but_in_a_datagram() -> None:
@@ -199,7 +199,7 @@ def test_a_frame_split_over_datagrams_by_a_bridge_is_joined_but_never_holds_up_a
     assert feed(framer, frame[99:] + heartbeat()) == [FTP, HEARTBEAT]
     assert feed(framer, frame[:50]) == []
     assert feed(framer, heartbeat()) == [HEARTBEAT]
-    assert framer.stats.garbage_bytes == 50
+    assert framer.garbage == 50
 
 
 def test_unknown_incompatible_flags_are_refused_and_a_signature_is_waited_for() -> None:
@@ -222,7 +222,7 @@ def test_reset_forgets_half_a_frame() -> None:
     feed(framer, ftp()[:60])
     framer.reset()
     assert feed(framer, ftp()) == [FTP]
-    assert framer.stats.garbage_bytes == 60
+    assert framer.garbage == 60
 
 
 def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

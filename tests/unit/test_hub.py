@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import random
-from itertools import pairwise
-
 import pytest
 
 from mavftpfs.hub.outbox import LINE_TIME, Line, Outbox, Waiting
@@ -83,32 +80,6 @@ def test_a_damaged_frame_passes_and_proves_nothing() -> None:
     frame = parsed(bytes(good))
     assert not frame.crc_fits
     assert frame.data == bytes(good)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_a_stream_gives_the_same_frames_however_it_is_cut(seed: int) -> None:
-    rng = random.Random(seed)
-    framer = Framer(ONE, stream=True)
-    parts: list[bytes] = []
-    for step in range(60):
-        parts.append(framer.encode(*telemetry(step, step)) if step % 3 else foreign(TWO, 40_000 + step))
-        parts.append(rng.randbytes(rng.randrange(4)).replace(b"\xfd", b"").replace(b"\xfe", b""))
-    sent = parts[::2]
-    data = b"".join(parts) + framer.encode_heartbeat(2)
-    cuts = sorted(rng.sample(range(len(data)), 40))
-    splitter = Splitter(stream=True)
-    found = [
-        frame.data
-        for start, stop in pairwise([0, *cuts, len(data)])
-        for frame in splitter.feed(data[start:stop])
-    ]
-    found += [frame.data for frame in splitter.give_up()]
-    missing = [frame for frame in sent if frame not in found]
-    # An unknown frame in front of garbage cannot be told from garbage.
-    assert all(
-        frame[7:10] != b"\x1e\0\0" and int.from_bytes(frame[7:10], "little") >= 40_000 for frame in missing
-    )
-    assert found[:-1] == [frame for frame in sent if frame in found]
 
 
 def test_what_a_stream_ended_in_counts_when_it_falls_silent() -> None:
