@@ -34,7 +34,7 @@ from mavftpfs.link.hublink import (
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.rendezvous import Door
-from mavftpfs.link.samelink import leads_back
+from mavftpfs.link.samelink import leads_back, same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
 
@@ -205,10 +205,9 @@ class Hub:
                 "another version of mavftpfs has the port; end its mounts, or: mavftpfs hub --stop --force"
             )
         spec = parse_source(hello["join"])
-        anywhere = {"0.0.0.0", "::"}
-        if spec.host != self.spec.host and not {spec.host, self.spec.host} & anywhere:
+        if not same_link(spec, self.spec):
             raise LinkClosed(
-                f"port {spec.port} of {self.spec.host} is shared already; of {spec.host} it cannot be"
+                f"{self.spec.description} is shared already, so {spec.description} cannot be opened"
             )
         forward = tuple(map(str, hello.get("forward", ())))
         self._joining.append(forward)

@@ -63,10 +63,9 @@ class Running:
         sock.connect(str(door))
         return sock
 
-    async def joined(self, *forward: str, again: bool = False) -> HubLink:
+    async def joined(self, *forward: str, source: str = "") -> HubLink:
         """Return another client."""
-        wish = Wish(US, forward)
-        return await join(self.knock(), parse_source(self.source), wish, None, again=again)
+        return await join(self.knock(), parse_source(source or self.source), Wish(US, forward), None)
 
     async def status(self) -> dict[str, Any]:
         with self.knock() as sock:
@@ -185,6 +184,14 @@ async def test_a_port_is_shared_while_its_vehicle_restarts(
         source = f"tcp:{HOST}:{server.getsockname()[1]}"
     async with running(tmp_path, source=source) as here:
         assert len((await here.status())["clients"]) == 1
+
+
+async def test_only_the_same_port_is_shared(tmp_path: Path, autojump_clock: trio.testing.MockClock) -> None:
+    async with running(tmp_path) as here:
+        anywhere, elsewhere = (here.source.replace(HOST, host) for host in ("0.0.0.0", "127.0.0.2"))
+        await (await here.joined(source=anywhere)).aclose()
+        with pytest.raises(Refused, match="is shared already"):
+            await here.joined(source=elsewhere)
 
 
 # -- clients and doors ----------------------------------------------------------------------------
