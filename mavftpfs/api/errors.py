@@ -57,6 +57,14 @@ def translated() -> Iterator[None]:
         raise told from (None if isinstance(told, UsageError) else exc)
 
 
+def note_or_raise(undelivered: NotDelivered, error: BaseException | None) -> None:
+    """Note on the error of a `with` statement's body that its file was not delivered. Raise that instead, if
+    the body had no error, or one of a file."""
+    if error is None or isinstance(error, OSError):
+        raise undelivered
+    error.add_note(str(undelivered))
+
+
 def whereabouts(there: bool | None) -> str:
     """Return the words about a file that was not delivered; see NotDelivered.on_vehicle."""
     if there is None:

@@ -15,7 +15,7 @@ import os
 import warnings
 from typing import IO, Any
 
-from mavftpfs.api.errors import NotDelivered, whereabouts
+from mavftpfs.api.errors import NotDelivered, note_or_raise, whereabouts
 from mavftpfs.api.opened import Opened
 from mavftpfs.api.portal import Closed, Portal
 
@@ -82,9 +82,7 @@ class _Ending:
         try:
             self.close()  # type: ignore[attr-defined]
         except NotDelivered as exc:
-            if error is None or isinstance(error, OSError):
-                raise
-            error.add_note(str(exc))
+            note_or_raise(exc, error)
 
 
 class RawFile(_Ending, io.RawIOBase):

@@ -8,6 +8,7 @@ from typing import IO, Any, TypeVar
 
 import trio
 
+from mavftpfs.api.errors import NotDelivered, note_or_raise
 from mavftpfs.api.opened import Opened
 
 ResultT = TypeVar("ResultT")
@@ -97,8 +98,11 @@ class AsyncFile:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        """Close it."""
-        await self.aclose()
+        """Close it. If the body was interrupted, that error stays, with a note of what became of the file."""
+        try:
+            await self.aclose()
+        except NotDelivered as exc:
+            note_or_raise(exc, error)
 
     def __aiter__(self) -> AsyncIterator[Any]:
         """Yield the lines."""

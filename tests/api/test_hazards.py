@@ -426,6 +426,18 @@ async def test_a_file_that_was_given_up_is_not_closed_as_if_it_were_there(sim: S
     assert on_card(sim) == {"f": OLD}
 
 
+async def test_an_error_of_the_program_is_not_replaced_by_that_of_its_file(sim: SimVehicle) -> None:
+    async def write_half(drone: mavftpfs.trio.Drone) -> None:
+        async with await drone.open("/f", "w") as file:
+            await file.write("half")
+            raise KeyError("of the program")
+
+    async with mavftpfs.trio.connect(sim.source, **QUICK) as drone:
+        with silent(sim), pytest.raises(KeyError) as caught:
+            await write_half(drone)
+    assert "withdrawn" in caught.value.__notes__[0]
+
+
 async def test_an_error_of_the_program_shows_its_own_place(sim: SimVehicle) -> None:
     async def work(drone: mavftpfs.trio.Drone) -> None:
         await drone.remove("/", recursive=True)
