@@ -6,11 +6,12 @@ itself and counts it. LinkClosed means that it will never work again.
 
 from __future__ import annotations
 
+import socket
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import trio
 
@@ -113,6 +114,18 @@ class Link(Protocol):
     async def aclose(self) -> None:
         """Flush what can be flushed at once and close."""
         ...
+
+
+async def look_up(host: str, port: int, kind: socket.SocketKind, flags: int = 0) -> list[Any]:
+    """Return what `getaddrinfo` says.
+
+    Raises:
+        OSError: there is no such host; also for a text that cannot be a host name.
+    """
+    try:
+        return await trio.socket.getaddrinfo(host, port, type=kind, flags=flags)
+    except UnicodeError as exc:
+        raise socket.gaierror(socket.EAI_NONAME, f"{host!r} is no host name") from exc
 
 
 def pack(frames: Sequence[bytes]) -> Iterable[bytes]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import trio
 
 from mavftpfs.link.addresses import PATIENCE
-from mavftpfs.link.base import background
+from mavftpfs.link.base import background, look_up
 from mavftpfs.link.stream import Pipe, StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
 
@@ -93,7 +93,7 @@ async def _connect(spec: LinkSpec) -> socket.socket:
     Raises:
         OSError: that of the last address.
     """
-    found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_STREAM)
+    found = await look_up(spec.host, spec.port, socket.SOCK_STREAM)
     problem: OSError = OSError(errno.EHOSTUNREACH, "no address")
     for family, kind, protocol, _, address in found[:_MAX_ADDRESSES]:
         with trio.socket.socket(family, kind, protocol) as sock:
@@ -110,9 +110,7 @@ async def _connect(spec: LinkSpec) -> socket.socket:
 
 
 async def _listen(spec: LinkSpec) -> socket.socket:
-    found = await trio.socket.getaddrinfo(
-        spec.host, spec.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-    )
+    found = await look_up(spec.host, spec.port, socket.SOCK_STREAM, socket.AI_PASSIVE)
     family, kind, protocol, _, address = found[0]
     listener = socket.socket(family, kind, protocol)
     try:

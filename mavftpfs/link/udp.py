@@ -19,7 +19,7 @@ from dataclasses import replace
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox, Seat, background, pack
+from mavftpfs.link.base import LinkStats, Outbox, Seat, background, look_up, pack
 from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
@@ -252,7 +252,7 @@ async def open_udp(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterat
 
 async def _resolve(spec: LinkSpec) -> tuple[socket.AddressFamily, NetAddress]:
     try:
-        found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_DGRAM)
+        found = await look_up(spec.host, spec.port, socket.SOCK_DGRAM)
     except OSError as exc:
         raise LinkClosed(
             f"{spec.description}: host {spec.host!r} is unknown ({exc.strerror or exc})"

@@ -490,3 +490,11 @@ async def test_serial_waits_without_spinning() -> None:
             await link.receive()
             pytest.fail("nothing was sent")
         assert link.connected
+
+
+@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
+@pytest.mark.parametrize("host", ["a..b", "\N{SNOWMAN}.example"])
+async def test_what_cannot_be_a_host_name_is_said(kind: str, host: str) -> None:
+    with pytest.raises(LinkClosed, match="is no host name"):
+        async with opened(f"{kind}:{host}:5760"):
+            pass
