@@ -68,15 +68,13 @@ async def fetch(context: Context, node: Node, draft: Draft) -> None:
         NoSpace; else as read_base.
     """
     assert draft.base is not None
-    uncut = draft.base_limit == draft.base.size
-    if context.directories.tells_times or not uncut or draft.base.size > context.options.verify_max:
-        for start, stop in draft.missing_base():
-            for at in range(start, stop, STEP):
-                draft.fill(at, await read_base(context, node, at, min(at + STEP, stop)))
-        return
+    size = draft.base.size
+    summed = not context.directories.tells_times and draft.base_limit == size <= context.options.verify_max
     value = 0
-    for at in range(0, draft.base.size, STEP):
-        data = await read_base(context, node, at, min(at + STEP, draft.base.size))
-        value = crc32(data, value)
-        draft.fill(at, data)
-    draft.base = replace(draft.base, crc32=value)
+    for start, stop in [(0, size)] if summed else draft.missing_base():
+        for at in range(start, stop, STEP):
+            data = await read_base(context, node, at, min(at + STEP, stop))
+            value = crc32(data, value)
+            draft.fill(at, data)
+    if summed:
+        draft.base = replace(draft.base, crc32=value)

@@ -60,8 +60,8 @@ class Names:
 
     # --- asking
 
-    async def size(self, path: bytes) -> int:
-        """Return the size of a file on the vehicle, asked just now.
+    async def size(self, path: bytes) -> int | None:
+        """Return the size of a file on the vehicle, asked just now; None if there is none.
 
         Opening a file takes the server's one session. Where OpenFileWO empties files, an upload that gives
         way for that loses all it sent. There the directory is listed instead.
@@ -75,7 +75,12 @@ class Names:
             entry = await context.directories.current(path)
             if entry is not None:
                 return entry.size
-        return await context.store.stat_size(path)
+        try:
+            return await context.store.stat_size(path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            return None
 
     async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
         """Return whether a name is free, in every spelling that the card takes for it: it is opened now.

@@ -9,7 +9,6 @@ logged and counted. In doubt it is read back instead, past every cache.
 
 from __future__ import annotations
 
-import errno
 import logging
 from contextlib import suppress
 
@@ -17,7 +16,6 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
-from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
     FileChanged,
@@ -74,7 +72,7 @@ class Verifier:
         if crc32 is not None and crc32 != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
         if not crc32:
-            size = await self._size(path)
+            size = await self._names.size(path)
             if size is None:
                 raise VerificationFailed(f"{path!r} is not there any more")
             if size != draft.size:
@@ -107,19 +105,10 @@ class Verifier:
                     return answer is Sameness.SAME
         if timed:
             return True
-        size = await self._size(path)
+        size = await self._names.size(path)
         return size is not None and compare(base, Opened(size)) is Sameness.SAME
 
     # --- inside
-
-    async def _size(self, path: bytes) -> int | None:
-        """Return the size of a file on the vehicle, None if there is none."""
-        try:
-            return await self._names.size(path)
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-            return None
 
     def _go_without(self, path: bytes, error: Exception) -> None:
         """Note that no checksum came.
