@@ -20,7 +20,6 @@ from mavftpfs.cache.texts import (
     Texts,
     cause_of,
     problems_refused,
-    require_found,
 )
 from mavftpfs.cache.virtual import PARAM_FILE
 from mavftpfs.parameters.own import is_own
@@ -93,7 +92,8 @@ class Parameters(Texts[Base]):
 
     def _render(self, name: bytes, snapshot: Snapshot, differing: Sequence[Parameter] | None) -> Shown[Base]:
         if name == CHANGED:
-            differing = require_found(differing, name)
+            if differing is None:
+                raise NotFound(f"the vehicle tells no defaults, so {name.decode()} has nothing to show")
             values = {one.name: one for one in differing}
             return Shown(render_changed(differing).encode(), values, snapshot.since_ns)
         text = render_all(snapshot.parameters)

@@ -32,7 +32,6 @@ from mavftpfs.shared.errors import (
     InvalidText,
     LocalProtocolError,
     MavftpfsError,
-    NotFound,
     NotTaken,
     ReadOnly,
     RemoteProtocolError,
@@ -514,14 +513,3 @@ def cause_of(failure: MavftpfsError | None, missed: str) -> MavftpfsError:
     answered all of it. missed: what the vehicle did not take.
     """
     return NotTaken(missed) if failure is None or isinstance(failure, FtpNak) else failure
-
-
-def require_found(found: B | None, name: bytes) -> B:
-    """Return what was found.
-
-    Raises:
-        NotFound.
-    """
-    if found is None:
-        raise NotFound(f"the vehicle has nothing that {name.decode()} would show")
-    return found
