@@ -11,7 +11,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
-from tests.support.mounts import abort_mount, mavftpfs, mounted_at, processes_in, wait_until
+from tests.support.mounts import abort_mount, mavftpfs, mounted_at, processes_in, unmount, wait_until
 from tests.support.vehicles import HOST, PROJECT, free_udp_port
 
 NOBODY = f"udpin:{HOST}:0"
@@ -95,7 +95,7 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
         assert "sizes" in mount.run("ls", mount.path).stdout.split()
         pids = processes_in(mount.path)
         assert len(pids) == 1
-        subprocess.run(["fusermount3", "-u", str(mount.path)], check=True, timeout=30)
+        unmount(mount.path)
         wait_until("the daemon ended", lambda: not processes_in(mount.path))
     finally:
         abort_mount(mount.path)

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from mavftpfs.client.control import ask
-from tests.support.mounts import abort_mount, wait_until
+from tests.support.mounts import abort_mount, unmount, wait_until
 from tests.support.vehicles import PROJECT
 
 
@@ -66,7 +66,7 @@ class KernelServer:
     def end(self) -> None:
         """Unmount; the process must end with 0."""
         try:
-            subprocess.run(["fusermount3", "-u", str(self.path)], check=True, timeout=90)
+            unmount(self.path)
             assert self.process.wait(90) == 0
         finally:
             abort_mount(self.path)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, wait_until
+from tests.support.mounts import COMMAND_TIMEOUT, Mount, wait_until
 from tests.support.trees import content
 from tests.support.vehicles import UdpVehicle
 
@@ -130,7 +130,7 @@ with concurrent.futures.ThreadPoolExecutor(len(names)) as pool:
 @pytest.mark.holds("promise 8")
 def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     vehicle = field.sim(tree)
-    mount = field.mount(vehicle.source, "dir_timeout=600")  # stat is to need nothing of the vehicle
+    mount = field.mount(vehicle.source, "dir_timeout=600", "op_deadline=600")  # stat is to need no vehicle
     names = mount.run("ls", mount.path / "many").stdout.split()[:120]
     assert len(names) == 120
     vehicle.pause()
@@ -138,8 +138,8 @@ def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
         assert readers.stdout is not None
         readers.stdout.readline()
         time.sleep(1.0)
-        mount.run("df", mount.path, timeout=25)
-        mount.run("stat", mount.path / "many" / names[0], timeout=25)
+        mount.run("df", mount.path)
+        mount.run("stat", mount.path / "many" / names[0])
         vehicle.resume()
         out, errors = readers.communicate(timeout=120)
     assert readers.returncode == 0, errors
@@ -160,9 +160,11 @@ def test_the_link_is_free_once_a_copy_was_interrupted(field: Field, tmp_path: Pa
     began = received()
     with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
         wait_until("the copy is under way", lambda: received() - began > 2 * rate)
+        at = received()
         copy.send_signal(signal.SIGINT)
-        copy.wait(20)
-    wait_until("its reads ended", lambda: mount.status()["connection"]["in_flight"] == 0, timeout=5)
+        copy.wait(COMMAND_TIMEOUT)
+    wait_until("its reads ended", lambda: mount.status()["connection"]["in_flight"] == 0)
+    assert received() - at < 6 * rate, "what was on its way, not the rest of what the kernel asked for"
     before = received()
     time.sleep(3)
     assert received() - before < rate / 2, "no more than heartbeats, and what was on its way"

@@ -28,9 +28,11 @@ from tests.support.mounts import COMMAND_TIMEOUT, mavftpfs, wait_until
 from tests.support.mounts import command as run
 from tests.support.neighbours import Beating
 from tests.support.places import start_place
-from tests.support.vehicles import HOST, PROJECT, SimVehicle, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, Program, SimVehicle, free_udp_port
 
-SLOW = ("--rate", "100000", "--delay", "0.01")
+SLOW = ("--rate", "20000", "--delay", "0.01")
+"""So that progress is drawn before the first file is here: five times a second, if the machine has time."""
+
 FAR = ("--delay", "0.2")
 """So that a growing log has grown between its last read and the next question, on a busy machine too."""
 
@@ -287,9 +289,21 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
 # -- by itself ------------------------------------------------------------------------------------
 
 
+def watching(field: Field, source: object, local: Path, *words: str) -> Program:
+    """Start `sync --watch`, which is ended before the mounts that are there."""
+    argv = ["mavftpfs.__main__", "sync", str(source), str(local), "--watch", *words]
+    watch = Program("sync", argv, field.local("sync"))
+    field.own(watch)
+    return watch
+
+
 @pytest.mark.parametrize(
     ("kind", "mounted"),
-    [pytest.param("px4", "never", marks=pytest.mark.soak), ("ardupilot", "before"), ("px4", "later")],
+    [
+        pytest.param("px4", "never", marks=pytest.mark.soak),
+        pytest.param("ardupilot", "before", marks=pytest.mark.soak),  # later is with a mount, too
+        ("px4", "later"),
+    ],
 )
 def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, mounted: str) -> None:
     place = start_place(field, kind)
@@ -299,24 +313,18 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
     if mounted == "before":
         field.mount(vehicle.source)
     write_log(card / "1.BIN", 50_000, 1, 1)
-    handed, local, said = tmp_path / "handed", tmp_path / "logs", tmp_path / "said"
-    command = f"sh -c 'basename \"$1\" >> {handed}' sh"
-    words = argv("sync", vehicle.source, local, "--watch", "--exec", command)
-    with (
-        said.open("wb") as output,
-        subprocess.Popen(words, stdout=output, stderr=output, cwd=PROJECT) as child,
-    ):
-        wait_until("the first log was handed on", lambda: handed.read_text() == "1.BIN\n")
-        if mounted == "later":
-            field.mount(vehicle.source)
-        vehicle.react(signal.SIGUSR1)  # armed
-        wait_until("that is noticed", lambda: "vehicle 1 is armed" in said.read_text())
-        write_log(card / "2.BIN", 60_000, 2, 2)
-        vehicle.react(signal.SIGUSR1)
-        wait_until("the second, too", lambda: handed.read_text() == "1.BIN\n2.BIN\n")
-        child.send_signal(signal.SIGTERM)
-        assert child.wait(COMMAND_TIMEOUT) == 0
-    out = said.read_text()
+    handed, local = tmp_path / "handed", tmp_path / "logs"
+    watch = watching(field, vehicle.source, local, "--exec", f"sh -c 'basename \"$1\" >> {handed}' sh")
+    wait_until("the first log was handed on", lambda: handed.read_text() == "1.BIN\n")
+    if mounted == "later":
+        field.mount(vehicle.source)
+    vehicle.react(signal.SIGUSR1)  # armed
+    wait_until("that is noticed", lambda: "vehicle 1 is armed" in watch.text())
+    write_log(card / "2.BIN", 60_000, 2, 2)
+    vehicle.react(signal.SIGUSR1)
+    wait_until("the second, too", lambda: handed.read_text() == "1.BIN\n2.BIN\n")
+    assert watch.stop() == 0
+    out = watch.text()
     assert out.splitlines()[-1] == "ended; the next run goes on"
     assert out.count("is here, verified by size and CRC32") == 2
     assert ("a mount has this vehicle now" in out) is (mounted == "later")
@@ -327,30 +335,24 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path, kind: str, m
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("how", ["armed", "refused"])
 def test_a_transfer_by_a_mount_lets_go(field: Field, tmp_path: Path, how: str) -> None:
-    root, local, said = field.local("card"), tmp_path / "logs", tmp_path / "said"
+    root, local = field.local("card"), tmp_path / "logs"
     vehicle = field.counted_sim(root, "px4")
     write_log(root / "fs/microsd/log/1.ulg", 400_000, 1, 1)
     mount = field.mount(vehicle.source, "bwlimit=10000")
-    with (
-        said.open("wb") as output,
-        subprocess.Popen(
-            argv("sync", mount.path, local, "--watch"), stdout=output, stderr=output, cwd=PROJECT
-        ) as child,
-    ):
-        wait_until("some of the log came", lambda: any(part.stat().st_size for part in local.rglob("*.part")))
-        if how == "armed":
-            vehicle.do(vehicle.vehicle.arm)
-        else:
-            vehicle.do(lambda: vehicle.vehicle.say(3, "Arming denied: high throttle"))
-        wait_until("that is noticed", lambda: "the transfer waits" in said.read_text())
-        wait_until("its session is closed", lambda: not vehicle.sessions())
-        asked = vehicle.asked()
-        time.sleep(2.0)
-        assert vehicle.asked() == asked
-        child.send_signal(signal.SIGTERM)
-        assert child.wait(COMMAND_TIMEOUT) == 0
+    watch = watching(field, mount.path, local)
+    wait_until("some of the log came", lambda: any(part.stat().st_size for part in local.rglob("*.part")))
+    if how == "armed":
+        vehicle.do(vehicle.vehicle.arm)
+    else:
+        vehicle.do(lambda: vehicle.vehicle.say(3, "Arming denied: high throttle"))
+    wait_until("that is noticed", lambda: "the transfer waits" in watch.text())
+    wait_until("its session is closed", lambda: not vehicle.sessions())
+    asked = vehicle.asked()
+    time.sleep(2.0)
+    assert vehicle.asked() == asked
+    assert watch.stop() == 0
     word = "is armed" if how == "armed" else "refused to be armed"
-    assert said.read_text().count(word) == 1
+    assert watch.text().count(word) == 1
 
 
 def test_what_goes_with_watch_only_is_said(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from mavftpfs.client import control
 from mavftpfs.client.files import session_on
 from mavftpfs.shared.errors import MavftpfsError
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, wait_until
+from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, unmount, wait_until
 from tests.support.trees import content
 from tests.support.vehicles import Process, SimVehicle
 
@@ -183,7 +183,7 @@ def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: P
 @pytest.mark.holds("promise 3")
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
     mount, vehicle, card = holding(field, data)
-    subprocess.run(["fusermount3", "-u", mount.path], check=True, timeout=60)
+    unmount(mount.path)
     wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
     path = control.find_socket(str(mount.path), control.own_directories())
     with socket.socket(socket.AF_UNIX) as client:

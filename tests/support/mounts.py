@@ -107,6 +107,19 @@ def _is_served(path: Path) -> bool:
     return mounted_at(path)
 
 
+def unmount(path: Path) -> None:
+    """Unmount as a user does, if it is mounted. It may be in use for a moment more: by a program that ends
+    (`git gc`), or one elsewhere that looks at all mounts (`df`)."""
+
+    def unmounted() -> bool:
+        if mounted_at(path):
+            command = ["fusermount3", "-u", str(path)]
+            subprocess.run(command, check=False, timeout=END_TIMEOUT, capture_output=True)
+        return not mounted_at(path)
+
+    wait_until("no program uses the mount any more", unmounted)
+
+
 def abort_mount(path: Path) -> None:
     """Free the programs that wait in the mount, and take it away; harmless if nothing is mounted."""
     for command in (["umount", "-f"], ["umount", "-l"], ["fusermount3", "-uz"]):
@@ -263,8 +276,7 @@ class Mount:
     def unmount(self) -> int:
         """Unmount as a user does and return the daemon's exit code."""
         assert self.process is not None
-        if mounted_at(self.path):
-            subprocess.run(["fusermount3", "-u", str(self.path)], check=True, timeout=END_TIMEOUT)
+        unmount(self.path)
         return self.process.wait(END_TIMEOUT)
 
     def end_by(self, number: signal.Signals) -> int:
@@ -273,13 +285,6 @@ class Mount:
         process.send_signal(number)
         return process.wait(END_TIMEOUT)
 
-    def _unmounted(self) -> bool:
-        """Try to unmount: programs in it may be ending still (`git gc`)."""
-        command = ["fusermount3", "-u", str(self.path)]
-        if mounted_at(self.path):
-            subprocess.run(command, check=False, timeout=END_TIMEOUT, capture_output=True)
-        return not mounted_at(self.path)
-
     def finish(self) -> None:
         """Unmount if mounted; then the daemon must have ended with 0 and a clean log."""
         process, self.process = self.process, None
@@ -287,7 +292,7 @@ class Mount:
             return
         try:
             if process.running:
-                wait_until("nobody uses the mount any more", self._unmounted)
+                unmount(self.path)
             code = process.wait(END_TIMEOUT)
         finally:
             abort_mount(self.path)
