@@ -72,7 +72,7 @@ class Space:
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """A vehicle whose root was listed.
+    """A connected vehicle and its files.
 
     watcher: to be run by a program that keeps running. notice: moves what earlier mounts left, and returns a
     line, or "".
@@ -202,6 +202,7 @@ async def attached(
 ) -> AsyncIterator[Attached]:
     """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
 
+    list_root: False if the body asks for something at once itself.
     writing: the tree may be changed, if the options do not forbid it. Its held bytes then lie in a spool that
     survives the process. rescue_for: `Attached.notice` moves what earlier mounts left there to a recovery
     directory named after this SOURCE. It is called when its line can be shown to a person. Without rescue_for

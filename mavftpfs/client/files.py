@@ -1,8 +1,8 @@
 """The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
 Two programs should not share the vehicle's only FTP session. So while a mount of the vehicle is up, its files
-(client/mounted.py) are used in place of a second connection. `Files` and `File` say
-what both offer. Paths are normalised (shared.model.normalise).
+(client/mounted.py) are used in place of a second connection. `Files` and `File` say what both offer. Paths
+are normalised (shared.model.normalise).
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class Watch:
     """Brings the logs of each vehicle that comes, into a directory for each. say: gets lines for people.
 
     Raises:
-        UsageError: of `begin`: the directory cannot be used.
+        UsageError: the directory cannot be used.
     """
 
     def __init__(
