@@ -33,7 +33,6 @@ from mavftpfs.shared.errors import (
     ProtocolError,
     RequestTimeout,
     SessionLost,
-    SpoolFailed,
 )
 from mavftpfs.shared.model import split, wire_path
 from mavftpfs.shared.sending import SendBuffer
@@ -54,7 +53,7 @@ has nothing to send: else a log that trickles would keep it for ever."""
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
 
-REFUSALS = (FtpNak, ProtocolError, SpoolFailed)
+REFUSALS = (FtpNak, ProtocolError)
 """Errors that do not pass by themselves."""
 
 _PATHS_TURN = 0.5
