@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import partial
 
 import pytest
@@ -12,6 +13,7 @@ from mavftpfs.cache.delivery import START_AT
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
 from mavftpfs.session.connection import Connection
+from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -37,6 +39,19 @@ async def test_the_first_large_file_is_sent_once_where_the_card_cannot_rename(si
 
 
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
+
+
+@asynccontextmanager
+async def uploading(
+    data: bytes, *, profile: str = "px4", link: LinkSettings = PLAIN, known: bool = True
+) -> AsyncIterator[tuple[Rig, MemorySource, Upload]]:
+    """Begin to upload `new`. known: it is known what OpenFileWO does."""
+    here = Rig(profile, {b"/d": None}, link)
+    async with here.connected() as connection:
+        if known:
+            know(connection, profile)
+        source = MemorySource(data)
+        yield here, source, await start(connection, profile, source)
 
 
 async def cut(here: Rig, connection: Connection, length: float) -> None:
@@ -295,10 +310,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: s
 
 async def test_an_error_at_close_is_the_callers() -> None:
     """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
-    here = Rig("ardupilot5", {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        source = MemorySource(content(3000))
-        upload = await start(connection, "ardupilot5", source)
+    async with uploading(content(3000), profile="ardupilot5", known=False) as (here, source, upload):
 
         def break_close() -> None:
             slot = next(slot for slot in here.server.firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
@@ -321,12 +333,8 @@ async def test_an_error_at_close_is_the_callers() -> None:
 
 
 async def test_a_long_upload_proves_what_it_has_from_time_to_time() -> None:
-    data = content(200_000)
-    here = Rig("px4", {b"/d": None}, LinkSettings(rate=1_000.0, delay=0.05))
-    async with here.connected() as connection:
-        know(connection, "px4")
-        source = MemorySource(data)
-        upload = await start(connection, "px4", source)
+    link = LinkSettings(rate=1_000.0, delay=0.05)
+    async with uploading(content(200_000), link=link) as (_, source, upload):
         await trio.sleep(130)
         assert source.checkpoints == 2
         assert 40_000 < source.proven.total < 130_000
@@ -409,12 +417,9 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, p
 
 async def test_each_finish_waits_for_what_it_was_called_for() -> None:
     """Bytes that come while another caller's Terminate is under way are not covered by it."""
-    here = Rig("px4", {b"/d": None}, LinkSettings(rate=60_000.0, delay=0.3))
+    link = LinkSettings(rate=60_000.0, delay=0.3)
     proven: list[int] = []
-    async with here.connected() as connection:
-        know(connection, "px4")
-        source = MemorySource(b"first")
-        upload = await start(connection, "px4", source)
+    async with uploading(b"first", link=link) as (here, source, upload):
 
         async def late() -> None:
             source.add(b" second")
@@ -431,10 +436,7 @@ async def test_each_finish_waits_for_what_it_was_called_for() -> None:
 
 
 async def test_nothing_is_created_before_there_is_something() -> None:
-    here = Rig("px4", {b"/d": None})
-    async with here.connected() as connection:
-        source = MemorySource()
-        upload = await start(connection, "px4", source)
+    async with uploading(b"", known=False) as (here, _, upload):
         await trio.sleep(10)
         assert [entry.name for entry in here.card.entries(b"/d")][2:] == []
         await upload.finish()  # an empty file was wanted, then
@@ -442,11 +444,7 @@ async def test_nothing_is_created_before_there_is_something() -> None:
 
 
 async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
-    here = Rig("px4", {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        know(connection, "px4")
-        source = MemorySource(content(3000))
-        upload = await start(connection, "px4", source)
+    async with uploading(content(3000)) as (here, source, upload):
         await upload.finish()
         here.card.open(b"/d/new", write=True).resize(100)
         source.add(b"more")
@@ -458,13 +456,8 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) -> None:
-    here = Rig("px4", {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        if probed:
-            know(connection, "px4")
-        source = MemorySource(content(3000))
-        upload = await start(connection, "px4", source)
-        here.faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, connection))
+    async with uploading(content(3000), known=probed) as (here, source, upload):
+        here.faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, here.connection))
         await upload.finish()
         assert source.rollbacks == [True]
         assert source.checkpoints == 1
@@ -473,15 +466,12 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) ->
 
 async def test_a_terminate_done_twice_is_done() -> None:
     """The first one's reply is lost, and a listing in between ends PX4's replay: NAK 4 to the second."""
-    here = Rig("px4", {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        source = MemorySource(content(3000))
-        upload = await start(connection, "px4", source)
+    async with uploading(content(3000), known=False) as (here, source, upload):
         here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
 
         async def list_soon() -> None:
             await trio.sleep(0.01)
-            await connection.store.list_directory(b"/d")
+            await here.connection.store.list_directory(b"/d")
 
         async with trio.open_nursery() as nursery:
             here.faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(list_soon))
@@ -492,11 +482,7 @@ async def test_a_terminate_done_twice_is_done() -> None:
 
 
 async def test_only_what_was_not_proven_goes_again() -> None:
-    here = Rig("px4", {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        know(connection, "px4")
-        source = MemorySource(content(20_000))
-        upload = await start(connection, "px4", source)
+    async with uploading(content(20_000)) as (here, source, upload):
         await upload.finish()
         source.add(content(40_000, 1))
         upload.wake()
@@ -504,7 +490,7 @@ async def test_only_what_was_not_proven_goes_again() -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(upload.finish)
             await trio.sleep(1.5)
-            steal(here, connection)
+            steal(here, here.connection)
         assert source.rollbacks == [False]
         assert source.all_proven
         assert here.count(Opcode.CREATE_FILE) == 0
