@@ -115,6 +115,7 @@ def log_levels() -> Iterator[None]:
         logger.setLevel(level)
 
 
+@functools.cache
 def tier_of(path: Path) -> str:
     """Return the directory below tests/ that a test file lies in."""
     return path.relative_to(TESTS).parts[0]

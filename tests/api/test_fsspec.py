@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import fsspec
-import pandas
 import pytest
 from fsspec.tests import abstract
 
@@ -111,6 +110,8 @@ def fs(source: str) -> Iterator[DroneFileSystem]:
 
 
 def test_pandas_reads_and_writes_a_csv(source: str, fs: DroneFileSystem) -> None:
+    import pandas  # here, since each of the test processes loads this module
+
     frame = pandas.read_csv("mftp:///data.csv", storage_options={"source": source})
     assert (len(frame), frame.alt.sum()) == (5000, sum(range(5000)) / 2)
     frame.to_csv("mftp:///copy.csv", index=False, storage_options={"source": source})

@@ -20,8 +20,6 @@ from matplotlib.figure import Figure
 from tests.bench import record, tables
 from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
 
-RESULTS = Path(__file__).parent / "results" / "results.json"
-
 STYLE: Any = {
     "svg.hashsalt": "mavftpfs",
     "svg.fonttype": "none",
@@ -106,7 +104,9 @@ def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="scripts/bench plots", description="draw the picture of docs/benchmarks.md"
     )
-    parser.add_argument("--json", type=Path, default=RESULTS, metavar="FILE", help="what --json wrote before")
+    parser.add_argument(
+        "--json", type=Path, default=record.RESULTS, metavar="FILE", help="what --json wrote before"
+    )
     parser.add_argument(
         "--page", type=Path, metavar="FILE", help="put the tables between the marks in this file"
     )

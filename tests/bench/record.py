@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+RESULTS = Path(__file__).parent / "results" / "results.json"
 PACKAGES = ("mavftpfs", "mavsdk", "pyfuse3", "pymavlink", "trio")
 
 

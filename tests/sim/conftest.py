@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import pytest
@@ -22,5 +23,10 @@ def autojump() -> MockClock:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Have all other tests of this tier run on virtual time."""
     for item in items:
-        if item.path.parent == Path(__file__).parent and item.path.stem not in REAL_TIME:
+        if _is_virtual(item.path):
             use_virtual_time(item)
+
+
+@functools.cache
+def _is_virtual(path: Path) -> bool:
+    return path.parent == Path(__file__).parent and path.stem not in REAL_TIME

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench import plots, record, tables
+from tests.bench import record, tables
 from tests.bench.cases import Case
 
 PROJECT = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def test_a_card_that_pauses_costs_where_nothing_bridges_it() -> None:
 
 def test_the_page_shows_what_was_recorded() -> None:
     page = (PROJECT / "docs/benchmarks.md").read_text()
-    recorded = record.sections(plots.RESULTS)
+    recorded = record.sections(record.RESULTS)
     assert tables.filled_in(page, recorded) == page, "scripts/bench plots --page docs/benchmarks.md"
     (picture,) = re.findall(r"\]\(\.\./(tests/bench/\S+\.svg)\)", page)
     assert (PROJECT / picture).is_file()
