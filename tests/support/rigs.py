@@ -84,6 +84,7 @@ class Rig:
         self.server = LyingServer(self.card, PROFILES[profile], rng=Random(seed))
         self.vehicle.server = self.server
         self.faults = Faults(self.server)
+        self.faults.copies = bool(link.duplicate)
         self.model = LinkModel(Random(seed + 1), link)
         self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []
