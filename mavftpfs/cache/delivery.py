@@ -41,6 +41,7 @@ from mavftpfs.shared.errors import (
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
+    SessionLost,
     SpoolFailed,
     VerificationFailed,
 )
@@ -65,7 +66,7 @@ a mount: finding out costs four requests on every card."""
 START_PAUSE = 5.0
 """Seconds after which an upload that could not begin is tried again."""
 
-PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
+PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 
@@ -85,10 +86,12 @@ class Deliverer:
         self.verifier = Verifier(context, names)
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
-        """Bring a node's file to the vehicle, and verify it. Stop when it is not `wanted` any more.
+        """Bring a node's file to the vehicle, and verify it. `wanted` is asked before each round; a round
+        that began is finished.
 
         Raises:
-            The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
+            The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileChanged, AlreadyExists,
+            NoSpace, SpoolFailed, RemoteProtocolError.
         """
         try:
             while (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):

@@ -229,12 +229,12 @@ class Draft:
             self._note_changed(self.size, size)
         else:
             self.content.cut(size)
+            if self.sending is not None:
+                self.sending.on_changed(size, size)
             self.on(Event.CHANGED if size else Event.EMPTIED)
             for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
-            if self.sending is not None:
-                self.sending.on_changed(size, size)
         self.size = size
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
@@ -267,6 +267,7 @@ class Draft:
     def interrupted(self, *, ours: bool = False) -> None:
         """Note that it is not known which file has the name. All of the draft is here, so no base counts any
         more.
+
         ours: the file that has the name is the one that was sent, or what became of it."""
         self.on(Event.REFUSED)
         self.base_limit = 0

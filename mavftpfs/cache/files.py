@@ -8,8 +8,8 @@ At open it is decided whether the version in the cache is still the vehicle's fi
   without an mtime prove nothing.
 
 While a program has a file open, its session is closed and opened again: after losses, restarts, and turns of
-other users. Then size and mtime are compared (`VersionHandle.read`). A file that is equal, or larger, is the
-same, because logs grow. For another file readers get FileChanged. The open reply tells the size. Where
+other users. Then size and mtime are compared (`Files.compare`). A file that is equal, or larger, is the same,
+because logs grow. For another file readers get FileChanged. The open reply tells the size. Where
 listings tell mtimes, a listing that began after the reopening tells the mtime. After a restart of the vehicle
 nothing is proven.
 
@@ -138,7 +138,7 @@ class Files:
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
         if kept is not None:
             version = self._version(path, kept.key.size, entry.mtime)
-            version.kept = kept
+            version.kept, version.proven_at = kept, found.directory.listed_at
             self._replace(version)
         else:
             version = await self._start_version(path, entry)
@@ -455,7 +455,8 @@ class VersionHandle(OpenFile):
                 if version.drops == drops:
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
             if version.drops != drops:
-                version.close_reader()
+                if version.ignores_data:  # else another read opened the file anew, and waits for its bytes
+                    version.close_reader()
                 await trio.sleep(pause)
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 

@@ -35,7 +35,7 @@ class ReadSink(Protocol):
         ...
 
     def on_queued(self) -> None:
-        """The reader waits for its turn, and the queue before it moved. So the vehicle is not silent."""
+        """The reader waits for its turn, and the vehicle is not silent."""
         ...
 
     def on_suspect(self, reason: str) -> None:

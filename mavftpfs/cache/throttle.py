@@ -8,12 +8,15 @@ take longer than two minutes.
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.options import KIB, MIB
+from mavftpfs.cache.together import together
 from mavftpfs.cache.versions import RateMeter
 from mavftpfs.shared.errors import FileTooLarge
 
@@ -105,6 +108,30 @@ class Throttle:
             await self.waiting.park()
             return True
         return False
+
+    async def while_full(self, node: Node, deliver: Callable[[], Awaitable[None]]) -> None:
+        """Have a delivery say what is wrong, if anything is. It is cancelled once bytes move again: what it
+        would give its name is half a file, whose program is writing on.
+
+        Raises:
+            What the delivery failed with.
+        """
+        delivery, watch = trio.CancelScope(), trio.CancelScope()
+
+        async def try_it() -> None:
+            try:
+                with delivery:
+                    await deliver()
+            finally:
+                watch.cancel()
+
+        async def look() -> None:
+            with watch:
+                while self.is_full(node):
+                    await self.waiting.park()
+                delivery.cancel()
+
+        await together(try_it, look)
 
     def on_acked(self, count: int) -> None:
         """Note that bytes were ACKed: writers that wait look again."""

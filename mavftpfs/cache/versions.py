@@ -285,7 +285,7 @@ class Version:
             waiter.missing = missing
 
     def on_queued(self) -> None:
-        """Give reads that wait more time: the reader waits for its turn, and the queue before it moves."""
+        """Give reads that wait more time: the reader waits for its turn."""
         for waiter in self._waiters:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
 

@@ -265,8 +265,8 @@ class WriteFile(ReadFile):
         throttle = self._parts.throttle
         while throttle.is_full(self._node):
             self._context.require_disarmed()
-            if not await throttle.wait():  # a delivery says what is wrong, if anything is
-                await self._parts.deliverer.deliver(self._node, wanted=partial(throttle.is_full, self._node))
+            if not await throttle.wait():
+                await throttle.while_full(self._node, partial(self._parts.deliverer.deliver, self._node))
 
     async def _truncate(self, node: Node, size: int) -> None:
         self._context.require_disarmed()

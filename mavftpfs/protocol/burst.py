@@ -147,7 +147,7 @@ class BurstTransfer(ReadTransfer):
         super().__init__(session, size, sink, chunks, wants)
         self.by_requests = False
         self._burst: Burst | None = None
-        self._covered = 0  # below this the last burst left out what is wanted still
+        self._covered = 0  # where the last burst ended: what is wanted below is asked for by ReadFile
         self._barren_bursts = 0
         self._gave_up = False
 
@@ -168,12 +168,14 @@ class BurstTransfer(ReadTransfer):
             return []
         if self.by_requests or self._gave_up:
             return super().next_requests(most, now)
-        gap = self.wants.take(self.chunks.size, 0, self._covered)
+        gap = self.wants.take(self.chunks.size, self._covered)
         if gap is not None:
             return self._requests_for(gap, self.chunks.size)
+        if self._unanswered:
+            return []
         self._covered = 0
         first = self.wants.demand.first() or self.wants.ahead.first()
-        if self._unanswered or first is None:
+        if first is None:
             return []
         opcode = Opcode.BURST_READ_FILE
         return [Request(self, opcode, MANNERS[opcode], self.session, first[0], self.chunks.size)]

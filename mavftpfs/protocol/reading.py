@@ -5,7 +5,7 @@ lie, from its beginning until the server says that it ends."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
@@ -49,7 +49,8 @@ class DataSink(Protocol):
 
 
 class Wants:
-    """What is wanted of a file, and not asked for yet. It outlives the transfers that take from it.
+    """What is wanted of a file and has not come, but for what ReadFile requests are out for. It outlives the
+    transfers that take from it.
 
     Attributes:
         demand: what programs wait for; it goes first. ahead: readahead, none of it in demand.
@@ -84,19 +85,11 @@ class Wants:
             self.demand = ExtentSet()
         self.ahead = ExtentSet()
 
-    def keep(self, missing: Callable[[int, int], list[tuple[int, int]]]) -> None:
-        """Want only what is missing still."""
-        for wanted in (self.demand, self.ahead):
-            for start, stop in wanted:
-                wanted.discard(start, stop)
-                for gap_start, gap_stop in missing(start, stop):
-                    wanted.add(gap_start, gap_stop)
-
-    def take(self, limit: int, start: int, stop: int) -> tuple[int, int, bool] | None:
-        """Remove and return the first of it in [start, stop), at most `limit` bytes, and whether it is
+    def take(self, limit: int, below: int) -> tuple[int, int, bool] | None:
+        """Remove and return the first of it below an offset, at most `limit` bytes, and whether it is
         demand."""
         for wanted, demand in ((self.demand, True), (self.ahead, False)):
-            for first, end in wanted.intersection(start, stop):
+            for first, end in wanted.intersection(0, below):
                 end = min(end, first + limit)
                 wanted.discard(first, end)
                 return first, end, demand
@@ -107,7 +100,8 @@ class ReadTransfer(Operation):
     """Reads wanted ranges of an open regular file for as long as its owner likes.
 
     Args:
-        session: id of the open file. size: as the open ACK said; nothing beyond is ever asked for.
+        session: id of the open file. size: as the first open ACK said (the file may be larger now); nothing
+            beyond is ever asked for.
         sink: takes the data. chunks: the size of requests. wants: what is wanted already.
 
     Attributes:
@@ -134,7 +128,7 @@ class ReadTransfer(Operation):
         self.received_bytes = 0
         self.wants = Wants() if wants is None else wants
         self._sink = sink
-        # Whether a program waits for it; None: it was dropped since, and is not asked for again.
+        # Whether a program waits for it; None: it was dropped since. A lost one is still repeated.
         self._unanswered: dict[Request, bool | None] = {}
         self._errors = 0
 
@@ -157,7 +151,7 @@ class ReadTransfer(Operation):
                 self._unanswered[request] = None
 
     def give_back(self) -> None:
-        """What is on its way is not waited for any more: it is wanted again."""
+        """Want again all that was asked for and did not come. Answers that still come are not taken."""
         for request in list(self._unanswered):
             self._want_again(request)
 
@@ -184,7 +178,7 @@ class ReadTransfer(Operation):
 
     @property
     def priority(self) -> Priority:
-        """DEMAND while a program waits for what is to be asked for."""
+        """DEMAND if `wants` has some."""
         return Priority.READAHEAD if self.wants.demand.empty else Priority.DEMAND
 
     # --- requests
@@ -193,7 +187,7 @@ class ReadTransfer(Operation):
         """Return ReadFile requests for a row of chunks; demand goes first."""
         chunk = self.chunks.next_size(now)
         limit = chunk if self.chunks.trying else most * chunk
-        return self._requests_for(self.wants.take(limit, 0, self.size), chunk)
+        return self._requests_for(self.wants.take(limit, self.size), chunk)
 
     def _requests_for(self, row: tuple[int, int, bool] | None, chunk: int) -> list[Request]:
         if row is None:

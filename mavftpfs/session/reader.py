@@ -27,8 +27,9 @@ class FileStream(SessionUser):
     expected_size: in bytes, if the file need not be opened to know it.
 
     Attributes:
-        size: by the first open ACK, in bytes; 0 before that. opened: that came, or the file cannot be opened.
-        closed: nothing goes to the sink any more, but that what it got is in doubt.
+        size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK came, or with the
+            error of the open.
+        closed: the sink is told nothing any more, except that what it got is in doubt.
     """
 
     def __init__(self, path: bytes, sink: ReadSink, expected_size: int | None, scheduler: Scheduler) -> None:
@@ -175,8 +176,7 @@ class FileStream(SessionUser):
     async def _read(self, turn: Turn) -> None:
         server, session = self._server, self._server.session
         if session is None or self.idle:
-            return  # the vehicle restarted since it was opened, or nothing is wanted
-        self._wants.keep(self._sink.missing)  # other readers may have got some of it
+            return  # it was abandoned meanwhile, or nothing is wanted
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
         began, driver, engine = server.clock(), server.driver, server.engine

@@ -121,8 +121,7 @@ class SessionUser:
         return False
 
     def on_queued(self) -> None:
-        """The vehicle answered in another user's turn, while this one waited: that is no silence of the
-        vehicle."""
+        """It waits for another reason than the vehicle's silence."""
 
     def on_removed(self) -> None:
         """The file of its path was removed or replaced."""
@@ -154,7 +153,8 @@ class SessionUser:
         return heavy, now if self.asked_at is None else self.asked_at
 
     def gives_way(self, rival: float, began: float, now: float, rtt: float | None) -> bool:
-        """Return whether its turn, which began then, ends for a user that waits, and used so many seconds."""
+        """Return whether its turn, which began then, ends for a user that waits. rival: seconds that the
+        lightest of these used lately."""
         slice_ = now - began
         if slice_ < RELIEF and self.waited_long(began, rtt):
             return False
@@ -496,10 +496,12 @@ class Scheduler:
             left = max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(server.session.path) else 0.0
             if not await server.sleep(min(left, news_in)) and self.first() is None:
                 await server.close_quietly()
-        elif server.state is State.MAYBE_OPEN and not server.vehicle.lost(now):
+        elif server.state is State.MAYBE_OPEN:
             # An open or a Terminate that was never answered: leave no orphan over there. Any news begins this
             # wait anew.
-            if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)):
+            if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)) and not server.vehicle.lost(
+                self.clock()
+            ):
                 await server.close_maybe_open()
         else:
             await server.sleep(news_in)

@@ -634,6 +634,29 @@ async def test_a_writer_is_told_why_nothing_moves(here: Rig) -> None:
     file.close()
 
 
+@pytest.mark.holds("promise 4")
+async def test_a_pause_of_the_link_gives_no_half_file_its_name() -> None:
+    """Its program is writing on: later bytes would count as the change of a part, and be refused."""
+    async with rig(link=LinkSettings(rate=10_000.0, delay=0.05)) as here:
+        file = await here.mount().create(b"/new", exclusive=True)
+        data = content(400_000)
+
+        async def pause_the_link() -> None:
+            await trio.sleep(15)
+            here.link.cut()
+            await trio.sleep(8)
+            here.link.restore()
+
+        here.nursery.start_soon(pause_the_link)
+        for at in range(0, len(data), 20_000):
+            assert b"/new" not in here.files()
+            await file.write(at, data[at : at + 20_000])
+        await file.flush()
+        assert here.data(b"/new") == data
+        assert here.count(Opcode.RENAME) == 2  # with the one that shows whether the card can
+        await file.release()
+
+
 async def rate_and_limit(rate: float, size: int) -> tuple[float, object]:
     """Write a file over a link; return its rate and how much may wait then."""
     async with rig(link=LinkSettings(rate=rate, delay=0.001)) as here:

@@ -147,6 +147,24 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(profile:
         assert await copy(tree) == NEW[: len(OLD)]
 
 
+async def test_a_read_whose_bytes_fell_into_doubt_leaves_the_reader_of_another_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with opened("px4") as (_, _, handle):
+        files, version = handle._handle._files, handle._handle._version  # type: ignore[attr-defined]
+        readers, compare = [], files.compare
+
+        async def doubt_comes(*args: object, **kwargs: object) -> None:
+            monkeypatch.setattr(files, "compare", compare)
+            version.on_suspect("doubt")
+            await handle.read(STEP, STEP)  # opens the file anew
+            readers.append(version.reader)
+
+        monkeypatch.setattr(files, "compare", doubt_comes)
+        assert await handle.read(0, STEP) == OLD[:STEP]
+        assert version.reader is readers[0]
+
+
 @pytest.mark.parametrize("grown", [False, True])
 @pytest.mark.parametrize("profile", EVERY)
 async def test_the_same_file_is_read_on(profile: str, grown: bool) -> None:

@@ -99,7 +99,14 @@ def test_a_base_that_others_replaced() -> None:
 # --- sending
 
 
-@pytest.mark.parametrize("change", [lambda draft: draft.write(2, b"XX"), lambda draft: draft.truncate(2)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda draft: draft.write(2, b"XX"),
+        lambda draft: draft.truncate(2),
+        lambda draft: draft.truncate(0),
+    ],
+)
 def test_what_was_handed_out_may_not_change(change: Callable[[Draft], None]) -> None:
     draft, sending = sending_of(b"abcdef")
     sending.next_chunk(3)

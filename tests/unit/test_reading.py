@@ -248,6 +248,16 @@ def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
     assert again.seq - request.seq > 4096
     stream(reader, again, list(range(31)))
     assert bytes(reader.sink.data) == CONTENT
+
+
+def test_a_gap_that_comes_short_begins_no_burst() -> None:
+    reader, request = bursting()
+    stream(reader, request, [0, *range(2, 41)])
+    (gap,) = reader.sent()
+    assert reader.sent() == []
+    reader.engine.receive(ack(gap, CONTENT[239:339]), reader.now)
+    (rest,) = reader.sent()
+    assert (rest.opcode, *ranges([rest])) == (Opcode.READ_FILE, (339, 478))
     assert reader.sink.repeats == 0
 
 
