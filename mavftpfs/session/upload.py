@@ -58,7 +58,7 @@ REFUSALS = (FtpNak, ProtocolError)
 
 _PATHS_TURN = 0.5
 _OFTEN = 0.25
-_REFUSED_ARM = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
+_BLOCKED = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
 class Stop(Enum):
@@ -327,8 +327,8 @@ class Upload(SessionUser):
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         server, traits, gate = self._server, self._engine.traits, self._server.path_gate
-        rearmed = False
-        gate.shut = traits.paths_disarm
+        unblocked = False
+        gate.shut = traits.paths_block_writes
         try:
             while True:
                 # If a light user waits already, a short queue is half filled: the Terminate finds a place in
@@ -347,19 +347,19 @@ class Upload(SessionUser):
                 finally:
                     if not transfer.trailing:  # else its last answers come while `_close` waits for its own
                         self._end_transfer()
-                if transfer.acked_bytes and rearmed:
-                    traits.paths_disarm, rearmed = True, False
+                if transfer.acked_bytes and unblocked:
+                    traits.paths_block_writes, unblocked = True, False
                 error = transfer.error
                 if error is None:
                     assert stop is not None
                     return stop
-                if rearmed or not is_disarmed(error):
+                if unblocked or not is_blocked(error):
                     self._check_refusal(transfer, error)
                     raise error
-                rearmed = True
+                unblocked = True
                 # From now on path operations take turns with this upload: first those under way end.
                 await gate.let_in(0.0)
-                await self._rearm()
+                await self._unblock()
         finally:
             gate.open()
 
@@ -393,7 +393,7 @@ class Upload(SessionUser):
                 transfer.paused = True
                 if transfer.idle:
                     await gate.let_in(max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0)))
-                    await self._rearm()
+                    await self._unblock()
                     transfer.paused = False
             else:
                 transfer.paused = False
@@ -437,7 +437,7 @@ class Upload(SessionUser):
         """
         if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
             return False
-        if self._engine.traits.paths_disarm or self._scheduler.is_excluded(self.path):
+        if self._engine.traits.paths_block_writes or self._scheduler.is_excluded(self.path):
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
@@ -469,7 +469,7 @@ class Upload(SessionUser):
                 raise nak
             self._refused_at = transfer.failed_at
 
-    async def _rearm(self) -> None:
+    async def _unblock(self) -> None:
         """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.
 
         One request from beyond any end suffices; whatever it answers, the next write tells.
@@ -499,12 +499,12 @@ class Upload(SessionUser):
             raise SessionLost(str(error)) from error
         last = self._end_transfer()
         if last is not None and transfer is not None:
-            self._engine.traits.paths_disarm |= is_disarmed(last)
+            self._engine.traits.paths_block_writes |= is_blocked(last)
             self._check_refusal(transfer, last)
         if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from last
         self._source.check_point()
-        if isinstance(last, REFUSALS) and not is_disarmed(last):
+        if isinstance(last, REFUSALS) and not is_blocked(last):
             raise last
 
     async def _clean_up(self, error: MavftpfsError) -> None:
@@ -526,6 +526,6 @@ class Upload(SessionUser):
         )
 
 
-def is_disarmed(error: MavftpfsError) -> bool:
+def is_blocked(error: MavftpfsError) -> bool:
     """Whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
-    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _REFUSED_ARM
+    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _BLOCKED

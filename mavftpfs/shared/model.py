@@ -168,7 +168,7 @@ class Traits:
         queue_limit: the most requests that may be in flight; None where no limit is known.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
-        paths_disarm: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
+        paths_block_writes: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
         lists_times: it answers opcode 16. time_silences: how often it did not answer that, and then answered
         opcode 3.
         wo_truncates: OpenFileWO empties the file (servers.md 8).
@@ -181,7 +181,7 @@ class Traits:
     queue_limit: int | None = None
     write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None
-    paths_disarm: bool = False
+    paths_block_writes: bool = False
     lists_times: bool | None = None
     time_silences: int = 0
     wo_truncates: bool | None = None
