@@ -23,7 +23,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.rigs import Rig
 from tests.support.takingturns import taking_turns
-from tests.support.transfers import ROOTS, MemorySource, begin_to_read, content, path
+from tests.support.transfers import ROOTS, MemorySource, begin_to_read, content, know, path
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -67,6 +67,20 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str) -> None
         upload.wake()
         await upload.finish()
         assert here.data(b"/d/new") == b"hello world"
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_an_upload_makes_room_for_a_change_of_its_path(profile: str) -> None:
+    here = Rig(profile, {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.02))
+    async with here.connected() as connection:
+        know(connection, profile)
+        source = MemorySource(bytes(300_000))
+        upload = await connection.store.open_upload(path(profile, "file"), source)
+        await trio.sleep(1)
+        await connection.store.remove(path(profile, "file"))
+        assert not source.todo.empty  # it did not wait for the upload's end
+        await upload.end()
+    assert here.server.open_sessions == 0
 
 
 async def test_readers_of_a_removed_file_get_no_more_of_it() -> None:
