@@ -271,7 +271,7 @@ SWIFTEST = 2.5
 def come_again(here: Rig, late: float, chosen: Callable[[bytes], bool]) -> None:
     """Have requests come once more so many seconds later, where they are chosen."""
     handle = here.server.handle
-    here.faults.copies = True
+    here.faults.orphans = True
 
     async def again(wire: bytes, source: Address) -> None:
         await trio.sleep(late)

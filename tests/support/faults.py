@@ -43,7 +43,8 @@ class Faults:
     Attributes:
         requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
         spoil: in so many more WriteFiles the first byte arrives as another one.
-        copies: copies of requests come late, so files are open by more than our doing.
+        orphans: files may be open that we cannot close: copies of requests come late, or the server gives
+            its sessions numbers of its own, and the ACK of an open was lost.
     """
 
     def __init__(self, server: FtpServer) -> None:
@@ -59,7 +60,7 @@ class Faults:
         self._repeated: set[int] = set()
         self._server = server
         self._taking: set[bytes] = set()
-        self.copies = False
+        self.orphans = False
         self._handle, self._outgoing = server.handle, server.outgoing
         server.handle = self._on_request  # type: ignore[method-assign]
         server.outgoing = self._on_replies  # type: ignore[method-assign]
@@ -136,7 +137,7 @@ class Faults:
             self._handle(self._spoiled(wire), source, now)
 
     def _require_closed(self, wire: bytes) -> None:
-        if self.copies or wire[_OPCODE] not in _TAKING or wire in self._taking:
+        if self.orphans or wire[_OPCODE] not in _TAKING or wire in self._taking:
             return
         self._taking.add(wire)  # the link may double it
         for path in wire[HEADER_SIZE : HEADER_SIZE + wire[_SIZE]].split(b"\0"):

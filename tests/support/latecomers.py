@@ -32,7 +32,7 @@ class Latecomer:
         self._what, self._after, self._left = what, after, nth
         self._first = first
         self._kept: tuple[bytes, float] | None = None
-        here.faults.copies = True
+        here.faults.orphans = True
         self._handle = here.server.handle
         here.server.handle = self._on_request  # type: ignore[method-assign]
 

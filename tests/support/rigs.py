@@ -29,7 +29,7 @@ from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
-from mavftpfs.sim.profiles import PROFILES, Storage
+from mavftpfs.sim.profiles import PROFILES, Family, Storage
 from mavftpfs.sim.tree import Kind, MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.faults import Faults
@@ -84,7 +84,7 @@ class Rig:
         self.server = LyingServer(self.card, PROFILES[profile], rng=Random(seed))
         self.vehicle.server = self.server
         self.faults = Faults(self.server)
-        self.faults.copies = bool(link.duplicate)
+        self.faults.orphans = bool(link.duplicate) or PROFILES[profile].family is Family.SPEC
         self.model = LinkModel(Random(seed + 1), link)
         self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []
