@@ -201,7 +201,7 @@ def test_calls_of_many_threads_leave_no_threads(source: str) -> None:
     fs = DroneFileSystem(source, idle=600)
 
     def work() -> None:
-        for _ in range(50):
+        for _ in range(10):
             fs.exists("/nothing")
 
     threads = [threading.Thread(target=work) for _ in range(8)]

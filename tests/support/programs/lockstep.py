@@ -218,7 +218,7 @@ class Side:
         return found.st_size, found.st_mode >> 12
 
     def on_list(self, path: str) -> list[str]:
-        return sorted(os.listdir(self.place(path)))
+        return sorted(name for name in os.listdir(self.place(path)) if name != "@PARAM")
 
     def size_of(self, slot: int) -> int:
         """Return the size of an open file, -1 if the slot is free."""
