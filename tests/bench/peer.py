@@ -94,7 +94,7 @@ def by_pymavlink(args: argparse.Namespace) -> None:
 def main() -> int:
     """Say `ready` when connected, wait for a line, work, say `done` or `failed`, wait for a line."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("library", choices=["mavsdk", "pymavlink"])
+    parser.add_argument("client", choices=["mavsdk", "pymavlink"])
     parser.add_argument("port", type=int)
     parser.add_argument("direction", choices=["read", "write"])
     parser.add_argument("remote")
@@ -102,7 +102,7 @@ def main() -> int:
     parser.add_argument("--chunk", type=int)
     parser.add_argument("--window", type=int)
     args = parser.parse_args()
-    (by_mavsdk if args.library == "mavsdk" else by_pymavlink)(args)
+    (by_mavsdk if args.client == "mavsdk" else by_pymavlink)(args)
     return 0
 
 
