@@ -17,7 +17,8 @@ from typing import Any
 import trio
 
 from mavftpfs.hub.outbox import Line, Outbox, Waiting
-from mavftpfs.hub.routing import BEATS, PORT, Kind, Place, Router
+from mavftpfs.hub.routing import BEATS, Kind, Router
+from mavftpfs.hub.senders import PORT, Place
 from mavftpfs.link.addresses import NetAddress, readable_address
 from mavftpfs.link.base import Link
 from mavftpfs.link.frames import Frame, Splitter
@@ -233,10 +234,9 @@ class Hub:
         Raises:
             LinkClosed: all link ids are in use.
         """
-        now = trio.current_time()
         owns = {client.own for client in self._clients.values()}
         for _ in range(255):
-            if wanted not in owns and not self.router.taken(wanted, now):
+            if wanted not in owns and wanted not in self.router.senders:
                 break
             wanted = Address(wanted.system, wanted.component % 249 + 1)
         numbers = {client.number for client in self._clients.values()}
@@ -453,7 +453,7 @@ class Hub:
         """Check each second whether the hub is still needed, and warn of second vehicles."""
         while True:
             self._end_if_done()
-            for sender, where in self.router.doubles.items():
+            for sender, where in self.router.senders.doubles().items():
                 if sender not in self._said_doubles:
                     self._said_doubles.add(sender)
                     log.warning(_DOUBLE, readable_address(where), *sender)
@@ -470,7 +470,7 @@ class Hub:
             self._ended.set()
 
     def _is_active(self, endpoint: _Endpoint) -> bool:
-        heard = self.router.heard_at(endpoint.side)
+        heard = self.router.senders.heard_at(endpoint.side)
         return heard is not None and trio.current_time() - heard < ACTIVE
 
     def _is_needed(self) -> bool:
@@ -482,7 +482,7 @@ class Hub:
         now = trio.current_time()
         endpoints = []
         for endpoint in self._endpoints.values():
-            heard = self.router.heard_at(endpoint.side)
+            heard = self.router.senders.heard_at(endpoint.side)
             facts = {"endpoint": endpoint.text, "problem": endpoint.problem or None}
             endpoints.append({**facts, "heard_ago": None if heard is None else round(now - heard, 1)})
         return {
@@ -496,7 +496,7 @@ class Hub:
             "armed": sorted(system for system, armed in self.router.armed.items() if armed),
             "doubles": [
                 {"system": sender.system, "component": sender.component, "address": readable_address(where)}
-                for sender, where in self.router.doubles.items()
+                for sender, where in self.router.senders.doubles().items()
             ],
             "dropped": self._outbox.dropped,
         }

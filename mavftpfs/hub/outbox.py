@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from typing import NamedTuple
 
-from mavftpfs.hub.routing import Place
+from mavftpfs.hub.senders import Place
 
 LINE_TIME = 0.05
 """Seconds of a serial line's rate that may be queued in the kernel."""

@@ -1,30 +1,26 @@
 """Where each frame goes. Layer: hub; pure.
 
-Frames come from *sides* and go to sides: the port that SOURCE names (side 0), an endpoint, a client. A side
-may have several *places*: the network addresses that are heard there.
+Frames come from *sides* and go to sides: the port that SOURCE names, endpoints, and clients, which are
+programs of ours. Only a frame that `senders` believes goes anywhere.
 
-- A sender counts only from where it was first heard, as on a port of our own (link.addresses). So a loop of
-  cables and forwards ends here: a frame that comes back by another way is not believed.
-- A frame with a target goes where the target was heard. A frame for all, or for a target that was never
-  heard, goes to all other sides. No frame goes to a side where its sender was heard.
-- Clients are programs of ours. Each gets the frames that concern its vehicle, and its frames go to its
-  vehicle.
+- A frame with a target goes where the target is. A frame for all, or for a target that was never heard, goes
+  to all places of the port and of the endpoints. No frame goes to a side where its sender is.
+- A client's frames go to the address of its vehicle. Before it has one they go by the same rule, but to the
+  port alone.
+- A client gets all of its vehicle, FTP with its vehicle, and the heartbeats of others. `_concerns` says it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
 
-from mavftpfs.link.addresses import PATIENCE, AddressBook, NetAddress
+from mavftpfs.hub.senders import PORT, Belief, Place, Senders
+from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID
 from mavftpfs.link.frames import EVERYBODY, HEARTBEAT_ID, Frame, armed_by
 from mavftpfs.link.messages import Address
-
-PORT = 0
-"""The side that SOURCE names."""
 
 ALL = 0
 """The focus of a client that does not know its vehicle yet."""
@@ -33,11 +29,6 @@ BEATS = -1
 
 BEAT_PERIOD = 0.5
 """Seconds between two heartbeats of one sender that clients with another vehicle get."""
-MEMORY = 60.0
-"""Seconds for which a place that fell silent still gets the frames for all."""
-_MOST_PLACES = 64
-_MOST_SENDERS = 64
-"""Of one side."""
 _MOST_PLANS = 4096
 
 
@@ -49,41 +40,29 @@ class Kind(Enum):
     CLIENT = "client"
 
 
-class Place(NamedTuple):
-    """A side, and an address there; None where the side has only one, or chooses it itself."""
-
-    side: int
-    address: NetAddress | None
-
-
 @dataclass(slots=True)
 class _Side:
     """fixed: all frames go there to one address. focus: the system that concerns a client. answers: the
-    address that a client sends to."""
+    address of a client's vehicle."""
 
     kind: Kind
     fixed: bool
     focus: int = ALL
     answers: NetAddress | None = None
-    heard: dict[NetAddress | None, float] = field(default_factory=dict)
 
 
 class Router:
-    """Knows the sides, what was heard where, and where a frame goes.
+    """Knows the sides, and where a frame goes.
 
     Attributes:
-        doubles: senders of the port that were heard at a second address too, and where: two vehicles, or a
-            fake.
+        senders: what was heard where.
         armed: system -> whether its autopilot's last heartbeat said that it is armed.
     """
 
     def __init__(self) -> None:
-        self.doubles: dict[Address, NetAddress] = {}
+        self.senders = Senders()
         self.armed: dict[int, bool] = {}
         self._sides: dict[int, _Side] = {}
-        self._book = AddressBook()
-        self._suspects: dict[Address, NetAddress] = {}
-        self._elsewhere: dict[Address, dict[Place, float]] = {}
         self._beats: dict[Address, float] = {}
         self._plans: dict[tuple[Place, Address, Address, bool], tuple[Place, ...]] = {}
 
@@ -97,11 +76,7 @@ class Router:
     def remove(self, side: int) -> None:
         """Forget a side, and what was heard there."""
         del self._sides[side]
-        for sender, places in list(self._elsewhere.items()):
-            for place in [place for place in places if place.side == side]:
-                del places[place]
-            if not places:
-                del self._elsewhere[sender]
+        self.senders.remove(side)
         self._plans.clear()
 
     def focus(self, side: int, system: int) -> None:
@@ -114,174 +89,86 @@ class Router:
         self._sides[side].answers = address
         self._plans.clear()
 
-    def taken(self, wanted: Address, now: float) -> bool:
-        """Return whether a program uses a MAVLink address."""
-        return wanted in self._elsewhere or self._book.place_of(wanted, now) is not None
-
-    def heard_at(self, side: int) -> float | None:
-        """Return when something was heard from a side last."""
-        return max(self._sides[side].heard.values(), default=None)
-
     # -- frames
 
     def route(self, frame: Frame, place: Place, now: float) -> tuple[Place, ...]:
         """Return where a frame goes that came from a place; nowhere if it is not believed."""
-        side = self._sides[place.side]
-        if not self._is_believed(frame, place, side.kind, now):
-            if side.kind is not Kind.PORT or frame.source in self._elsewhere:
-                return ()
+        belief = self.senders.judge(frame.source, place, now, proven=frame.crc_fits)
+        if belief is Belief.REFUSED:
+            return ()
+        if belief is Belief.SECOND:
             # Each client judges by unique ids which of two vehicles is the mounted one.
-            return tuple(self._clients(frame, place, now))
-        if place.address not in side.heard:
-            self._welcome(place.address, side, now)
-        side.heard[place.address] = now
-        if frame.id == HEARTBEAT_ID:
-            self._on_heartbeat(frame, side)
-            return (*self._plan(frame, place), *self._clients(frame, place, now))
+            return tuple(self._to_clients(frame, place, now))
+        if belief is Belief.NEW:
+            self._plans.clear()
+        if frame.id == HEARTBEAT_ID:  # how often clients get them depends on the time
+            self._note_armed(frame, place)
+            return (*self._out(frame, place), *self._to_clients(frame, place, now))
         key = (place, frame.source, frame.target, frame.id == FTP_MESSAGE_ID)
         plan = self._plans.get(key)
         if plan is None:
             if len(self._plans) >= _MOST_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = (*self._plan(frame, place), *self._clients(frame, place, now))
+            plan = self._plans[key] = (*self._out(frame, place), *self._to_clients(frame, place, now))
         return plan
 
-    def _is_believed(self, frame: Frame, place: Place, kind: Kind, now: float) -> bool:
-        """Return whether a frame from a place is believed, and note its sender."""
-        sender, book = frame.source, self._book
-        if kind is Kind.PORT:
-            others = self._elsewhere.get(sender)
-            if others is not None and now - max(others.values()) <= PATIENCE:
-                return False  # it comes back
-            where = place.address or ()
-            before = book.last_place(sender)
-            if not frame.crc_fits:
-                return before == where
-            if not book.accepts(sender, where, now):
-                self._suspects[sender] = where
-                return False
-            if others is not None:  # it is silent there
-                del self._elsewhere[sender]
-                self._plans.clear()
-            if before != where:
-                self._plans.clear()
-                self._suspects.pop(sender, None)
-                self.doubles.pop(sender, None)
-            elif sender in self._suspects:  # both are there: it did not just move
-                self.doubles[sender] = self._suspects.pop(sender)
-            return True
-        if book.place_of(sender, now) is not None:
-            return False  # it comes back, or claims to be the vehicle
-        places = self._elsewhere.get(sender)
-        if places is not None and place in places:
-            places[place] = now
-            return True
-        if not frame.crc_fits:
-            return False
-        self._make_room(place.side)
-        self._elsewhere.setdefault(sender, {})[place] = now
-        self._plans.clear()
-        return True
-
-    def _make_room(self, side: int) -> None:
-        """If a side has too many senders, because it makes them up, forget the one that was silent for
-        longest."""
-        heard = [
-            (at, sender, place)
-            for sender, places in self._elsewhere.items()
-            for place, at in places.items()
-            if place.side == side
-        ]
-        if len(heard) >= _MOST_SENDERS:
-            _, sender, place = min(heard, key=lambda one: one[0])
-            del self._elsewhere[sender][place]
-            if not self._elsewhere[sender]:
-                del self._elsewhere[sender]
-
-    def _welcome(self, address: NetAddress | None, side: _Side, now: float) -> None:
-        """Note a new address of a side, and forget those that fell silent."""
-        if len(side.heard) >= _MOST_PLACES:
-            del side.heard[min(side.heard, key=lambda known: side.heard[known])]
-        for known in [known for known, at in side.heard.items() if now - at > MEMORY]:
-            del side.heard[known]
-        side.heard[address] = now
-        self._plans.clear()
-
-    def _on_heartbeat(self, frame: Frame, side: _Side) -> None:
-        armed = armed_by(frame) if side.kind is Kind.PORT and frame.crc_fits else None
+    def _note_armed(self, frame: Frame, place: Place) -> None:
+        armed = armed_by(frame) if place.side == PORT and frame.crc_fits else None
         if armed is not None:
             self.armed[frame.source.system] = armed
 
-    def _plan(self, frame: Frame, place: Place) -> Iterator[Place]:
-        """Yield the places on the port and at endpoints that a frame goes to."""
+    def _out(self, frame: Frame, place: Place) -> list[Place]:
+        """Return the places on the port and at endpoints that a frame goes to."""
         origin = self._sides[place.side]
-        known = [where for where in self._places_of(frame.target) if where.side != place.side]
+        if origin.answers is not None:
+            return [self._way_to(Place(PORT, origin.answers))]
         if origin.kind is Kind.CLIENT:
-            if origin.answers is not None:
-                yield self._outlet(PORT, origin.answers)
-                return
-            known = [where for where in known if where.side == PORT]
-            yield from known or self._all_of(PORT)
-            return
-        shunned = {place.side, *(heard.side for heard in self._elsewhere.get(frame.source, ()))}
-        if not known:
-            others = [number for number, side in self._sides.items() if side.kind is not Kind.CLIENT]
-            known = [where for number in others for where in self._all_of(number)]
-        for where in known:
-            if where.side not in shunned and self._sides[where.side].kind is not Kind.CLIENT:
-                yield where
+            sides = {PORT}
+        else:
+            sides = {number for number, side in self._sides.items() if side.kind is not Kind.CLIENT}
+            sides -= {heard.side for heard in self.senders.places_of(frame.source)}
+        targets = self.senders.places_of(frame.target)
+        if not targets:
+            targets = [found for side in sorted(sides) for found in self._places_at(side)]
+        return list(dict.fromkeys(self._way_to(found) for found in targets if found.side in sides))
 
-    def _places_of(self, target: Address) -> list[Place]:
-        """Return where a component was heard, or else its system."""
-        system: dict[Place, None] = {}
-        exact: dict[Place, None] = {}
-        if target.system:
-            for sender, address in self._book.known():
-                if sender.system == target.system:
-                    found = exact if sender == target else system
-                    found[self._outlet(PORT, address or None)] = None
-            for sender, places in self._elsewhere.items():
-                if sender.system == target.system:
-                    found = exact if sender == target else system
-                    found.update(dict.fromkeys(self._outlet(*where) for where in places))
-        return list(exact or system)
+    def _places_at(self, side: int) -> list[Place]:
+        return [Place(side, None)] if self._sides[side].fixed else self.senders.places_at(side)
 
-    def _all_of(self, number: int) -> list[Place]:
-        """Return all places of a side."""
-        side = self._sides[number]
-        return [Place(number, None)] if side.fixed else [Place(number, address) for address in side.heard]
+    def _way_to(self, place: Place) -> Place:
+        return Place(place.side, None) if self._sides[place.side].fixed else place
 
-    def _outlet(self, number: int, address: NetAddress | None) -> Place:
-        return Place(number, None if self._sides[number].fixed else address)
-
-    def _clients(self, frame: Frame, place: Place, now: float) -> Iterator[Place]:
+    def _to_clients(self, frame: Frame, place: Place, now: float) -> Iterator[Place]:
         """Yield the clients that a frame concerns."""
-        kind, heartbeat = self._sides[place.side].kind, frame.id == HEARTBEAT_ID
-        if kind is not Kind.PORT and frame.id != FTP_MESSAGE_ID:
-            # Vehicles are on the port. Clients need to hear of ground stations, but not of each other.
-            station = heartbeat and kind is Kind.ENDPOINT and armed_by(frame) is None
-            if not station:
-                return
-        due = heartbeat and self._is_beat_due(frame.source, now)
+        kind = self._sides[place.side].kind
+        due = frame.id == HEARTBEAT_ID and self._is_due(frame, kind, now)
         for number, side in self._sides.items():
-            if side.kind is not Kind.CLIENT or number == place.side:
-                continue
-            if due or _concerns(side.focus, frame, on_port=kind is Kind.PORT):
+            if (
+                side.kind is Kind.CLIENT
+                and number != place.side
+                and (due or _concerns(side.focus, frame, kind))
+            ):
                 yield Place(number, None)
 
-    def _is_beat_due(self, sender: Address, now: float) -> bool:
-        if now - self._beats.get(sender, float("-inf")) < BEAT_PERIOD:
+    def _is_due(self, frame: Frame, kind: Kind, now: float) -> bool:
+        """Return whether a heartbeat is told to all clients: they hear of vehicles, which are on the port,
+        and of ground stations. Not of each other, and not of each heartbeat of other vehicles."""
+        if kind is Kind.CLIENT or (kind is Kind.ENDPOINT and armed_by(frame) is not None):
+            return False
+        if now - self._beats.get(frame.source, float("-inf")) < BEAT_PERIOD:
             return False
         if len(self._beats) >= _MOST_PLANS:
             self._beats.clear()
-        self._beats[sender] = now
+        self._beats[frame.source] = now
         return True
 
 
-def _concerns(focus: int, frame: Frame, *, on_port: bool) -> bool:
-    """Return whether a client with that focus gets a frame, from the port or from elsewhere."""
+def _concerns(focus: int, frame: Frame, origin: Kind) -> bool:
+    """Return whether a frame goes to a client with that focus."""
     if focus == BEATS:
         return False
-    if focus == ALL or (on_port and frame.source.system == focus):
-        return True
-    return frame.id == FTP_MESSAGE_ID and frame.target.system in (EVERYBODY.system, focus)
+    of_vehicle = origin is Kind.PORT and focus in (ALL, frame.source.system)
+    with_vehicle = frame.id == FTP_MESSAGE_ID and (
+        focus == ALL or frame.target.system in (EVERYBODY.system, focus)
+    )
+    return of_vehicle or with_vehicle

@@ -7,7 +7,6 @@ vehicle's router restarted, or it comes over its other link.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -41,20 +40,6 @@ class AddressBook:
 
     def __contains__(self, sender: Address) -> bool:
         return sender in self._senders
-
-    def known(self) -> Iterator[tuple[Address, NetAddress]]:
-        """Yield each sender and the address it is known by."""
-        return ((sender, known.address) for sender, known in self._senders.items())
-
-    def last_place(self, sender: Address) -> NetAddress | None:
-        """Return the address that a sender is known by, however long ago it was heard."""
-        known = self._senders.get(sender)
-        return None if known is None else known.address
-
-    def place_of(self, sender: Address, now: float) -> NetAddress | None:
-        """Return where a sender was heard in the last seconds, if it was."""
-        known = self._senders.get(sender)
-        return None if known is None or now - known.heard_at > PATIENCE else known.address
 
     def accepts(self, sender: Address, address: NetAddress, now: float) -> bool:
         """Return whether a frame of a sender counts that came from an address, and note that it was heard."""

@@ -14,7 +14,7 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_MODE_FLAG_SAFETY_A
 
 HEARTBEAT_ID = 0
 _ANY_ID = 0xFFFFFF
-_AUTOPILOT_AT, _MODE_AT = 5, 6
+_AUTOPILOT_AT, _MODE_AT, _HEARTBEAT_SIZE = 5, 6, 9
 EVERYBODY = Address(0, 0)
 
 
@@ -65,11 +65,10 @@ def _frame(data: bytes, message_id: int, *, crc_fits: bool) -> Frame:
 
 def armed_by(frame: Frame) -> bool | None:
     """Return whether a heartbeat says that its vehicle is armed; None if it is no autopilot's heartbeat."""
-    payload = frame.data[10 if frame.data[0] == 0xFD else 6 :]
-    if (
-        frame.id != HEARTBEAT_ID
-        or len(payload) <= _MODE_AT
-        or payload[_AUTOPILOT_AT] == MAV_AUTOPILOT_INVALID
-    ):
+    if frame.id != HEARTBEAT_ID:
+        return None
+    header = 10 if frame.data[0] == 0xFD else 6
+    payload = frame.data[header : header + frame.data[1]].ljust(_HEARTBEAT_SIZE, b"\0")
+    if payload[_AUTOPILOT_AT] == MAV_AUTOPILOT_INVALID:
         return None
     return bool(payload[_MODE_AT] & MAV_MODE_FLAG_SAFETY_ARMED)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from fastcrc import crc16
 
 from mavftpfs.hub.outbox import LINE_TIME, Line, Outbox, Waiting
-from mavftpfs.hub.routing import BEATS, PORT, Kind, Place, Router
+from mavftpfs.hub.routing import BEATS, Kind, Router
+from mavftpfs.hub.senders import MEMORY, MOST_SENDERS, PORT, Place
 from mavftpfs.link.addresses import PATIENCE, NetAddress
 from mavftpfs.link.fastframe import FTP_PAYLOAD_SIZE
-from mavftpfs.link.frames import EVERYBODY, Frame, Splitter, armed_by
+from mavftpfs.link.frames import EVERYBODY, HEARTBEAT_ID, Frame, Splitter, armed_by
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.sim.vehicle import telemetry
@@ -93,6 +95,17 @@ def test_what_a_stream_ended_in_counts_when_it_falls_silent() -> None:
     assert not splitter.waiting
 
 
+def test_zeros_that_were_cut_from_a_heartbeat_are_no_armed_vehicle() -> None:
+    """Its last fields are zeros: base_mode too. The bytes behind are the checksum."""
+    for custom_mode in range(256):
+        head = bytes((5, 0, 0, 0, *ONE, HEARTBEAT_ID, 0, 0))
+        payload = custom_mode.to_bytes(4, "little") + b"\x02"
+        crc = crc16.mcrf4xx(head + payload + bytes((50,)))  # 50: the message's extra byte
+        frame = parsed(b"\xfd" + head + payload + crc.to_bytes(2, "little"))
+        assert frame.crc_fits
+        assert armed_by(frame) is False
+
+
 def test_only_autopilots_are_armed() -> None:
     assert armed_by(beat(ONE, armed=True)) is True
     assert armed_by(beat(ONE)) is False
@@ -160,6 +173,7 @@ ROUTES: dict[str, tuple[Frame, int, NetAddress | None, set[Place]]] = {
     "a client by the port": (hello(CLIENT), PORT, AT_ONE, set()),
     "another vehicle at an endpoint": (beat(FAR), WEST, AT_WEST, {TO_ONE, TO_TWO, TO_EAST}),
     "it asks ours": (ftp(FAR, ONE), WEST, AT_WEST, {TO_ONE, TO_MOUNT}),
+    "one vehicle asks the other": (ftp(ONE, TWO), PORT, AT_ONE, {TO_MOUNT, TO_OTHER}),
 }
 
 
@@ -193,13 +207,14 @@ def test_heartbeats_of_others_are_told_to_clients_but_no_flood_of_them(net: Net)
 @pytest.mark.holds("promise 1")
 def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> None:
     assert net.sides(ftp(ONE, STATION), PORT, ELSEWHERE) == {MOUNT}, "which judges for itself"
-    assert net.router.doubles == {}, "it may have moved"
+    assert net.router.senders.doubles() == {}, "it may have moved"
+    net.now += 0.1
     net.send(attitude(ONE), PORT, AT_ONE)
-    assert net.router.doubles == {ONE: ELSEWHERE}
+    assert net.router.senders.doubles() == {ONE: ELSEWHERE}
     assert net.send(ftp(STATION, ONE), EAST) >= {Place(PORT, AT_ONE)}
     net.now += PATIENCE + 1
     assert EAST in net.sides(attitude(ONE), PORT, ELSEWHERE), "the first one fell silent"
-    assert net.router.doubles == {}
+    assert net.router.senders.doubles() == {}
 
 
 def test_a_vehicle_that_comes_back_at_another_address_is_no_second_one(net: Net) -> None:
@@ -207,13 +222,14 @@ def test_a_vehicle_that_comes_back_at_another_address_is_no_second_one(net: Net)
     for _ in range(int(PATIENCE) + 2):
         net.send(beat(ONE), PORT, ELSEWHERE)
         net.now += 1
-    assert net.router.doubles == {}
+    assert net.router.senders.doubles() == {}
 
 
 def test_a_vehicle_that_is_back_on_the_port_is_told_to_the_endpoint_that_spoke_for_it(net: Net) -> None:
     net.now += PATIENCE + 1
     net.send(attitude(ONE), EAST)
     assert net.sides(attitude(ONE), PORT, AT_ONE) == set(), "it counts where it was heard last"
+    assert net.send(ftp(FAR, ONE), WEST, AT_WEST) == {TO_EAST, TO_MOUNT}, "and frames for it go there alone"
     net.now += PATIENCE + 1
     assert EAST in net.sides(attitude(ONE), PORT, AT_ONE)
 
@@ -223,33 +239,64 @@ def test_damaged_frames_pass_on_their_way_but_teach_nothing(net: Net) -> None:
     assert EAST in net.sides(damaged, PORT, AT_ONE)
     unheard = attitude(Address(77, 1))._replace(crc_fits=False)
     assert not net.sides(unheard, PORT, AT_TWO) & {EAST, WEST}
-    assert not net.router.taken(Address(77, 1), net.now)
+    assert Address(77, 1) not in net.router.senders
     net.send(beat(ONE, armed=True)._replace(crc_fits=False), PORT, AT_ONE)
     assert not net.router.armed[1]
 
 
+def made_up(number: int) -> Address:
+    return Address(10 + number % 240, 1 + number // 240)
+
+
 def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
-    for number in range(500):
-        net.send(attitude(Address(10 + number % 200, 1 + number // 200)), WEST, AT_WEST)
+    for number in range(3 * MOST_SENDERS):
+        net.send(attitude(made_up(number)), WEST, AT_WEST)
         net.now += 0.001
-    assert net.router.taken(STATION, net.now)
+    assert STATION in net.router.senders
     assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None)}
     late = Address(255, 77)
     net.send(beat(late, autopilot=8), EAST)
     assert net.send(ftp(ONE, late), PORT, AT_ONE) >= {Place(EAST, None)}
 
 
+@pytest.mark.holds("promise 1")
+def test_made_up_senders_on_the_port_take_no_vehicles_place_and_do_not_go_round(net: Net) -> None:
+    passed = 0
+    for number in range(3 * MOST_SENDERS):
+        frame = attitude(made_up(number))
+        if net.sides(frame, PORT, ELSEWHERE):
+            passed += 1
+            assert not net.send(frame, PORT, AT_TWO) & {TO_EAST, TO_WEST}, "it was sent back by a router"
+        net.now += 0.001
+    assert passed < MOST_SENDERS
+    assert EAST not in net.sides(attitude(ONE), PORT, ELSEWHERE)
+    assert EAST in net.sides(attitude(ONE), PORT, AT_ONE)
+    net.now += PATIENCE + 1
+    assert EAST in net.sides(attitude(FAR), PORT, AT_TWO), "room for a new one when they fell silent"
+
+
+def test_frames_for_all_go_no_longer_where_a_station_was_before(net: Net) -> None:
+    station = Address(255, 191)
+    for number in range(5):
+        net.now += MEMORY + 1
+        assert net.sides(hello(station), WEST, ("127.0.0.1", 50 + number))
+    net.send(attitude(ONE), PORT, AT_ONE)
+    assert {place for place in net.send(attitude(ONE), PORT, AT_ONE) if place.side == WEST} == {
+        Place(WEST, ("127.0.0.1", 54))
+    }
+
+
 def test_what_cannot_be_proven_makes_nobody_known(net: Net) -> None:
     rubbish = parsed(foreign(Address(99, 1), 54_321))
     assert net.sides(rubbish, WEST, AT_WEST) == set()
-    assert not net.router.taken(Address(99, 1), net.now)
+    assert Address(99, 1) not in net.router.senders
     assert EAST in net.sides(parsed(foreign(ONE, 54_321)), PORT, AT_ONE), "the vehicle itself is known"
 
 
 def test_who_left_is_forgotten(net: Net) -> None:
     net.router.remove(EAST)
     assert EAST not in net.sides(ftp(ONE, STATION), PORT, AT_ONE)
-    assert not net.router.taken(STATION, net.now)
+    assert STATION not in net.router.senders
 
 
 # -- which mount is next --------------------------------------------------------------------------

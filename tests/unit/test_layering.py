@@ -66,6 +66,7 @@ PURE_MODULES = {
     "client.options",
     "hub.outbox",
     "hub.routing",
+    "hub.senders",
     "mount.handles",
     "mount.roster",
     "mount.options",
