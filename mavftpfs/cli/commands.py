@@ -86,7 +86,8 @@ def _serve(
     from mavftpfs.client.connect import open_sinks
 
     try:
-        from mavftpfs.mount.kernel import MountRequest, run_mount
+        from mavftpfs.mount.life import MountRequest
+        from mavftpfs.mount.single import run_mount
     except ImportError as exc:  # libfuse3 went away, or another version of it came, since pyfuse3 was built
         raise MountFailed(f"{exc}; install libfuse3 and mavftpfs anew (pipx reinstall mavftpfs)") from exc
 

@@ -37,10 +37,6 @@ ended a moment after its parent was told, and desktop services look at what is n
 _BUSY_PAUSE = 0.1
 
 
-class CannotStart(MountFailed):
-    """The program that unmounts could not be started by this process."""
-
-
 class DeadMount(MountFailed):
     """What is mounted there has lost its program."""
 
@@ -143,10 +139,10 @@ def ours_below(path: str) -> list[str]:
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:
-    """Unmount, waiting for it; with `lazy` even if it is in use.
+    """Unmount, waiting for it; with `lazy` even if it is in use. Another program may have done it already.
 
     Raises:
-        MountFailed: busy, or whatever fusermount3 said.
+        MountFailed: it is still mounted: busy, or whatever fusermount3 said.
     """
     program = "fusermount3" if shutil.which("fusermount3") else "umount"
     words = [program, *(["-u"] if program == "fusermount3" else []), *(["-z"] if lazy else []), "--", path]
@@ -158,35 +154,21 @@ def unmount(path: str, *, lazy: bool = False) -> None:
             break
         time.sleep(_BUSY_PAUSE)
         said = _said_by(words, path)
-    if said is not None:
+    if said is not None and path in mounts():
         raise MountFailed(_describe_unmount(path, said))
-
-
-def unmount_what_is_left(path: str) -> None:
-    """Unmount lazily a mount that another program may be unmounting, or has just unmounted.
-
-    Raises:
-        MountFailed: it is still mounted; with what fusermount3 said.
-    """
-    try:
-        unmount(path, lazy=True)
-    except MountFailed:
-        if path in mounts():
-            raise
 
 
 def _said_by(words: list[str], path: str) -> str | None:
     """Return the complaint of a program that mounts or unmounts, None if it succeeded.
 
     Raises:
-        CannotStart: it is missing, or this process has no descriptors left.
-        MountFailed: it does not end.
+        MountFailed: it cannot be started (it is missing, or no descriptors are left), or does not end.
     """
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
     except OSError as exc:
         command = " ".join(words)
-        raise CannotStart(f"cannot start {words[0]} here: {exc.strerror}; run: {command}") from exc
+        raise MountFailed(f"cannot start {words[0]} here: {exc.strerror}; run: {command}") from exc
     except subprocess.TimeoutExpired as exc:
         raise MountFailed(f"{words[0]} {path}: {exc}") from exc
     return done.stderr.strip() if done.returncode != 0 else None

@@ -121,6 +121,11 @@ def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
     return int(code)
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals that end us: not those that our caller made us ignore (nohup)."""
+    return [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
+
+
 @contextmanager
 def _ending_raises() -> Iterator[None]:
     """Have the signals that end us raise _Ended."""
@@ -146,9 +151,8 @@ def signals_held() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Give the signals that end us to a handler, except those that our caller made us ignore (nohup)."""
-    taken = [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, handler) for number in taken}
+    """Give the signals that end us to a handler."""
+    before = {number: signal.signal(number, handler) for number in ending_signals()}
     try:
         yield
     finally:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Heartbeat
+from mavftpfs.shared.errors import ExitCode
 
 FIRST_INO = 2
 """1 is the root's."""
@@ -26,7 +27,7 @@ MOST = 64
 _NAME = re.compile(rb"([1-9][0-9]{0,2})(?:-([1-9][0-9]{0,2}))?")
 
 
-class State(Enum):
+class MemberState(Enum):
     """What a vehicle's own mount is doing."""
 
     HEARD = "heard"
@@ -37,11 +38,11 @@ class State(Enum):
 
 
 NEXT = {
-    State.HEARD: {State.STARTING},
-    State.STARTING: {State.MOUNTED, State.FAILED, State.UNMOUNTED},
-    State.MOUNTED: {State.FAILED, State.UNMOUNTED},
-    State.FAILED: {State.STARTING},
-    State.UNMOUNTED: set(),
+    MemberState.HEARD: {MemberState.STARTING},
+    MemberState.STARTING: {MemberState.MOUNTED, MemberState.FAILED, MemberState.UNMOUNTED},
+    MemberState.MOUNTED: {MemberState.FAILED, MemberState.UNMOUNTED},
+    MemberState.FAILED: {MemberState.STARTING},
+    MemberState.UNMOUNTED: set(),
 }
 """State -> the states that may follow. A mount that the user ended stays ended."""
 
@@ -56,7 +57,7 @@ class Member:
     system: int
     component: int
     ino: int
-    state: State = State.HEARD
+    state: MemberState = MemberState.HEARD
     heard_at: float = float("-inf")
     due_at: float = float("-inf")
     pause: float = FIRST_PAUSE
@@ -67,25 +68,25 @@ class Member:
         """The name of its directory: `1`, or `1-100`."""
         return f"{self.system}-{self.component}" if self.component else str(self.system)
 
-    def _go_to(self, state: State) -> None:
+    def _go_to(self, state: MemberState) -> None:
         assert state in NEXT[self.state], (self.state, state)
         self.state = state
 
     def start(self) -> None:
         """Its mount is being started."""
-        self._go_to(State.STARTING)
+        self._go_to(MemberState.STARTING)
 
     def mounted(self) -> None:
         """Its mount is up."""
-        self._go_to(State.MOUNTED)
+        self._go_to(MemberState.MOUNTED)
         self.pause, self.problem = FIRST_PAUSE, ""
 
     def ended(self, code: int, problem: str, now: float) -> None:
-        """Its mount's process ended; code 0: it was unmounted."""
-        if code == 0:
-            self._go_to(State.UNMOUNTED)
+        """Its mount's process ended, with an exit code."""
+        if code in (ExitCode.OK, ExitCode.UNDELIVERED):  # it was unmounted
+            self._go_to(MemberState.UNMOUNTED)
             return
-        self._go_to(State.FAILED)
+        self._go_to(MemberState.FAILED)
         self.problem = problem
         self.due_at = now + self.pause
         self.pause = min(self.pause * 2, LONGEST_PAUSE)
@@ -142,7 +143,7 @@ class Roster:
         return [
             member
             for member in self
-            if member.state in (State.HEARD, State.FAILED)
+            if member.state in (MemberState.HEARD, MemberState.FAILED)
             and member.due_at <= now
             and now - member.heard_at <= HEARD_LATELY
         ]

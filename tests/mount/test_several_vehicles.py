@@ -276,7 +276,8 @@ def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Flee
     nothing_can_be_made_beside_the_vehicles(mounts)
     with mounts.started("sleep", "100", cwd=mounts.path / "1") as holder:
         said = command("umount", mounts.path, code=3)[1]
-        assert "in use" in said
+        assert f"{mounts.path}/1 is in use" in said
+        assert said.endswith("; unmounted: 2\n")
         assert mounted_at(mounts.path / "1")
         holder.kill()
     fleet.launch(3)

@@ -20,8 +20,9 @@ import trio
 from mavftpfs.client.connect import Attached
 from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
-from mavftpfs.mount.kernel import MountRequest, serve_mount
+from mavftpfs.mount.life import MountRequest
 from mavftpfs.mount.options import MountOptions
+from mavftpfs.mount.single import SingleMount
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0
@@ -93,7 +94,7 @@ def main() -> int:
     request = MountRequest(
         source, parse_source(source), mountpoint, MountOptions(Options(read_only=True)), control=Path(control)
     )
-    return trio.run(serve_mount, request, Server().attach, report)
+    return trio.run(SingleMount(request, Server().attach, report).run)
 
 
 def report(code: int, message: str) -> None:

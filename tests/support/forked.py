@@ -21,7 +21,7 @@ from pathlib import Path
 _SERVER = multiprocessing.get_context("forkserver")
 _SERVER.set_forkserver_preload(
     [
-        *("mavftpfs.__main__", "mavftpfs.cli.main", "mavftpfs.mount.kernel", "mavftpfs.sim.endpoints"),
+        *("mavftpfs.__main__", "mavftpfs.cli.main", "mavftpfs.mount.single", "mavftpfs.sim.endpoints"),
         *("tests.support.flown", "tests.support.proxy"),
     ]
 )

@@ -16,7 +16,6 @@ from mavftpfs.client.mountpoint import (
     is_ours,
     mounts,
     unmount,
-    unmount_what_is_left,
 )
 from mavftpfs.shared.errors import MountFailed
 
@@ -97,7 +96,7 @@ def test_canonical_follows_links(tmp_path: Path) -> None:
 
 def test_what_somebody_else_has_unmounted_is_gone(tmp_path: Path) -> None:
     """After `fusermount3 -u` a mount ended with 3, `Invalid argument`, if a thread of it was still busy."""
-    unmount_what_is_left(str(tmp_path))
+    unmount(str(tmp_path), lazy=True)
 
 
 def test_what_is_busy_for_a_moment_is_unmounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,11 @@ from mavftpfs.mount.roster import (
     HEARD_LATELY,
     LONGEST_PAUSE,
     MOST,
+    MemberState,
     Roster,
-    State,
     parse_name,
 )
+from mavftpfs.shared.errors import ExitCode
 
 
 def beat(system: int, component: int = 1, autopilot: int = 12) -> Heartbeat:
@@ -97,14 +98,15 @@ def test_a_silent_vehicle_is_not_mounted_again_before_it_is_heard() -> None:
     assert due(roster, 60.0) == ["1"]
 
 
-def test_what_the_user_unmounted_stays_so() -> None:
+@pytest.mark.parametrize("code", [ExitCode.OK, ExitCode.UNDELIVERED])
+def test_what_the_user_unmounted_stays_so(code: ExitCode) -> None:
     roster = Roster()
     roster.hear(beat(1), 0.0)
     (member,) = roster
     member.start()
     member.mounted()
-    member.ended(0, "", 1.0)
-    assert member.state is State.UNMOUNTED
+    member.ended(code, "", 1.0)
+    assert member.state is MemberState.UNMOUNTED
     assert due(roster, 2.0) == []
 
 

@@ -1,0 +1,111 @@
+"""Tells the kernel that what it cached is old. Layer: mount."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import pyfuse3
+import trio
+
+from mavftpfs.mount.handles import InodeTable
+from mavftpfs.shared.model import split
+
+log = logging.getLogger("mavftpfs.mount")
+
+MAX_DROPS = 16
+"""Files of which the kernel is told at once to drop its pages; each takes a thread."""
+
+
+class Invalidator:
+    """Tells the kernel, by its calls `notify(ino, attr_only)` and `notify_name(parent ino, name)`.
+
+    These run in a worker thread. In them the kernel waits for pages that are being read and for names that
+    are being looked up, and the event loop has to answer those.
+    """
+
+    def __init__(
+        self,
+        inodes: InodeTable,
+        notify: Callable[[int, bool], None] = pyfuse3.invalidate_inode,
+        notify_name: Callable[[int, bytes], None] = pyfuse3.invalidate_entry,
+    ) -> None:
+        self._inodes = inodes
+        self._notify = notify
+        self._notify_name = notify_name
+        self._pending: set[int] = set()
+        self._wake = trio.Event()
+        self._calls: set[object] = set()
+        self._drops = trio.CapacityLimiter(MAX_DROPS)
+        # Without a limit: a call that queued and was cancelled would count as running.
+        self._limiter = trio.CapacityLimiter(math.inf)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a thread is inside the kernel's call at this moment."""
+        return bool(self._calls)
+
+    def on_changed(self, path: bytes) -> None:
+        """Make the kernel drop its pages and attributes of a path, because its bytes changed."""
+        ino = self._inodes.known(path)
+        if ino is not None:
+            self._pending.add(ino)
+            self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        async with trio.open_nursery() as nursery:
+            while True:
+                await self._wake.wait()
+                self._wake = trio.Event()
+                pending, self._pending = self._pending, set()
+                for ino in pending:
+                    nursery.start_soon(self._drop, ino)
+
+    async def _drop(self, ino: int) -> None:
+        """Make the kernel drop a file's pages and attributes. Other files do not wait for it, since one of
+        its pages may be read from a lost vehicle just now."""
+        async with self._drops:
+            await self._tell(ino, attr_only=False)
+
+    async def forget_attributes(self, ino: int) -> None:
+        """Make the kernel ask for attributes again; return when it has forgotten them."""
+        await self._tell(ino, attr_only=True)
+
+    async def forget_name(self, path: bytes) -> None:
+        """Make the kernel look a name up again; return when it has forgotten it."""
+        directory, name = split(path)
+        parent = self._inodes.known(directory)
+        if parent is not None:
+            await self._in_thread([partial(self._notify_name, parent, name)])
+
+    async def forget_beliefs(self) -> None:
+        """Make the kernel ask again for all that it would answer by itself; return when it has forgotten
+        it."""
+        inodes, absent = self._inodes.believed(trio.current_time())
+        calls = [partial(self._notify, ino, True) for ino in inodes]
+        await self._in_thread(calls + [partial(self._notify_name, *name) for name in absent])
+
+    async def _tell(self, ino: int, *, attr_only: bool) -> None:
+        await self._in_thread([partial(self._notify, ino, attr_only)])
+
+    async def _in_thread(self, calls: Sequence[Callable[[], None]]) -> None:
+        await trio.lowlevel.checkpoint_if_cancelled()
+        running = object()
+        self._calls.add(running)
+        action = partial(self._call, running, calls)
+        await trio.to_thread.run_sync(action, abandon_on_cancel=True, limiter=self._limiter)
+
+    def _call(self, running: object, calls: Sequence[Callable[[], None]]) -> None:
+        try:
+            for call in calls:
+                try:
+                    call()
+                except OSError as exc:
+                    if exc.errno != errno.ENOENT:  # the kernel forgot it by itself
+                        log.warning("the kernel refused to drop what it cached: %s", exc)
+        finally:
+            self._calls.discard(running)

@@ -1,0 +1,222 @@
+"""The life of a mount: its state, the signals, and the programs that wait for its end. Layer: mount.
+
+Each way to the end of a mount:
+
+- `mavftpfs umount` has this process unmount. If the mount is in use, that is refused and it goes on; with
+  `-l` it leaves all the same.
+- A program unmounts it (`umount`, `fusermount3 -u`, the kernel): it leaves. After `umount -l` or
+  `fusermount3 -uz` of a mount in use that is when its last user leaves.
+- The first SIGINT, SIGTERM or SIGHUP: it leaves, also if it is in use. The next one: it hurries, and what is
+  not delivered is kept. While it is starting the first one ends it.
+- The link cannot be opened any more: it ends, and what is not delivered is kept. (A vehicle that is lost ends
+  nothing.)
+- SIGKILL: nothing of this runs. The kernel's mount stays, and answers with ENOTCONN, until
+  `mavftpfs umount` (with `auto_unmount`, fusermount3 takes it away); the next mount of that vehicle finds the
+  spool.
+
+What leaving is, is said by the two kinds of mount: `mount.single` and `mount.supervisor`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import trio
+
+import mavftpfs
+from mavftpfs.client.connect import NO_SINKS, Sinks
+from mavftpfs.client.control import Reply
+from mavftpfs.client.controlserver import Command, ControlServer
+from mavftpfs.link.uri import LinkSpec
+from mavftpfs.mount.daemon import Report, ending_signals
+from mavftpfs.mount.options import MountOptions
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, exit_code_for
+
+log = logging.getLogger("mavftpfs.mount")
+
+LAST_REPLIES = 3.0
+"""Seconds to hand the programs that wait for the end their reply."""
+
+
+class State(Enum):
+    """What a mount is doing."""
+
+    STARTING = "starting"
+    """The vehicle is waited for; the kernel has no mount yet."""
+    MOUNTED = "mounted"
+    """Programs get answers."""
+    LEAVING = "leaving"
+    """Programs get no answers any more. What they wrote is delivered, or kept."""
+    ENDED = "ended"
+    """The exit code is known; the programs that waited for it are told."""
+
+
+NEXT = {
+    State.STARTING: {State.MOUNTED, State.ENDED},
+    State.MOUNTED: {State.LEAVING, State.ENDED},  # ENDED: the link failed
+    State.LEAVING: {State.ENDED, State.MOUNTED},  # MOUNTED: one vehicle of several is in use
+    State.ENDED: set[State](),
+}
+"""State -> the states that may follow."""
+
+
+@dataclass(frozen=True, slots=True)
+class MountRequest:
+    """What to mount where. mountpoint: absolute; control: the control socket's path, None = without."""
+
+    source: str
+    spec: LinkSpec
+    mountpoint: str
+    options: MountOptions
+    control: Path | None = None
+    sinks: Sinks = NO_SINKS
+
+
+class Life(ABC):
+    """A mount from start to end."""
+
+    def __init__(self, request: MountRequest, report: Report) -> None:
+        self.request = request
+        self.state = State.STARTING
+        self._code = ExitCode.OK
+        self._last_words: list[str] = []
+        self._report: Report | None = report
+        self._scope = trio.CancelScope()
+        self._ended = trio.Event()
+        self._control: ControlServer | None = None
+        self._started = time.time()
+
+    # -- what the two kinds of mount say
+
+    @abstractmethod
+    async def serve(self, nursery: trio.Nursery) -> None:
+        """Mount, serve until the mount has left. nursery: for what runs until the mount has ended."""
+
+    @abstractmethod
+    async def unmount(self, *, lazy: bool) -> None:
+        """Unmount, and leave; lazy: also if it is in use.
+
+        Raises:
+            MountFailed: it is in use, and goes on.
+        """
+
+    @abstractmethod
+    def leave(self) -> None:
+        """Leave, also if it is in use."""
+
+    @abstractmethod
+    def hurry(self) -> None:
+        """Deliver nothing more: keep what is left."""
+
+    @abstractmethod
+    def status(self) -> Mapping[str, Any]:
+        """Return facts beside those that every mount has; JSON-able."""
+
+    # -- from start to end
+
+    async def run(self) -> int:
+        """Live; returns the exit code."""
+        async with trio.open_nursery() as nursery:
+            await nursery.start(self._watch_signals)
+            try:
+                with self._scope:
+                    await self.serve(nursery)
+            except MavftpfsError as error:
+                self._fail(exit_code_for(error), str(error))
+            if self._scope.cancelled_caught and self.state is State.STARTING:
+                self._fail(ExitCode.INTERRUPTED, "interrupted")
+            self.enter(State.ENDED)
+            self._ended.set()
+            if self._control is not None:
+                self._control.close()
+                with trio.move_on_after(LAST_REPLIES):
+                    await self._control.closed.wait()
+            nursery.cancel_scope.cancel()
+        return self._code
+
+    def enter(self, state: State) -> None:
+        """Be in another state from now on."""
+        assert state in NEXT[self.state], (self.state, state)
+        self.state = state
+
+    def stop(self) -> None:
+        """Cancel `serve`."""
+        self._scope.cancel()
+
+    def tell_mounted(self, notice: str) -> None:
+        """Tell the command that waits for the mount that it is up."""
+        report, self._report = self._report, None
+        if report is not None:
+            report(ExitCode.OK, notice)
+
+    def note_end(self, code: int, words: str) -> None:
+        """Note the exit code of a part of the mount, and a line for the program that unmounts, or ""."""
+        self._code = max(self._code, ExitCode(code))
+        self._last_words += [words] if words else []
+
+    def _fail(self, code: ExitCode, reason: str) -> None:
+        """Tell the command that waits for the mount; once that has its answer, the log."""
+        self.note_end(code, "")
+        if self._report is not None:
+            self._report(code, reason)
+        else:
+            log.error("unmounted: %s", reason)
+
+    # -- who ends it
+
+    async def _watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
+        with trio.open_signal_receiver(*ending_signals()) as signals:
+            task_status.started()
+            async for number in signals:
+                log.info("signal %s", signal.Signals(number).name)
+                match self.state:
+                    case State.STARTING:
+                        self.stop()
+                    case State.MOUNTED:
+                        self.leave()
+                    case State.LEAVING:
+                        self.hurry()
+
+    async def start_control(self, commands: Mapping[str, Command], nursery: trio.Nursery) -> None:
+        """Answer `mavftpfs status`, `umount`, and the commands given."""
+        if self.request.control is None:
+            return
+
+        async def status(_: Reply) -> Reply:
+            return {"status": self.facts()}
+
+        own = {"status": status, "umount": self._umount}
+        server = ControlServer(self.request.control, {**own, **commands})
+        try:
+            await nursery.start(server.run)
+        except OSError as exc:
+            log.warning("no control socket, so no `mavftpfs status`: %s", exc)
+        else:
+            self._control = server
+
+    async def _umount(self, request: Reply) -> Reply:
+        await self.unmount(lazy=bool(request.get("lazy")))
+        await self._ended.wait()
+        return {"exit_code": int(self._code), "pid": os.getpid(), "message": "; ".join(self._last_words)}
+
+    def facts(self) -> dict[str, Any]:
+        """Return the status for people and scripts; JSON-able."""
+        return {
+            "mountpoint": self.request.mountpoint,
+            "state": "unmounting" if self.state is State.LEAVING else "mounted",
+            "problem": None,
+            "source": self.request.source,
+            "pid": os.getpid(),
+            "version": mavftpfs.__version__,
+            "uptime": round(time.time() - self._started, 1),
+            **self.status(),
+        }

@@ -1,0 +1,155 @@
+"""The mount of one vehicle: composition root. Layer: mount.
+
+Order matters. The vehicle must have answered before the kernel mount appears. At the end the kernel mount
+goes first; then what programs wrote is delivered, or kept; then the server's session is closed.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import partial
+from typing import Any
+
+import trio
+
+from mavftpfs.cache.tree import Tree
+from mavftpfs.client.connect import Attached, attached
+from mavftpfs.client.control import Reply
+from mavftpfs.client.controlserver import Command
+from mavftpfs.client.mountpoint import unmount
+from mavftpfs.client.status import network_namespace
+from mavftpfs.mount.daemon import Report
+from mavftpfs.mount.farewell import say_goodbye
+from mavftpfs.mount.handles import InodeTable
+from mavftpfs.mount.invalidator import Invalidator
+from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
+from mavftpfs.mount.life import Life, MountRequest, State
+from mavftpfs.mount.operations import Operations
+from mavftpfs.mount.options import fuse_words
+from mavftpfs.shared.errors import ExitCode
+
+FORGETTING_TIME = 2.0
+"""Seconds for the kernel to forget what it cached, for a command that waits for that."""
+
+Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
+"""Connects to the vehicle. Its argument is called for paths whose bytes changed."""
+
+
+def run_mount(request: MountRequest, report: Report) -> int:
+    """Mount and serve until unmounted; returns the exit code."""
+
+    def attach(invalidate: Callable[[bytes], None]) -> AbstractAsyncContextManager[Attached]:
+        return attached(
+            request.spec,
+            request.options.client,
+            invalidate=invalidate,
+            sinks=request.sinks,
+            writing=True,
+            rescue_for=request.source,
+        )
+
+    return trio.run(SingleMount(request, attach, report).run)
+
+
+class SingleMount(Life):
+    """The mount of one vehicle."""
+
+    def __init__(self, request: MountRequest, attach: Attach, report: Report) -> None:
+        super().__init__(request, report)
+        self._attach = attach
+        self._loop = FuseLoop()
+        self._status: Callable[[], Mapping[str, Any]] = dict
+
+    async def serve(self, nursery: trio.Nursery) -> None:
+        """See Life.serve."""
+        inodes = InodeTable()
+        invalidator = Invalidator(inodes)
+        async with self._attach(invalidator.on_changed) as vehicle, self._goodbye(vehicle.tree):
+            nursery.start_soon(vehicle.watcher.run)
+            operations = Operations(
+                vehicle.tree,
+                presentation(self.request.options),
+                inodes=inodes,
+                refresh=invalidator.forget_attributes,
+                space=vehicle.space,
+                status=self.facts,
+            )
+            self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
+            words = fuse_words(self.request.options, self.request.source)
+            with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
+                self.enter(State.MOUNTED)
+                await self.start_control(_commands(vehicle, operations, invalidator), nursery)
+                await self._answer(invalidator, vehicle.notice)
+
+    @asynccontextmanager
+    async def _goodbye(self, tree: Tree) -> AsyncIterator[None]:
+        """Deliver or keep what was written in the body, once the kernel mount is gone."""
+        try:
+            yield
+        finally:
+            if self.state is not State.STARTING:
+                await say_goodbye(tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED))
+        await tree.keep_whole_files()
+
+    async def _answer(self, invalidator: Invalidator, notice: Callable[[], str]) -> None:
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(invalidator.run)
+            gc.collect()
+            gc.freeze()  # else a full collection would go through all imported modules during a transfer
+            # Move old files only now. If mounting failed afterwards, nobody would hear where they are.
+            self.tell_mounted(notice())
+            await self._loop.run()
+            self.leave()
+            nursery.cancel_scope.cancel()
+
+    async def unmount(self, *, lazy: bool) -> None:
+        """See Life.unmount."""
+        if self.state is State.MOUNTED:
+            action = partial(unmount, self.request.mountpoint, lazy=lazy)
+            await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+            self.leave()
+
+    def leave(self) -> None:
+        """See Life.leave."""
+        if self.state is State.MOUNTED:
+            self.enter(State.LEAVING)
+            self._loop.stop()
+
+    def hurry(self) -> None:
+        """See Life.hurry."""
+        self.stop()
+
+    def status(self) -> Mapping[str, Any]:
+        """See Life.status."""
+        client = self.request.options.client
+        return {
+            "root": os.fsdecode(client.root),
+            "network_namespace": network_namespace(),
+            "read_only": client.read_only,
+            **self._status(),
+        }
+
+
+def _commands(vehicle: Attached, operations: Operations, invalidator: Invalidator) -> dict[str, Command]:
+    """Return what only a mount of one vehicle can be asked by its control socket."""
+
+    async def forget(_: Reply) -> Reply:
+        vehicle.tree.forget_caches()
+        # The kernel waits for lookups that are under way, and these wait for the vehicle.
+        with trio.move_on_after(FORGETTING_TIME):
+            await invalidator.forget_beliefs()
+        return {}
+
+    async def withdraw(request: Reply) -> Reply:
+        path = os.fsencode(request["path"])
+        there = await vehicle.tree.withdraw(path)
+        if there is False:
+            operations.inodes.unlink(path)  # a reader keeps the withdrawn file, under a number of its own
+        with trio.move_on_after(FORGETTING_TIME):
+            await invalidator.forget_name(path)
+        return {"there": there}
+
+    return {"forget": forget, "withdraw": withdraw}
