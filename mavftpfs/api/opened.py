@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-
-import trio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from mavftpfs.api.errors import translated, whereabouts
-from mavftpfs.client.files import File, written
-from mavftpfs.client.mounted import CLOSING_TIME, WITHDRAWAL_TIME
+from mavftpfs.client.files import File, Writing, close_reader
 from mavftpfs.shared.errors import MavftpfsError, NotDelivered
 
 log = logging.getLogger("mavftpfs.api")
@@ -19,11 +17,11 @@ PIECE = 1 << 20
 
 
 class Opened:
-    """An open file. All methods raise OSErrors (see api.errors). All but `size` run in the event loop.
+    """An open file. All methods raise OSErrors (see api.errors). All but `size` and `fail` run in the event
+    loop.
 
     Attributes:
-        name: for people. writable: whether it may be changed by this. there: after a close that failed, as
-            NotDelivered.on_vehicle.
+        name: for people. writable: whether it may be changed by this.
     """
 
     def __init__(self, name: str, file: File, *, writable: bool, forget: Callable[[Opened], None]) -> None:
@@ -31,17 +29,22 @@ class Opened:
         self.name = name
         self.writable = writable
         self._file = file
+        self._writing = Writing(file)
         self._forget = forget
         self._failure: BaseException | None = None
         self._closed = False
         self._abandoned = False
         self._changed = False
-        self.there: bool | None = None
 
     @property
     def closed(self) -> bool:
         """Whether it is closed, and any error of that was raised."""
         return self._closed
+
+    @property
+    def there(self) -> bool | None:
+        """After a close that failed, as NotDelivered.on_vehicle."""
+        return self._writing.there
 
     @property
     def size(self) -> int:
@@ -63,28 +66,28 @@ class Opened:
 
     async def write(self, offset: int | None, data: bytes | memoryview) -> int:
         """Take all of `data`, at the end if no offset is given; return the offset behind it."""
-        with translated():
-            self._changed = True
-            try:
-                offset = self._file.size if offset is None else offset
-                return offset + await self._file.write(offset, data)
-            except BaseException as exc:
-                self._failure = exc
-                raise
-
-    def fail(self, error: BaseException) -> None:
-        """Have `close` withdraw what was written, because of this error."""
-        self._failure = self._failure or error
+        with self._changing():
+            offset = self._file.size if offset is None else offset
+            return offset + await self._file.write(offset, data)
 
     async def truncate(self, size: int) -> None:
         """Cut or extend it."""
+        with self._changing():
+            await self._file.truncate(size)
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        self._changed = True
         with translated():
-            self._changed = True
             try:
-                await self._file.truncate(size)
+                yield
             except BaseException as exc:
-                self._failure = exc
+                self.fail(exc)
                 raise
+
+    def fail(self, error: BaseException) -> None:
+        """Have `close` withdraw what was written: a part of a file must not pass for the whole."""
+        self._failure = self._failure or error
 
     async def close(self) -> None:
         """Deliver what was written; or have nothing of it on the card, and raise NotDelivered.
@@ -92,42 +95,32 @@ class Opened:
         Raises:
             NotDelivered. Also if the file was abandoned.
         """
-        if self._closed:
-            with translated():
-                self._require_not_abandoned()
-            return
-        self._closed = True
-        self._forget(self)
         with translated():
-            if self.writable:
-                async with written(self._file, self._on_taken_back):
-                    self._require_whole()
+            if self._closed:
+                if self._abandoned and self.writable:
+                    raise NotDelivered(f"{self.name} was given up before it was closed", there=self.there)
+                return
+            self._end()
+            if not self.writable:
+                await close_reader(self._file)
+            elif self._failure is None:
+                await self._writing.deliver()
+            elif isinstance(self._failure, MavftpfsError):
+                await self._writing.fail(self._failure)
             else:
-                with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
-                    await self._file.release()
-
-    def _on_taken_back(self, there: bool | None) -> None:
-        self.there = there
-
-    def _require_whole(self) -> None:
-        """Raise the error of an earlier write: a part of the file must not pass for the whole."""
-        if isinstance(self._failure, MavftpfsError):
-            raise self._failure
-        if self._failure is not None:
-            raise MavftpfsError(f"{self.name}: writing it was interrupted")
-
-    def _require_not_abandoned(self) -> None:
-        if self._abandoned and self.writable:
-            raise NotDelivered(f"{self.name} was given up before it was closed", there=self.there)
+                await self._writing.fail(MavftpfsError(f"{self.name}: writing it was interrupted"))
 
     async def abandon(self) -> None:
         """Close it, and withdraw what was written; log it if that cannot be done. Twice is harmless. Raises
         no MavftpfsError."""
         if self._closed:
             return
-        self._closed = self._abandoned = True
-        self._forget(self)
-        with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
-            self.there = await self._file.give_up()
-        if self._changed and self.there is not False:
+        self._end()
+        self._abandoned = True
+        await self._writing.take_back(whole=not self._changed)
+        if self.there is None:
             log.error("%s: %s", self.name, whereabouts(None))
+
+    def _end(self) -> None:
+        self._closed = True
+        self._forget(self)

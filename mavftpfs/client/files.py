@@ -12,7 +12,7 @@ import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import trio
 
@@ -35,7 +35,7 @@ READ_SIZE = 128 * 1024
 class File(Protocol):
     """An open file: cache.openfile.OpenFile, or MountedFile. All calls raise only MavftpfsError.
 
-    A write ends by `written`, which delivers it or takes it back.
+    A file that is written ends by `Writing`.
     """
 
     @property
@@ -115,38 +115,77 @@ async def reading(files: Files, path: bytes) -> AsyncIterator[File]:
     try:
         yield file
     finally:
-        with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
-            await file.release()
+        await close_reader(file)
+
+
+async def close_reader(file: File) -> None:
+    """Close a file that was only read, even if the task is cancelled."""
+    with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
+        await file.release()
+
+
+class Writing:
+    """The end of a file that is written: it is delivered, or taken back. No other place says what the card has
+    then.
+
+    Attributes:
+        there: whether the card has the file as it was written. False: it has what it had before, and nothing
+            is sent from now on. None: that is not known, or not decided.
+    """
+
+    def __init__(self, file: File) -> None:
+        self._file = file
+        self.there: bool | None = None
+
+    async def deliver(self) -> None:
+        """Close the file when all of it is on the card, checked.
+
+        Raises:
+            NotDelivered: it is taken back; its cause says why.
+        """
+        try:
+            await self._file.fsync()
+        except BaseException as exc:
+            await self.take_back(whole=True)
+            self._raise_undelivered(exc)
+        await self._file.release()
+
+    async def fail(self, error: BaseException) -> NoReturn:
+        """Take the file back because writing it failed, and raise that.
+
+        Raises:
+            NotDelivered: in place of a MavftpfsError, which is its cause. Else the error.
+        """
+        await self.take_back()
+        self._raise_undelivered(error)
+
+    async def take_back(self, *, whole: bool = False) -> None:
+        """Close the file without delivering it. whole: all of it was written; else what was delivered is a
+        part."""
+        with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
+            there = await self._file.give_up()
+            # A fork closes a copy of a mount's descriptor, which delivers what was written until then.
+            self.there = None if there and not whole else there
+
+    def _raise_undelivered(self, error: BaseException) -> NoReturn:
+        if isinstance(error, errors.MavftpfsError):
+            raise errors.NotDelivered(str(error), there=self.there) from error
+        raise error
 
 
 @asynccontextmanager
-async def written(
-    file: File, tell: Callable[[bool | None], None] = lambda there: None
-) -> AsyncIterator[None]:
-    """Write a file in the body. After it the file is delivered; after an error it is taken back. It is closed
-    in any case.
-
-    tell: gets what `File.give_up` returned, also if an interruption ends the body.
+async def written(file: File) -> AsyncIterator[None]:
+    """Write a file in the body. After it the file is delivered; after an error it is taken back.
 
     Raises:
-        NotDelivered: it is not delivered; its cause says why, and `there` what is on the card instead.
+        NotDelivered: see Writing.
     """
-    whole = False
+    writing = Writing(file)
     try:
         yield
-        whole = True
-        await file.fsync()
     except BaseException as exc:
-        there: bool | None = None
-        with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
-            there = await file.give_up()
-        if there and not whole:  # a fork closed a copy of a mount's descriptor: a part is there
-            there = None
-        tell(there)
-        if isinstance(exc, errors.MavftpfsError):
-            raise errors.NotDelivered(str(exc), there=there) from exc
-        raise
-    await file.release()
+        await writing.fail(exc)
+    await writing.deliver()
 
 
 Acknowledged = Mapping[str, int]

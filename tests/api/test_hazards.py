@@ -173,7 +173,7 @@ os.spawnlp(os.P_WAIT, "true", "true")
 """
     if end == "close":
         code += """
-f._opened._failure = RuntimeError()
+f._opened.fail(RuntimeError())
 try:
     f.close()
 except mavftpfs.NotDelivered as error:
