@@ -1,8 +1,8 @@
 """An event loop in a thread of its own, and calls into it from any other. Layer: api.
 
 A call that waits can be interrupted: Ctrl-C cancels it, and it ends in order. A finalizer may not wait, so it
-posts. The thread is a daemon: when the interpreter ends it does not wait for the thread, but closes what is
-open, for EXIT_PATIENCE at most.
+posts. The thread is a daemon. When the interpreter ends, all that is open is closed, for EXIT_PATIENCE at
+most.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractAsyncContextManager, suppress
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -63,41 +64,46 @@ class Closed(ValueError):
 
 
 class _Call(Generic[ResultT]):
-    """One call, from its start in a thread to its end in the loop."""
+    """A call, from a thread into the loop. scope: cancels it."""
 
     def __init__(self, function: Callable[..., Awaitable[ResultT]], args: tuple[Any, ...]) -> None:
         self._function = function
         self._args = args
-        self._results: list[ResultT] = []
-        self.error: BaseException | None = None
         self.scope = trio.CancelScope()
-        self.done = threading.Event()
+        self.outcome: Future[ResultT] = Future()
 
     async def run(self) -> None:
         """Run in the loop. Raises nothing but Cancelled."""
         try:
             with self.scope:
                 try:
-                    self._results.append(await self._function(*self._args))
+                    self.outcome.set_result(await self._function(*self._args))
                 except Exception as exc:  # raised again in the thread that waits
-                    self.error = exc
+                    self.outcome.set_exception(exc)
         finally:
-            self.done.set()
+            self.end()
 
-    def result(self) -> ResultT:
-        """Return the result, or raise the error."""
-        if self.error is not None:
-            raise self.error
-        if not self._results:
-            raise Closed("the connection was closed meanwhile")
-        return self._results[0]
+    def end(self) -> None:
+        """Have nobody wait for it any more; it may have a result, or an error."""
+        if self.outcome.cancel():
+            self.outcome.set_running_or_notify_cancel()  # else `wait` goes on
 
 
 class LoopThread(Generic[T]):
-    """Runs an async context in a thread, and calls from other threads in it. A Portal.
+    """Runs an async context in a thread of its own, and calls from other threads in it. A Portal.
+
+    | | from | waits for |
+    |---|---|---|
+    | `call` | any thread but the loop's | the result |
+    | `post`, `stop` | any thread, at any time: for finalizers | nothing |
+    | `close` | any thread | the end of the loop; in the loop's own thread nothing |
+
+    In another process than its own, after a fork, `call` raises and the others do nothing. `stop` ends the
+    calls that are under way, and leaves the context. What the context does at its exit is not cut off. The
+    loop and the thread end with it.
 
     Attributes:
-        value: what the context gives.
+        value: what the context gave.
     """
 
     def __init__(self, context: Callable[[], AbstractAsyncContextManager[T]], name: str) -> None:
@@ -105,91 +111,35 @@ class LoopThread(Generic[T]):
         self._context = context
         self._name = name
         self._pid = os.getpid()
-        self._lock = threading.RLock()
-        self._calls: set[_Call[Any]] = set()
         self._token: trio.lowlevel.TrioToken | None = None
         self._nursery: trio.Nursery | None = None
         self._scope = trio.CancelScope()
         self._stopping = False
-        self._stopped = trio.Event()
-        self._ready = threading.Event()
-        self._ended = threading.Event()
         self._error: BaseException | None = None
-        self._values: list[T] = []
+        self._entered: Future[T] = Future()
+        self._ended: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name=f"mavftpfs {name}", daemon=True)
         self._thread.start()
         try:
-            self._ready.wait()
-        except BaseException:  # Ctrl-C
+            self.value = self._entered.result()
+        except BaseException:  # also Ctrl-C
             self.close()
             raise
-        if not self._values:
-            self._ended.wait()
-            assert self._error is not None
-            raise self._error
         _running.add(self)
-
-    @property
-    def value(self) -> T:
-        """What the context gave."""
-        return self._values[0]
 
     @property
     def closed(self) -> bool:
         """Whether nothing can be called any more."""
-        return self._stopping or self._ended.is_set()
+        return self._stopping or self._ended.done()
 
     # --- from any thread
 
     def call(self, function: Callable[..., Awaitable[ResultT]], *args: Any) -> ResultT:
-        """See Portal.
+        """See Portal. Ctrl-C ends the call in order; a second one does not wait for that.
 
         Raises:
             RuntimeError: after a fork, or from the loop's own thread. Closed. Else what the function raises.
         """
-        self._require_usable()
-        call = _Call(function, args)
-        with self._lock:
-            if self.closed:
-                raise self._closed()
-            self._calls.add(call)
-        try:
-            self._start(call)
-            self._wait(call)
-            return call.result()
-        except trio.RunFinishedError:
-            raise self._closed() from None
-        finally:
-            self._calls.discard(call)
-
-    def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """See Portal. Does nothing after the loop has ended."""
-        if os.getpid() == self._pid and not self._ended.is_set():
-            with suppress(trio.RunFinishedError):
-                self._start(_Call(function, args))
-
-    def close(self, *, patience: float | None = None) -> None:
-        """Leave the context, and wait until it is left. patience: seconds to wait at most."""
-        if os.getpid() != self._pid:
-            return
-        self.stop()
-        if threading.current_thread() is not self._thread:
-            self._ended.wait(patience)
-
-    def stop(self) -> None:
-        """Have the context left, and do not wait for that. For finalizers."""
-        if os.getpid() != self._pid:
-            return
-        _running.discard(self)
-        with self._lock:
-            self._stopping = True
-            if self._token is not None:
-                with suppress(trio.RunFinishedError):
-                    self._token.run_sync_soon(self._stop)
-
-    # --- inside
-
-    def _require_usable(self) -> None:
         if os.getpid() != self._pid:
             raise RuntimeError(
                 f"the connection to {self._name} was made before a fork and belongs to the other process: "
@@ -197,67 +147,87 @@ class LoopThread(Generic[T]):
             )
         if threading.current_thread() is self._thread:
             raise RuntimeError("a call from the connection's own thread would wait for itself")
-
-    def _start(self, call: _Call[Any]) -> None:
-        """Raises: trio.RunFinishedError."""
-        token = self._token
-        assert token is not None
-        token.run_sync_soon(self._spawn, call)
-
-    def _spawn(self, call: _Call[Any]) -> None:
-        assert self._nursery is not None
+        if self.closed:
+            raise self._reason()
+        call = _Call(function, args)
+        self._soon(self._spawn, call)
         try:
-            self._nursery.start_soon(call.run)
-        except RuntimeError:  # it has just been closed
-            call.done.set()
+            self._wait(call)
+        except BaseException:
+            self._soon(call.scope.cancel)
+            self._wait(call)
+            raise
+        if not call.outcome.done() or call.outcome.cancelled():
+            self.close()  # it tells why when it has ended
+            raise self._reason()
+        return call.outcome.result()
+
+    def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
+        """See Portal. Does nothing after the loop has ended."""
+        if os.getpid() == self._pid:
+            self._soon(self._spawn, _Call(function, args))
+
+    def close(self, *, patience: float | None = None) -> None:
+        """Leave the context, and wait until it is left. patience: seconds to wait at most."""
+        self.stop()
+        if os.getpid() == self._pid and threading.current_thread() is not self._thread:
+            wait([self._ended], timeout=patience)
+
+    def stop(self) -> None:
+        """Have the context left, and do not wait for that. For finalizers."""
+        if os.getpid() == self._pid:
+            self._stopping = True
+            _running.discard(self)
+            self._soon(self._stop)
+
+    # --- inside
+
+    def _soon(self, function: Callable[..., object], *args: Any) -> None:
+        """Have a function called in the loop, unless that has not begun, or has ended. What trio takes it
+        carries out before it ends."""
+        if self._token is not None:
+            with suppress(trio.RunFinishedError):
+                self._token.run_sync_soon(function, *args)
 
     def _wait(self, call: _Call[Any]) -> None:
-        try:
-            call.done.wait()
-        except BaseException:  # Ctrl-C: let the call end in order; a second Ctrl-C does not wait
-            if self._token is not None:
-                with suppress(trio.RunFinishedError):
-                    self._token.run_sync_soon(call.scope.cancel)
-            call.done.wait()
-            raise
+        """Wait for the end of a call, or of the loop."""
+        wait([call.outcome, self._ended], return_when=FIRST_COMPLETED)
 
-    def _closed(self) -> BaseException:
-        if self._error is not None:
-            return self._error
-        return Closed(f"the connection to {self._name} is closed")
+    def _reason(self) -> BaseException:
+        """Return why nothing can be called."""
+        return self._error or Closed(f"the connection to {self._name} is closed")
 
-    # --- the loop's thread
+    # --- in the loop's thread
 
     def _run(self) -> None:
         try:
             trio.run(self._main)
         except BaseException as exc:  # raised again in the threads that wait
             self._error = _first(exc)
-        finally:
-            with self._lock:
-                self._ended.set()
-                left = list(self._calls)
-            for call in left:
-                call.error = call.error or self._error
-                call.done.set()
-            self._ready.set()
+        if not self._entered.done():
+            self._entered.set_exception(self._reason())
+        self._ended.set_result(None)
 
     async def _main(self) -> None:
-        with self._lock:
-            self._token = trio.lowlevel.current_trio_token()
-            if self._stopping:
-                return
+        self._token = trio.lowlevel.current_trio_token()
+        if self._stopping:
+            return
         with self._scope:
             async with self._context() as value, trio.open_nursery() as self._nursery:
-                self._values.append(value)
-                self._ready.set()
-                await self._stopped.wait()
-                self._nursery.cancel_scope.cancel()
+                self._scope = self._nursery.cancel_scope
+                self._entered.set_result(value)
+                await trio.sleep_forever()
+
+    def _spawn(self, call: _Call[Any]) -> None:
+        assert self._nursery is not None
+        try:
+            self._nursery.start_soon(call.run)
+        except RuntimeError:  # it has just been closed
+            call.end()
 
     def _stop(self) -> None:
-        self._stopped.set()
-        if not self._values:
-            self._scope.cancel()
+        """Cancel: the calls and the body of the context; or, before it is entered, that."""
+        self._scope.cancel()
 
 
 def _first(error: BaseException) -> BaseException:
@@ -272,7 +242,7 @@ _running: set[LoopThread[Any]] = set()
 
 def _close_all() -> None:
     """Close, as the interpreter ends, all connections that are open, with their vehicles' sessions."""
-    loops = [loop for loop in _running if not loop.closed]
+    loops = list(_running)
     for loop in loops:
         loop.stop()
     deadline = time.monotonic() + EXIT_PATIENCE

@@ -125,7 +125,7 @@ async def close_reader(file: File) -> None:
 
 
 class Writing:
-    """The end of a file that is written: it is delivered, or taken back. No other place says what the card has
+    """The end of a file that is written: it is delivered, or taken back. Only here is said what the card has
     then.
 
     Attributes:

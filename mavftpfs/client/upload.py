@@ -226,7 +226,7 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     except NotDelivered as exc:
         if exc.there is not False:
             await _remove(files, beside)
-        raise exc.__cause__ or exc  # `remote` was not touched
+        raise NotDelivered(str(exc), there=False) from exc.__cause__  # `remote` was not touched
     try:
         await files.rename(beside, remote)
     except BaseException as exc:
