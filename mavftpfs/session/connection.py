@@ -48,11 +48,12 @@ MOST_HEARD = 32
 """Components on the link of which a status tells: it has to fit into an extended attribute."""
 HEARD_SOON = 1.2
 """Seconds within which a vehicle that is there is heard: it sends one heartbeat a second."""
-TERMINATE_ON_EXIT = 5.0
-"""Seconds to spend on closing the server's session when we leave."""
+TERMINATE_ON_EXIT = 1.0, 5.0
+"""Seconds to spend on closing the server's session when we leave: at least, and at most."""
 
-TERMINATE_IF_LOST = 1.0
-"""The same if the vehicle is silent anyway."""
+SILENT_ON_EXIT = 2.5
+"""Seconds without a heartbeat after which a vehicle's answer is not waited for when we leave: two of them, or
+more, did not come."""
 
 _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
@@ -373,17 +374,34 @@ async def connected(
         except Exception as error:  # raised again outside, so that it is not wrapped in a group
             failure = error
         finally:
-            limit = TERMINATE_IF_LOST if connection.vehicle.lost(clock()) else TERMINATE_ON_EXIT
-            with trio.CancelScope(deadline=trio.current_time() + limit, shield=True):
-                serving.scope.cancel()
-                await serving.ended.wait()
-                await connection.scheduler.close()
+            with trio.CancelScope(shield=True):
+                await _leave(connection, serving)
             for task in tasks:
                 task.scope.cancel()
     for task in tasks:
         failure = task.failure or failure
     if failure is not None:
         raise failure
+
+
+async def _leave(connection: Connection, serving: _Task) -> None:
+    """Close the server's session, as long as the vehicle is heard."""
+    least, most = TERMINATE_ON_EXIT
+    with trio.move_on_after(most):
+        async with trio.open_nursery() as nursery:
+
+            async def give_up() -> None:
+                await trio.sleep(least)
+                silence = connection.vehicle.silence  # each heartbeat begins it anew
+                while (left := SILENT_ON_EXIT - silence(connection.clock())) > 0:  # noqa: ASYNC110
+                    await trio.sleep(left)
+                nursery.cancel_scope.cancel()
+
+            nursery.start_soon(give_up)
+            serving.scope.cancel()
+            await serving.ended.wait()
+            await connection.scheduler.close()
+            nursery.cancel_scope.cancel()
 
 
 class _Task:

@@ -159,6 +159,21 @@ async def test_a_neighbour_with_our_address_makes_us_move() -> None:
 # --- leaving
 
 
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("heard", [False, True])
+async def test_leaving_waits_for_the_session_while_the_vehicle_is_heard(heard: bool) -> None:
+    here = Rig("px4", {b"/f": DATA})
+    async with here.connected():
+        file = await here.mount().open(b"/f")
+        await file.read(0, 1000)
+        here.faults.ignore(Opcode.TERMINATE_SESSION)
+        if not heard:
+            here.link.cut()
+        left_at = trio.current_time()
+    took = trio.current_time() - left_at
+    assert took == pytest.approx(5.0, abs=0.1) if heard else took < 3.5
+
+
 def join(monkeypatch: pytest.MonkeyPatch, here: Rig, folder: Path) -> None:
     """Make all that opens a link, or a spool, get these."""
 
