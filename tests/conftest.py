@@ -1,4 +1,4 @@
-"""Order of the tiers, and hypothesis profiles. Fixtures of one tier live in that tier's own conftest."""
+"""Order and clock of the tiers, and hypothesis profiles. Fixtures of one tier live in its own conftest."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ from hypothesis import HealthCheck, settings
 
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.session.scheduler import Scheduler, Turn
+from tests.support.clocks import use_virtual_time
 
 TIERS = ("unit", "property", "sim", "ops", "conformance", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
+
+VIRTUAL = ("unit", "sim")
+"""Their tests run on virtual time, but for those that are marked `real_time`."""
 
 TESTS = Path(__file__).parent
 
@@ -122,10 +126,13 @@ def tier_of(path: Path) -> str:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Sort by tier and mark the mount tier."""
+    """Sort by tier, mark the mount tier, and give virtual time."""
     for item in items:
-        if tier_of(item.path) == "mount":
+        tier = tier_of(item.path)
+        if tier == "mount":
             item.add_marker(pytest.mark.mount)
+        if tier in VIRTUAL and item.get_closest_marker("real_time") is None:
+            use_virtual_time(item)
     rank = {tier: number for number, tier in enumerate(TIERS)}
     items.sort(key=lambda item: rank.get(tier_of(item.path), len(TIERS)))
     if hasattr(config, "workerinput"):

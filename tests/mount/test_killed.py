@@ -1,7 +1,8 @@
 """Programs are killed while the kernel has requests of theirs that the mount has not read yet.
 
 It takes those back. A read that waits for them stopped the whole mount, link and all, until somebody asked
-for something else: in one of ten rounds of this.
+for something else: in one of ten rounds of this. What is done about it, at that very moment:
+tests/unit/test_kernel.py.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from tests.support.vehicles import PROJECT
 
 pytestmark = pytest.mark.holds("promise 4")
 
-ROUNDS = 20
+ROUNDS = 8
 ASKER = PROJECT / "tests/support/programs/asker.py"
 
 

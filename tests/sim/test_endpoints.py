@@ -25,6 +25,8 @@ from mavftpfs.sim.arguments import add_arguments, link_settings
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from tests.support.vehicles import free_udp_port
 
+pytestmark = pytest.mark.real_time
+
 
 def arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser("sim")

@@ -38,6 +38,8 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
 from tests.support.vehicles import free_udp_port
 
+pytestmark = pytest.mark.real_time
+
 HOST = "127.0.0.1"
 US = Address(254, 191)
 

@@ -10,7 +10,6 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
@@ -72,9 +71,7 @@ async def told(connection: Connection) -> None:
 
 
 @pytest.mark.holds("promise 10")
-async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
-    autojump: MockClock, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(caplog: pytest.LogCaptureFixture) -> None:
     scene = Crowd()
     async with scene.rig.connected() as connection, trio.open_nursery() as nursery:
         await told(connection)
@@ -92,9 +89,7 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
 
 
 @pytest.mark.holds("promise 10")
-async def test_a_vehicle_whose_address_changes_is_found_again(
-    autojump: MockClock, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_vehicle_whose_address_changes_is_found_again(caplog: pytest.LogCaptureFixture) -> None:
     scene = Crowd()
     async with scene.rig.connected() as connection:
         await told(connection)
@@ -112,7 +107,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(
 @pytest.mark.holds("promise 10")
 @pytest.mark.parametrize("tells", [True, False])
 async def test_another_vehicle_that_takes_the_address_is_not_read(
-    tells: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+    tells: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor is one that tells no id, though ours would be believed in the end."""
     scene = Crowd()
@@ -133,9 +128,7 @@ async def test_another_vehicle_that_takes_the_address_is_not_read(
 
 
 @pytest.mark.holds("promise 10")
-async def test_two_links_to_one_vehicle_do_no_harm(
-    autojump: MockClock, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_two_links_to_one_vehicle_do_no_harm(caplog: pytest.LogCaptureFixture) -> None:
     scene = Crowd()
     scene.link.mirrors = [THERE]
     async with scene.rig.connected() as connection:
@@ -150,9 +143,7 @@ async def test_two_links_to_one_vehicle_do_no_harm(
 
 
 @pytest.mark.holds("promise 10")
-async def test_a_companion_has_an_address_of_its_own(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_companion_has_an_address_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our target is not the autopilot, whose heartbeats come from elsewhere and say whether it is armed."""
     monkeypatch.setitem(sim_vehicle._AUTOPILOT_TYPE, Family.MAVSDK, MAV_AUTOPILOT_INVALID)
     scene = Crowd("mavsdk", component=191)
@@ -174,6 +165,7 @@ def forge(request: Payload) -> bytes:
     return ftp(ack(request, b"\xee" * request.size).encode(), Address(254, 191))
 
 
+@pytest.mark.real_time
 @pytest.mark.holds("promise 10")
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcpin"])
 async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> None:
@@ -201,6 +193,7 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
                 assert await read_file(made, b"/f") == OURS
 
 
+@pytest.mark.real_time
 @pytest.mark.holds("promise 10")
 async def test_a_stranger_does_not_keep_our_vehicle_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """tcpin has one peer at a time. Ours goes away; somebody connects who sends without a pause, then another
@@ -298,9 +291,7 @@ async def swap(here: Rig, vehicle: SimVehicle, *, gap: float) -> None:
 @pytest.mark.holds("fault another vehicle")
 @pytest.mark.parametrize("gap", [3.0, 40.0])
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot"])
-async def test_what_is_held_for_one_is_not_written_to_the_other(
-    profile: str, gap: float, autojump: MockClock
-) -> None:
+async def test_what_is_held_for_one_is_not_written_to_the_other(profile: str, gap: float) -> None:
     scene = Scene(profile)
     async with scene.mounted() as tree:
         await tree.list(b"/d")
@@ -330,7 +321,7 @@ async def test_what_is_held_for_one_is_not_written_to_the_other(
 
 @pytest.mark.holds("fault another vehicle")
 @pytest.mark.parametrize("profile", ["px4", "px4-2026", "ardupilot"])
-async def test_no_file_is_read_half_from_each(profile: str, autojump: MockClock) -> None:
+async def test_no_file_is_read_half_from_each(profile: str) -> None:
     scene = Scene(profile)
     async with scene.mounted() as tree:
         file = await tree.open(FILE)
@@ -349,7 +340,7 @@ async def test_no_file_is_read_half_from_each(profile: str, autojump: MockClock)
 @pytest.mark.holds("fault another vehicle")
 @pytest.mark.parametrize("tells", ["never", "once"])
 async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
-    tells: str, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+    tells: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Later, if it told once: it was asked for seconds."""
     scene = Scene("px4", LinkSettings(delay=0.02))
@@ -365,9 +356,7 @@ async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
 
 
 @pytest.mark.holds("fault another vehicle")
-async def test_ours_is_known_again_though_nobody_was_silent(
-    autojump: MockClock, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_ours_is_known_again_though_nobody_was_silent(caplog: pytest.LogCaptureFixture) -> None:
     """A ground station asked the other one, which is switched on as ours is switched off."""
     caplog.set_level(logging.INFO)
     scene = Scene("px4", LinkSettings(delay=0.02))
@@ -384,9 +373,7 @@ async def test_ours_is_known_again_though_nobody_was_silent(
 
 
 @pytest.mark.holds("promise 10")
-async def test_a_target_without_heartbeats_moves_with_its_autopilot(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_target_without_heartbeats_moves_with_its_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Crowd("mavsdk", component=191)
     monkeypatch.setattr(
         scene.ours, "_beat", lambda frames, now: scene.ours.__setattr__("_next_beat", now + 1)
@@ -404,7 +391,7 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(
 
 @pytest.mark.holds("fault another vehicle")
 async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Between two heartbeats another one could have come, each time."""
     scene = Scene("px4", LinkSettings(delay=0.02))

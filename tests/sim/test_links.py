@@ -31,6 +31,8 @@ from mavftpfs.shared.errors import LinkClosed
 from tests.support.frames import feed
 from tests.support.vehicles import free_udp_port
 
+pytestmark = pytest.mark.real_time
+
 US = Address(254, 191)
 DRONE = Address(1, 1)
 PAYLOAD = bytes(range(1, 252))

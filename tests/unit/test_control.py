@@ -22,6 +22,8 @@ from mavftpfs.client.control import ControlError, NobodyThere, Reply, all_socket
 from mavftpfs.client.controlserver import Command, ControlServer
 from mavftpfs.shared.errors import UsageError
 
+pytestmark = pytest.mark.real_time
+
 
 @asynccontextmanager
 async def serving(path: Path, commands: Mapping[str, Command]) -> AsyncIterator[ControlServer]:

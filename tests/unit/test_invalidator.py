@@ -12,6 +12,8 @@ import trio
 from mavftpfs.mount.handles import InodeTable
 from mavftpfs.mount.invalidator import Invalidator
 
+pytestmark = pytest.mark.real_time
+
 
 class Kernel:
     """Records calls; may refuse or hang."""

@@ -153,6 +153,12 @@ async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) ->
     handle.close()
 
 
+async def test_what_is_kept_of_an_older_file_is_not_read_again(mounts: Mounts) -> None:
+    await mounts.read_and_settle()
+    assert await read_file(mounts.mount(), LOG) == DATA
+    assert mounts.asked() == (0, 0)
+
+
 async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(mounts: Mounts) -> None:
     tree, handle = await mounts.open_partly_kept()
     new = content(len(DATA), seed=8)

@@ -16,6 +16,8 @@ import trio.testing
 
 from mavftpfs.mount.kernel import never_blocking, watcher_told_last
 
+pytestmark = pytest.mark.real_time
+
 
 def test_the_socket_by_which_fusermount3_hears_of_our_end_lies_below_the_device() -> None:
     """Linux lets go of the highest descriptor first. Opened in the order of libfuse's."""

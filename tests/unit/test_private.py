@@ -9,7 +9,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from trio.testing import MockClock
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
@@ -72,7 +71,7 @@ def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     again.close()
 
 
-async def test_what_could_not_be_delivered_is_private(autojump_clock: MockClock, tmp_path: Path) -> None:
+async def test_what_could_not_be_delivered_is_private(tmp_path: Path) -> None:
     state, made = tmp_path / "state", Rig("px4", {b"/d": None})
     async with made.mounted() as tree:
         file = await tree.create(b"/d/f", exclusive=True)

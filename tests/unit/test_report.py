@@ -118,9 +118,7 @@ def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
     assert lines(read_only=True)[1:] == []
 
 
-async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(
-    autojump_clock: object, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     def facts() -> dict[str, Any]:
         return connection({"armed": 0.05 < trio.current_time() - began < 0.95})
 

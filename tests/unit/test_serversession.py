@@ -7,7 +7,6 @@ from typing import cast
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
@@ -49,9 +48,7 @@ def server(code: int) -> tuple[ServerSession, Refusing, Vehicle]:
     return made, driver, driver.vehicle
 
 
-async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up(
-    autojump_clock: MockClock,
-) -> None:
+async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up() -> None:
     made, driver, _ = server(NakCode.NO_SESSIONS_AVAILABLE)
     with pytest.raises(SessionBusy):
         await made.open(b"/f")
@@ -62,7 +59,7 @@ async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up
     assert not made.maybe_open
 
 
-async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clock: MockClock) -> None:
+async def test_sessions_are_not_reset_while_another_client_is_heard() -> None:
     made, driver, vehicle = server(NakCode.INVALID_SESSION)
     vehicle.foreign_at = trio.current_time() + SILENCE_PX4
     with pytest.raises(SessionBusy):
@@ -71,7 +68,7 @@ async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clo
 
 
 @pytest.mark.parametrize("resent", [False, True])
-async def test_a_plain_failure_costs_no_silence(resent: bool, autojump_clock: MockClock) -> None:
+async def test_a_plain_failure_costs_no_silence(resent: bool) -> None:
     """Asked twice, it may have worked the first time: that is closed before it is asked again."""
     made, driver, _ = server(NakCode.FAIL)
     driver.retransmitted = resent

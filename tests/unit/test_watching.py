@@ -11,6 +11,8 @@ import trio
 
 from mavftpfs.cli.watching import run_command
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.mark.parametrize(
     ("command", "problem", "shown"),
