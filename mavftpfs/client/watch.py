@@ -1,7 +1,8 @@
 """Brings logs automatically: connects, looks, fetches and lets go as `flights` decides. Layer: client.
 
-One task listens for vehicles. Another one takes the steps, one at a time. A third hands on the logs that
-came. A transfer lets go by leaving the connection, which closes the server's session.
+One task listens for vehicles. Another one takes the steps, one at a time; news end a step that must not go
+on. A third hands on the logs that came. A transfer lets go by leaving the connection, which closes the
+server's session.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
 from mavftpfs.client.download import NO_LOG, Wish, named, wanted_logs
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
-from mavftpfs.client.flights import Fetch, Log, Look, Policy, Wait
+from mavftpfs.client.flights import Fetch, Log, Look, Policy, Step, Wait
 from mavftpfs.client.options import Options
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
@@ -72,10 +74,11 @@ class Watch:
         self._hand_on = hand_on
         self._progress = progress or Progress()
         self._policy = Policy()
-        self._changed = trio.Event()
-        self._leave: LinkError | bool = False
+        self._step: Step | None = None
+        self._scope = trio.CancelScope()
+        self._leave = False
+        self._broken: LinkError | None = None
         self._wanted_system = 0
-        self._working_on: tuple[int, trio.CancelScope] | None = None
         self._logs: dict[int, dict[bytes, Wanted]] = {}
         self._names: dict[int, str] = {}
         self._target: Target | None = None
@@ -122,8 +125,8 @@ class Watch:
 
     def ended(self, error: LinkError) -> None:
         """See contact.Hearing."""
-        self._leave = error
-        self._wake()
+        self._leave, self._broken = True, error
+        self._end_step()
 
     def time_passed(self) -> None:
         """See contact.Hearing."""
@@ -131,17 +134,16 @@ class Watch:
             self._tell_of(system, "is lost")
 
     def _tell_of(self, system: int, news: str) -> None:
-        self._wake()
-        stopped = self._working_on is not None and self._working_on[1].cancel_called
+        self._end_step()
+        stopped = isinstance(self._step, Look | Fetch) and self._scope.cancel_called
         self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
 
-    def _wake(self) -> None:
-        """Choose the next step again, and end a step that must not go on."""
-        self._changed.set()
-        if self._working_on is not None:
-            system, scope = self._working_on
-            if self._leave or not self._policy.may_transfer(system, trio.current_time()):
-                scope.cancel()
+    def _end_step(self) -> None:
+        """News came: end the step under way, unless it asks a vehicle and may go on."""
+        step, now = self._step, trio.current_time()
+        asks = isinstance(step, Look | Fetch) and self._policy.may_transfer(step.system, now)
+        if self._leave or not asks:
+            self._scope.cancel()
 
     # --- what is done
 
@@ -188,52 +190,51 @@ class Watch:
         Raises:
             LinkError: the contact broke.
         """
-        self._leave = False
+        self._leave, self._broken = False, None
         async with plain_nursery() as nursery, AsyncExitStack() as stack:
             nursery.start_soon(contact.listen, self)
             session: Session | None = None
             while not self._leave:
                 step = self._policy.next(trio.current_time())
                 if isinstance(step, Wait):
-                    await self._wait(step)
+                    await self._take(step, partial(trio.sleep_until, step.until))
                 elif contact.system is None:
                     await trio.sleep(TICK)
                 elif step.system != contact.system:
                     self._wanted_system = step.system
                     await trio.sleep(TICK)
                     break
-                elif isinstance(step, Look) and isinstance(contact, LinkContact) and await self._is_mounted():
-                    self._leave = LinkClosed("a mount has this vehicle now: its files are used")
+                elif session is None:
+                    session = await contact.enter(stack)  # then another step may be due
                 else:
-                    session = session or await contact.enter(stack)
-                    if not await self._work(step, contact, session):
+                    await self._take(step, partial(self._work, step, contact, session))
+                    if self._scope.cancel_called:
                         break
-        if isinstance(self._leave, LinkError):
-            raise self._leave
+        if self._broken is not None:
+            raise self._broken
+
+    async def _take(self, step: Step, work: Callable[[], Awaitable[None]]) -> None:
+        """Take a step, which `_end_step` may end."""
+        with trio.CancelScope() as self._scope:
+            self._step = step
+            try:
+                await work()
+            finally:
+                self._step = None
+
+    async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> None:
+        if not self._local_is_ready(step):
+            self._policy.local_trouble(trio.current_time())
+        elif isinstance(step, Fetch):
+            await self._fetch(step.system, step.log, session)
+        elif isinstance(contact, LinkContact) and await self._is_mounted():
+            raise LinkClosed("a mount has this vehicle now: its files are used")
+        else:
+            await self._look(step.system, contact, session)
 
     async def _is_mounted(self) -> bool:
         """Return whether a mount of that vehicle came up: we would share its only session."""
         return self._target is not None and await self._target.mounted() is not None
-
-    async def _wait(self, step: Wait) -> None:
-        self._changed = trio.Event()
-        with trio.move_on_at(step.until):
-            await self._changed.wait()
-
-    async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> bool:
-        """Take a step; return whether the vehicle may be asked for more."""
-        with trio.CancelScope() as scope:
-            self._working_on = step.system, scope
-            try:
-                if not self._local_is_ready(step):
-                    self._policy.local_trouble(trio.current_time())
-                elif isinstance(step, Look):
-                    await self._look(step.system, contact, session)
-                else:
-                    await self._fetch(step.system, step.log, session)
-            finally:
-                self._working_on = None
-        return not scope.cancelled_caught and self._policy.may_transfer(step.system, trio.current_time())
 
     async def _look(self, system: int, contact: Contact, session: Session) -> None:
         """List the logs, and tell the policy which are new."""

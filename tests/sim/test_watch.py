@@ -7,14 +7,16 @@ import os
 import random
 import subprocess
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
 import trio
 
 from mavftpfs.client.brought import NAME, Memory
+from mavftpfs.client.contact import Hearing
 from mavftpfs.client.download import Wish
+from mavftpfs.client.files import Session
 from mavftpfs.client.options import Options
 from mavftpfs.client.watch import Watch, WatchWish
 from mavftpfs.link.messages import Address
@@ -514,3 +516,30 @@ async def test_flight_after_flight_without_growth(day: Day, flights: int, every:
     assert max(files[3:]) <= files[1]
     assert (day.local / NAME).stat().st_size < 200 * 400
     assert len(Memory(day.local).logs()) == 1
+
+
+class ArmsWhileEntered:
+    """A contact with a vehicle that is armed just when its files are to be had."""
+
+    system = 1
+
+    async def listen(self, hearing: Hearing) -> None:
+        self._hearing = hearing
+        hearing.heard(1, armed=False)
+        await trio.sleep_forever()
+
+    async def identity(self) -> str | None:
+        raise AssertionError("an armed vehicle was asked")
+
+    async def enter(self, stack: AsyncExitStack) -> Session:
+        await trio.sleep(0.1)
+        self._hearing.heard(1, armed=True)
+        return Session(MemoryTree())  # type: ignore[arg-type]
+
+
+@pytest.mark.holds("promise 9")
+async def test_a_vehicle_that_is_armed_while_its_files_are_opened_is_not_asked(tmp_path: Path) -> None:
+    said: list[str] = []
+    with trio.move_on_after(60.0):
+        await Watch(WatchWish(Wish(tmp_path)), said.append).serve(ArmsWhileEntered())
+    assert said == ["vehicle 1 is here, disarmed", "vehicle 1 is armed"]
