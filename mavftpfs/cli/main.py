@@ -112,7 +112,7 @@ def _run(words: list[str]) -> int:
         if name.startswith("-") or ":" in name or "/" in name:
             raise
         raise _no_command(name) from None
-    if not any(mark in args.source for mark in ":/"):
+    if not any(mark in args.source for mark in ":/") and not os.path.isdir(args.source):
         raise _no_command(args.source)
     return commands.mount(args)
 
@@ -342,7 +342,11 @@ def _crc_parser(name: str) -> Parser:
 def _param_parser(name: str) -> Parser:
     parser = _source_parser(name, "Print, set, load, save or compare the vehicle's parameters.")
     parser.add_argument(
-        "names", metavar="NAME", nargs="*", help="print these (a pattern, as 'BATT*'); NAME=VALUE: set"
+        "names",
+        metavar="NAME",
+        nargs="*",
+        default=[],
+        help="print these (a pattern, as 'BATT*'); NAME=VALUE: set",
     )
     parser.add_argument("--changed", action="store_true", help="only what differs from its default")
     parser.add_argument("--load", metavar="FILE", help="set what a file says and does not hold")

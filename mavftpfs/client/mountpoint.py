@@ -22,6 +22,7 @@ from pathlib import Path
 from mavftpfs.shared.errors import MountFailed
 
 FUSE_DEVICE = "/dev/fuse"
+_CONTAINER = "a container needs --device /dev/fuse --cap-add SYS_ADMIN"
 SUBTYPE = "mavftpfs"
 """The mount's type is fuse.mavftpfs: the same word that fstab has."""
 
@@ -94,14 +95,17 @@ def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
         MountFailed: and what to do about it.
     """
     if not os.path.exists(device):
-        raise MountFailed(
-            f"no {device}: load the kernel module (modprobe fuse), or give the container --device"
-        )
-    if (os.getuid() if uid is None else uid) == 0:
-        if not os.access(device, os.R_OK | os.W_OK):
-            raise MountFailed(f"{device} may not be opened here")
-    elif shutil.which("fusermount3") is None:
-        raise MountFailed("fusermount3 is missing, which mounts for users: install the package fuse3")
+        raise MountFailed(f"there is no {device}; run: sudo modprobe fuse ({_CONTAINER})")
+    if not os.access(device, os.R_OK | os.W_OK):  # fusermount3 opens it with its user's rights
+        raise MountFailed(f"{device} may not be opened; run: sudo chmod 666 {device} ({_CONTAINER})")
+    if (os.getuid() if uid is None else uid) != 0 and shutil.which("fusermount3") is None:
+        raise MountFailed("fusermount3 is missing, which mounts for users; run: sudo apt install fuse3")
+
+
+def why_not_mounted(path: str, said: str) -> str:
+    """Return what a person is told when libfuse or fusermount3 could not mount."""
+    hint = f" ({_CONTAINER})" if "not permitted" in said else ""
+    return f"cannot mount on {path}: {said}{hint}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +137,11 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
 
 
 def ours_below(path: str) -> list[str]:
-    """Return the mountpoints of ours below another one."""
+    """Return the mountpoints of ours below another one, sorted."""
     above = path.rstrip("/") + "/"
-    return [known for known, mount in mounts().items() if known.startswith(above) and mount.type == OUR_TYPE]
+    return sorted(
+        known for known, mount in mounts().items() if known.startswith(above) and mount.type == OUR_TYPE
+    )
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:

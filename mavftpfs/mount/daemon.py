@@ -60,7 +60,7 @@ def in_background(work: Callable[[Report], int]) -> int:
 
 
 def _be_child(write_end: int, work: Callable[[Report], int]) -> NoReturn:
-    code: int = ExitCode.MOUNT_FAILED
+    code: int = ExitCode.BUG
     reporter = _Reporter(write_end)
     try:
         os.setsid()
@@ -72,7 +72,7 @@ def _be_child(write_end: int, work: Callable[[Report], int]) -> NoReturn:
     except BaseException as exc:
         # Nothing above us: a bug must reach the log and the waiting parent, not vanish with the process.
         logging.getLogger("mavftpfs").exception("the daemon failed")
-        reporter(code, f"internal error: {exc!r}")
+        reporter(code, f"internal error: {exc!r}; please report it with the log")
     finally:
         logging.shutdown()
         os._exit(code)

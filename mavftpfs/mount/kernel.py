@@ -16,7 +16,7 @@ from typing import Any
 import pyfuse3
 import trio
 
-from mavftpfs.client.mountpoint import stderr_of, unmount
+from mavftpfs.client.mountpoint import stderr_of, unmount, why_not_mounted
 from mavftpfs.mount.handles import Presentation
 from mavftpfs.mount.options import MountOptions
 from mavftpfs.shared.errors import MountFailed
@@ -74,8 +74,7 @@ def kernel_mount(
             with watcher_told_last():
                 pyfuse3.init(operations, mountpoint, words)
         except RuntimeError as exc:
-            reason = said() or str(exc)
-            raise MountFailed(f"cannot mount on {mountpoint}: {reason}") from exc
+            raise MountFailed(why_not_mounted(mountpoint, said() or str(exc))) from exc
     try:
         yield
     finally:

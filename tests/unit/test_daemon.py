@@ -64,7 +64,7 @@ def test_success_frees_the_parent_and_detaches_the_child(tmp_path: Path) -> None
             1,
             "not that log",
         ),
-        ("raise ValueError('a bug')", 3, "internal error: ValueError('a bug')"),
+        ("raise ValueError('a bug')", 70, "internal error: ValueError('a bug')"),
         ("os.kill(os.getpid(), signal.SIGKILL)", 3, "signal 9"),
         ("os._exit(5)", 3, "exit code 5"),
     ],

@@ -16,6 +16,7 @@ from mavftpfs.client.mountpoint import (
     is_ours,
     mounts,
     unmount,
+    why_not_mounted,
 )
 from mavftpfs.shared.errors import MountFailed
 
@@ -74,6 +75,21 @@ def test_a_bad_mountpoint(
 def test_no_fuse_device(tmp_path: Path) -> None:
     with pytest.raises(MountFailed, match="modprobe fuse"):
         check_fuse(str(tmp_path / "fuse"))
+
+
+def test_a_device_that_a_user_may_not_open(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    device = tmp_path / "fuse"
+    device.touch()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    for uid in (0, 1000):
+        with pytest.raises(MountFailed, match="sudo chmod 666"):
+            check_fuse(str(device), uid=uid)
+
+
+def test_what_a_container_lacks_is_said() -> None:
+    said = why_not_mounted("/mnt", "fusermount3: mount failed: Operation not permitted")
+    assert said.endswith("Operation not permitted (a container needs --device /dev/fuse --cap-add SYS_ADMIN)")
+    assert why_not_mounted("/mnt", "no") == "cannot mount on /mnt: no"
 
 
 def test_no_fusermount_matters_to_users_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
