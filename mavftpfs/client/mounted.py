@@ -48,7 +48,7 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
     errno.ENOTCONN: errors.LinkClosed,  # the mount's process is gone
     errno.ECONNABORTED: errors.LinkClosed,
     errno.ENODEV: errors.LinkClosed,
-    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum has it, also while armed
+    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum has it
 }
 
 
@@ -68,7 +68,7 @@ _ABOUT_TARGET = (
 
 _HINTS = {
     errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
-    errors.NotDeliveredYet: " (the vehicle is armed, or has not got all of it yet)",
+    errors.NotDeliveredYet: " (not all of it is on the vehicle yet)",
     errors.RequestTimeout: " (the vehicle does not answer)",
     errors.FileBusy: " (another program uses the vehicle's files, or the vehicle writes this one)",
 }
@@ -272,6 +272,8 @@ class MountedFiles:
         """Ask the vehicle."""
         try:
             return int(await _call(path, os.getxattr, self._place(path), XATTR_CRC32), 16)
+        except errors.ReadOnly as exc:
+            raise errors.Armed("checksums are not asked for in flight") from exc
         except errors.OtherRefusal:
             if (await self.stat(path)).kind is EntryKind.DIRECTORY:  # which has no such attribute
                 raise errors.IsADirectory(_sentence(errors.IsADirectory, path)) from None

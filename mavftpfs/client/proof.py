@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mavftpfs.client.files import READ_SIZE, Session, mount_status
+from mavftpfs.client.files import READ_SIZE, Session
 from mavftpfs.protocol.payload import NakCode, crc32
 from mavftpfs.shared.errors import (
     Armed,
@@ -79,17 +79,16 @@ async def ask_crc32(session: Session, remote: bytes) -> Answer:
     except LinkError:
         raise
     except MavftpfsError as exc:
-        return Answer(None, await _why_not(session, exc), isinstance(exc, NOT_NOW))
+        return Answer(None, _why_not(exc), isinstance(exc, NOT_NOW))
 
 
-async def _why_not(session: Session, error: MavftpfsError) -> str:
-    """Return in a few words why there is no checksum. A mount's answer is the same for an armed vehicle and
-    for one that does not have the file yet."""
+def _why_not(error: MavftpfsError) -> str:
+    """Return in a few words why there is no checksum."""
     match error:
         case Armed():
             return "armed"
         case NotDeliveredYet():
-            return "armed" if await _armed(session) else "not all of it is on the vehicle yet"
+            return "not all of it is on the vehicle yet"
         case RequestTimeout():
             return "no answer"
         case SessionBusy():
@@ -101,12 +100,6 @@ async def _why_not(session: Session, error: MavftpfsError) -> str:
         case FtpNak() if error.code == NakCode.UNKNOWN_COMMAND:
             return "the vehicle computes no checksums"
     return str(error)
-
-
-async def _armed(session: Session) -> bool:
-    if session.mountpoint is None:
-        return False
-    return bool((await mount_status(session.mountpoint))["vehicle"]["armed"])
 
 
 def local_crc32(file: Path) -> int:

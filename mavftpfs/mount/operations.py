@@ -43,7 +43,7 @@ from mavftpfs.mount.handles import (
 )
 from mavftpfs.mount.programs import program_of
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, ListingIncomplete, MavftpfsError, NotFound
+from mavftpfs.shared.errors import ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.fuse")
@@ -435,10 +435,7 @@ class Operations(pyfuse3.Operations):
             raise FUSEError(pyfuse3.ENOATTR)
         if (await self._tree.stat(path)).kind is not EntryKind.FILE:
             raise FUSEError(pyfuse3.ENOATTR)
-        try:
-            return b"%08x" % await self._tree.crc32(path)
-        except Armed as exc:
-            raise FUSEError(errno.EAGAIN) from exc
+        return b"%08x" % await self._tree.crc32(path)
 
     @handler
     async def listxattr(self, inode: int, ctx: RequestContext) -> list[bytes]:

@@ -504,6 +504,24 @@ def test_an_error_is_said_in_the_same_words_over_a_mount(field: Field) -> None:
         vehicle.resume()
 
 
+@pytest.mark.mount
+@pytest.mark.holds("promise 9")
+def test_a_checksum_in_flight_is_one_error_with_and_without_a_mount(field: Field) -> None:
+    card = field.local("card")
+    (card / "f").write_bytes(b"data")
+    vehicle = field.sim(card, "px4", ("--armed",))
+    field.mount(vehicle.source)
+    said = []
+    for use_mount in (False, True):
+        with mavftpfs.connect(vehicle.source, use_mount=use_mount) as drone:
+            assert (drone.mountpoint is not None) == use_mount
+            with pytest.raises(OSError, match="in flight") as caught:
+                drone.crc32("/f")
+            said.append((caught.value.errno, str(caught.value)))
+    assert said[0] == said[1]
+    assert said[0][0] == errno.EROFS
+
+
 def refusal(call: Call, drone: mavftpfs.Drone) -> tuple[type, str]:
     """Return the error that a call ends with."""
     with pytest.raises(OSError, match="/") as caught:

@@ -217,7 +217,7 @@ async def test_statfs_never_asks_the_tree() -> None:
 
 
 @pytest.mark.holds("promise 9")
-async def test_checksum_while_armed_is_eagain() -> None:
+async def test_checksum_while_armed_is_erofs() -> None:
     tree = some_tree()
     ops = operations(tree)
     ino = await ino_of(ops, b"a.txt")
@@ -227,7 +227,7 @@ async def test_checksum_while_armed_is_eagain() -> None:
             raise Armed("armed")
 
     tree.on_call = arm
-    assert await failure(ops.getxattr(ino, XATTR_CRC32, CTX)) == errno.EAGAIN
+    assert await failure(ops.getxattr(ino, XATTR_CRC32, CTX)) == errno.EROFS
 
 
 @pytest.mark.holds("promise 4")
