@@ -12,12 +12,14 @@ import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NoReturn, Protocol
 
 import trio
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
+from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
 from mavftpfs.client.mountpoint import OUR_TYPE, enclosing_mount, mounts
 from mavftpfs.client.options import Options
@@ -289,9 +291,8 @@ async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     """Return the files of the mount that has this link now, if it is of the wanted vehicle and we may read
     it."""
     for status in await mounts_on(spec):
-        with suppress(KeyError, TypeError):
-            if is_wanted(status, options):
-                return session_on(status, options.root, read_only=options.read_only)
+        if is_wanted(status, options):
+            return session_on(status, options.root, read_only=options.read_only)
     return None
 
 
@@ -299,7 +300,7 @@ async def mounts_on(spec: LinkSpec) -> list[Mapping[str, Any]]:
     """Return the status of each mount that has this link now and may be read by us."""
     found = []
     for mountpoint in [path for path, mount in mounts().items() if mount.type == OUR_TYPE]:
-        with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
+        with suppress(errors.LinkClosed):
             status = await mount_status(mountpoint)
             if has_link(status, spec):
                 found.append(status)
@@ -313,7 +314,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
         LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is no directory.
         UsageError: the options ask for another vehicle or component.
     """
-    status = await mount_status(mountpoint)
+    status = await mount_status(mountpoint, several=True)
     if "members" in status:
         mountpoint = vehicle_below(status, subtree, options)
         status = await mount_status(mountpoint)
@@ -348,17 +349,23 @@ def session_on(status: Mapping[str, Any], root: bytes, *, read_only: bool = Fals
     return Session(files, root, acknowledged, mountpoint, counts=counts)
 
 
-async def mount_status(mountpoint: str) -> Mapping[str, Any]:
-    """Return the status that a mount tells to users that may read its files.
+async def mount_status(mountpoint: str, *, several: bool = False) -> Mapping[str, Any]:
+    """Return the status that a mount tells to users that may read its files. several: it may be a mount of
+    several vehicles.
 
     Raises:
-        LinkClosed: it does not answer.
+        LinkClosed: it does not answer, or is not what it was.
     """
-    with trio.move_on_after(STATUS_PATIENCE):
-        status = await trio.to_thread.run_sync(told_by, mountpoint, abandon_on_cancel=True)
-        if status is not None:
-            return status
-    raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")
+    ask = partial(told_by, mountpoint, STATUS_PATIENCE)
+    try:
+        status = await trio.to_thread.run_sync(ask, abandon_on_cancel=True)
+    except NobodyThere as exc:
+        raise errors.LinkClosed(str(exc)) from exc
+    if status.get("problem"):
+        raise errors.LinkClosed(f"the mount on {mountpoint}: {status['problem']}")
+    if "members" in status and not several:
+        raise errors.LinkClosed(f"the mount on {mountpoint} is one of several vehicles now")
+    return status
 
 
 _TICK = 0.2

@@ -110,8 +110,10 @@ def why_not_mounted(path: str, said: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """What the kernel's table says of a mount. uid: of the user that mounted it, None if that is not told."""
+    """What the kernel's table says of a mount. number: no other mount has it as long as this one is used;
+    uid: of the user that mounted it, None if that is not told."""
 
+    number: str
     type: str
     source: str
     uid: int | None
@@ -132,7 +134,8 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
         if len(columns) > 4:
             kind, source, words = [*right.split(" "), "", ""][:3]
             uid = re.search(r"(?:^|,)user_id=(\d+)", words)
-            found[_unescape(columns[4])] = Mounted(kind, _unescape(source), int(uid[1]) if uid else None)
+            mounted = Mounted(columns[0], kind, _unescape(source), int(uid[1]) if uid else None)
+            found[_unescape(columns[4])] = mounted
     return found
 
 

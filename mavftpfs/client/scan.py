@@ -41,10 +41,10 @@ async def scan(target: Target) -> list[Entry]:
         VehicleLost: no heartbeat at all within connect_timeout.
     """
     if target.mount is not None:
-        status = await mount_status(target.mount[0])
+        status = await mount_status(target.mount[0], several=True)
         if "members" in status:
             _, *below = await trio.to_thread.run_sync(with_vehicles, status)
-            return [_own_entry(vehicle) for vehicle in below if not vehicle["problem"]]
+            return [_own_entry(vehicle) for vehicle in below if not vehicle.get("problem")]
         return _of_mount(status)
     assert target.spec is not None
     statuses = await mounts_on(target.spec)

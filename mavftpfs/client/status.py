@@ -14,11 +14,13 @@ import json
 import os
 import threading
 from collections.abc import Mapping
+from concurrent.futures import Future
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from mavftpfs import __version__
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
 from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts, ours_below
@@ -90,6 +92,8 @@ Status = Mapping[str, Any]
 
 PATIENCE = 10.0
 """Seconds for a mount to answer: it does so without asking the vehicle."""
+_OF_ONE_VEHICLE = frozenset(("vehicle", "link", "transfers", "held", "connection", "cache"))
+"""Keys that the status of a mount of one vehicle has."""
 
 
 # -- asking mounts ----------------------------------------------------------------------------------
@@ -130,17 +134,20 @@ def status_of(mountpoint: str) -> Status:
         raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}") from None
 
 
-def told_by(mountpoint: str) -> Status | None:
-    """Return a mount's status from the attribute of its root, None if that cannot be read.
+def told_by(mountpoint: str, patience: float) -> Status:
+    """Return a mount's status from the attribute of its root, within so many seconds; as status_of.
 
     The control socket is found by the mountpoint's name, which may be another mount in another mount
     namespace.
+
+    Raises:
+        NobodyThere: nothing is mounted there, or this user may not ask.
     """
-    answer = _read_xattr(mountpoint)
-    if not isinstance(answer, bytes):
-        return None
-    facts: Status = json.loads(answer)
-    return facts
+    mount = mounts().get(mountpoint)
+    status = None if mount is None else _by_attribute(mountpoint, mount, patience)
+    if status is None:
+        raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
+    return status
 
 
 def second_vehicle(status: Status) -> str:
@@ -163,19 +170,22 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
     Raises:
         UsageError: the options do not say which one. NotFound: it is not there.
     """
-    place, names = status["mountpoint"], [member["name"] for member in status["members"]]
+    place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
     first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
     system, component = options.target_system, options.target_component
     wanted = f"{system}-{component}" if component else str(system)
     if first.replace("-", "").isdigit():
         raise NotFound(f"no vehicle is mounted on {place}/{first}")
     if not system and len(names) == 1:
-        wanted = names[0]
+        (wanted,) = names
     elif not system:
         shown = ", ".join(names) or "none yet"
         raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
     if wanted not in names:
         raise NotFound(f"no vehicle {wanted} is mounted below {place}")
+    if names[wanted]["state"] != "mounted":
+        why = names[wanted]["problem"] or names[wanted]["state"]
+        raise NotFound(f"vehicle {wanted} is not mounted below {place}: {why}")
     return os.path.join(place, wanted)
 
 
@@ -209,44 +219,76 @@ def _status_of(path: str, mount: Mounted) -> Status | None:
     try:
         return _ask(find_socket(path))
     except NobodyThere:
-        pass
+        return _by_attribute(path, mount, PATIENCE)
     except ControlError as exc:
-        return _unasked(path, mount, "mute", f"its program does not answer: {exc}")
-    answer = _read_xattr(path)
+        return _unasked(path, mount.source, "mute", f"its program does not answer: {exc}")
+
+
+def _by_attribute(path: str, mount: Mounted, patience: float) -> Status | None:
+    """Return what a mount says by the attribute of its root; None if this user may not ask."""
+    answer = _questions.ask(path, mount, patience)
     if isinstance(answer, bytes):
-        facts: Status = json.loads(answer)
-        return facts
+        return _understood(json.loads(answer), path)
     if answer == errno.ENOTCONN:
-        return _unasked(path, mount, "dead", f"DEAD: its program is gone; run: mavftpfs umount {path}")
+        return _unasked(path, mount.source, "dead", f"DEAD: its program is gone; run: mavftpfs umount {path}")
     if answer in (errno.EACCES, errno.EPERM):
         return None
-    return _unasked(path, mount, "mute", f"its program does not answer: {os.strerror(answer)}")
+    return _unasked(path, mount.source, "mute", f"its program does not answer: {os.strerror(answer)}")
 
 
-def _unasked(path: str, mount: Mounted, state: str, problem: str) -> Status:
-    return {"mountpoint": path, "source": mount.source, "state": state, "problem": problem}
+def _understood(status: Status, path: str) -> Status:
+    """Return a status that has all keys on which others rely; a mount of another version may not tell
+    them."""
+    if "members" in status or status.keys() >= _OF_ONE_VEHICLE:
+        return status
+    theirs = status.get("version", "unknown")
+    problem = f"its program is of version {theirs}, this one of {__version__}: unmount it, and mount it again"
+    return _unasked(path, status.get("source", ""), "mute", problem)
 
 
-def _read_xattr(path: str) -> bytes | int:
-    """Return the attribute, or the errno; read in a thread, because a mount that was stopped never
-    answers."""
-    answer: list[bytes | int] = []
+def _unasked(path: str, source: str, state: str, problem: str) -> Status:
+    return {"mountpoint": path, "source": source, "state": state, "problem": problem}
 
-    def read() -> None:
+
+class _Questions:
+    """Reads the attribute of mounts, each in a thread, because a mount that was stopped never answers. It
+    keeps one thread, however often it is asked."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[str, Future[bytes | int]] = {}
+
+    def ask(self, path: str, mount: Mounted, patience: float) -> bytes | int:
+        """Return the attribute, or the errno; ETIMEDOUT after so many seconds."""
+        with self._lock:
+            answer = self._open.get(mount.number)
+            if answer is None:
+                answer = Future()
+                threading.Thread(target=self._read, args=(path, mount, answer), daemon=True).start()
+                self._open[mount.number] = answer
         try:
-            answer.append(os.getxattr(path, XATTR_STATUS))
-        except OSError as exc:
-            answer.append(exc.errno or errno.EIO)
+            return answer.result(patience)
+        except TimeoutError:
+            return errno.ETIMEDOUT
 
-    thread = threading.Thread(target=read, daemon=True)
-    thread.start()
-    thread.join(PATIENCE)
-    return answer[0] if answer else errno.ETIMEDOUT
+    def _read(self, path: str, mount: Mounted, answer: Future[bytes | int]) -> None:
+        found: bytes | int
+        try:
+            found = os.getxattr(path, XATTR_STATUS)
+        except OSError as exc:
+            found = exc.errno or errno.EIO
+        with self._lock:
+            del self._open[mount.number]
+        answer.set_result(found)
+
+
+_questions = _Questions()
 
 
 def _ask(socket: Path) -> Status:
-    facts: Status = control.ask(socket, {"command": "status"}, timeout=PATIENCE)["status"]
-    return facts
+    """Return what a mount says at its control socket."""
+    status: Status = control.ask(socket, {"command": "status"}, timeout=PATIENCE)["status"]
+    return _understood(status, status["mountpoint"])
 
 
 def _ask_or_remove(socket: Path) -> Status | None:

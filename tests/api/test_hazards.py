@@ -21,6 +21,8 @@ import trio
 import mavftpfs
 import mavftpfs.trio
 from mavftpfs.api.triofile import AsyncFile
+from mavftpfs.client.files import mount_status
+from mavftpfs.shared.errors import LinkClosed
 from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
 from tests.support.trees import content
@@ -502,6 +504,27 @@ async def test_a_mount_that_does_not_answer_stops_no_other_task(sim: SimVehicle,
             mount.process.popen.send_signal(signal.SIGCONT)
         nursery.cancel_scope.cancel()
     assert turns > 0
+
+
+@pytest.mark.mount
+async def test_a_mount_that_hangs_holds_one_thread_however_often_it_is_asked(
+    sim: SimVehicle, field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavftpfs.client.files.STATUS_PATIENCE", 0.2)
+    mount = field.mount(sim.source)
+    assert mount.process is not None
+    place = str(mount.path)
+    assert (await mount_status(place))["vehicle"]["system"] == 1
+    before = threading.active_count()
+    mount.process.popen.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(5):
+            with pytest.raises(LinkClosed, match="does not answer"):
+                await mount_status(place)
+        assert threading.active_count() <= before + 1
+    finally:
+        mount.process.popen.send_signal(signal.SIGCONT)
+    assert (await mount_status(place))["vehicle"]["system"] == 1
 
 
 @pytest.mark.mount

@@ -17,10 +17,11 @@ import pytest
 import trio
 import trio.testing
 
+from mavftpfs.cli.main import main
 from mavftpfs.client import control, controlserver
 from mavftpfs.client.control import ControlError, NobodyThere, Reply, all_sockets, ask, find_socket
 from mavftpfs.client.controlserver import Command, ControlServer
-from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.errors import ExitCode, UsageError
 
 pytestmark = pytest.mark.real_time
 
@@ -171,6 +172,24 @@ def test_a_mute_process_is_not_taken_for_a_dead_one(tmp_path: Path) -> None:
         with pytest.raises(ControlError) as caught:
             ask(path, {"command": "echo"}, timeout=0.05)
     assert not isinstance(caught.value, NobodyThere)
+
+
+async def test_a_mount_of_a_version_that_tells_less_is_named_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = {"mountpoint": "/mnt/old", "source": "udpin:0", "state": "mounted", "version": "0.0.9"}
+
+    async def status(_: Reply) -> Reply:
+        return {"status": told}
+
+    with TemporaryDirectory() as name:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", name)
+        place = control.usable_directory(control.own_directories()) / control.socket_name("/mnt/old")
+        async with serving(place, {"status": status}):
+            code = await trio.to_thread.run_sync(main, ["status", "/mnt/old"])
+    said = capsys.readouterr()
+    assert (code, said.err) == (ExitCode.MOUNT_FAILED, "")
+    assert said.out.startswith("/mnt/old: its program is of version 0.0.9")
 
 
 # -- places ---------------------------------------------------------------------------------------
