@@ -218,7 +218,7 @@ class _Delivery:
         if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
             return
         if self._said_at is None:
-            self._explain()
+            self._explain(status["pid"])
         self._said_at = now
         if self._in_place:
             shown = line[: shutil.get_terminal_size().columns - 1]
@@ -231,7 +231,7 @@ class _Delivery:
         if self._in_place and self._said_at is not None:
             print(file=sys.stderr)
 
-    def _explain(self) -> None:
+    def _explain(self, pid: int) -> None:
         from mavftpfs.client.leftovers import recovered_directory
         from mavftpfs.mount.farewell import DRAIN_LIMIT
 
@@ -239,7 +239,7 @@ class _Delivery:
             "not everything is on the vehicle yet: it is delivered for at most "
             f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory()}"
         )
-        say("Ctrl-C ends only the waiting, not the delivery")
+        say(f"Ctrl-C ends only the waiting; to keep the rest now: kill {pid}")
 
 
 def _after_a_killed_mount() -> int:

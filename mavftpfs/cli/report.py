@@ -127,9 +127,9 @@ def _percent(share: float) -> str:
 def _transfer_line(transfer: Status) -> Line:
     size, done = transfer["size"], transfer["done"]
     facts = [f"{done * 100 // size} % of {readable_size(size)}" if size else "empty"]
-    if transfer["rate"]:
+    if size and transfer["rate"]:
         facts.append(f"{readable_size(transfer['rate'])}/s")
-    if transfer["eta"] is not None and transfer["state"] != "waiting":
+    if size and transfer["eta"] is not None and transfer["state"] != "waiting":
         facts.append(time_left(transfer["eta"]))
     if transfer.get("error"):
         facts.append(transfer["error"])
