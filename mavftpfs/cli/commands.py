@@ -21,7 +21,7 @@ from mavftpfs.client.options import split_words, with_root
 from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, with_vehicles
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon
-from mavftpfs.mount.options import MountOptions, parse_options
+from mavftpfs.mount.options import LOCAL_PATHS, MountOptions, parse_options
 from mavftpfs.mount.roster import Member
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
@@ -32,8 +32,6 @@ END_PATIENCE = 5.0
 """Seconds for a mount's process to end after its last word."""
 SAY_AGAIN = 10.0
 """Seconds between two lines about a delivery, where these go to a file."""
-
-_PATH_OPTIONS = ("cache_dir", "signing_key", "trace", "tlog")
 
 
 # -- mount ----------------------------------------------------------------------------------------
@@ -75,7 +73,7 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
 def absolute_paths(options: MountOptions) -> MountOptions:
     """Return the options with local paths absolute: the background process works in `/`."""
     client, log_file = options.client, options.log_file
-    found = {name: getattr(client, name) for name in _PATH_OPTIONS}
+    found = {name: getattr(client, name, None) for name in LOCAL_PATHS}
     client = replace(client, **{name: os.path.abspath(path) for name, path in found.items() if path})
     return replace(options, client=client, log_file=log_file and os.path.abspath(log_file))
 
@@ -112,7 +110,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
     own: list[tuple[str, bool]] = []
     for word in split_words(args.options):
         option, equals, value = word.partition("=")
-        if equals and option in (*_PATH_OPTIONS, "log_file"):
+        if equals and option in LOCAL_PATHS:
             word = f"{option}={os.path.abspath(value)}"  # now: a process in the background works in `/`
         if option not in ("all", "forward"):
             escaped = word.replace("\\", "\\\\").replace(",", "\\,")

@@ -14,7 +14,7 @@ from importlib.resources import files
 import shtab
 
 from mavftpfs.client.options import Choice
-from mavftpfs.mount.options import VALUES, option_help
+from mavftpfs.mount.options import LOCAL_PATHS, VALUES, option_help
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -34,9 +34,6 @@ _PLACES = {
     "options": _LIST,
 }
 """How arguments are completed by name, if they are not paths on the vehicle."""
-
-_LOCAL_PATHS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
-"""Options whose values are local paths."""
 
 _ZSH_BEGINS = "typeset -A opt_args"
 """What follows this in shtab's script is no definition any more."""
@@ -74,10 +71,10 @@ def _filling(shell: str, commands: Mapping[str, argparse.ArgumentParser]) -> Map
         return {"@COMMANDS@": " ".join(commands), "@VALUES@": " \\\n".join(map(_indented, _zsh_specs()))}
     values = [f"{name}={word}" for name, words in _choices().items() for word in words]
     if shell == "bash":
-        paths = "|".join(f"{name}=*" for name in _LOCAL_PATHS)
+        paths = "|".join(f"{name}=*" for name in LOCAL_PATHS)
         return {"@WORDS@": " ".join(option_help()), "@VALUES@": " ".join(values), "@FILES@": paths}
     described = (shlex.quote(f"{word}\t{text}") for word, text in option_help().items())
-    paths = " ".join(f"{name}=" for name in _LOCAL_PATHS)
+    paths = " ".join(f"{name}=" for name in LOCAL_PATHS)
     return {"@WORDS@": " ".join(described), "@VALUES@": " ".join(values), "@FILES@": paths}
 
 
@@ -93,7 +90,7 @@ def _zsh_specs() -> Iterator[str]:
         name, value, _ = word.partition("=")
         said = "".join(f"\\{letter}" if letter in "[]:" else letter for letter in text)
         wanted = (
-            f"({' '.join(choices[name])})" if name in choices else "_files" * (name in _LOCAL_PATHS) or " "
+            f"({' '.join(choices[name])})" if name in choices else "_files" * (name in LOCAL_PATHS) or " "
         )
         yield shlex.quote(f"{name}[{said}]:{name}:{wanted}" if value else f"{name}[{said}]")
 

@@ -1,6 +1,8 @@
 """pyfuse3's handlers: translate, delegate to the tree, map errors. Layer: mount.
 
-Inodes are touched only between awaits: reserve, reply and count form one atomic step.
+Inodes are touched only between awaits: reserve, reply and count form one atomic step. What has no handler
+here is ENOSYS for the kernel, which knows what to make of it: an fsync of a directory succeeds, and no
+extended attribute can be set.
 
 flush is called for every closed descriptor, also of programs that wrote nothing. So it asks the handle, and a
 handle for reading has nothing to deliver. A program asks for fsync, and means the file: any handle will do
@@ -123,16 +125,6 @@ class Operations(pyfuse3.Operations):
         for ino, lookups in inode_list:
             self.inodes.forget(ino, lookups)
 
-    @handler
-    async def access(self, inode: int, mode: int, ctx: RequestContext) -> bool:
-        """Not called, because default_permissions is always on."""
-        return True
-
-    @handler
-    async def readlink(self, inode: int, ctx: RequestContext) -> bytes:
-        """There are no symbolic links."""
-        raise FUSEError(errno.EINVAL)
-
     # -- directories ------------------------------------------------------------------------------
 
     @handler
@@ -189,10 +181,6 @@ class Operations(pyfuse3.Operations):
     async def releasedir(self, fh: int) -> None:
         """Forget the snapshot."""
         self.directories.remove(fh)
-
-    @handler
-    async def fsyncdir(self, fh: int, datasync: bool) -> None:
-        """Nothing is ever pending in a directory."""
 
     # -- files ------------------------------------------------------------------------------------
 
@@ -404,13 +392,8 @@ class Operations(pyfuse3.Operations):
     async def _not_on_a_card(self, *_: object) -> NoReturn:
         raise FUSEError(errno.EPERM)
 
-    async def _no_attribute(self, *_: object) -> NoReturn:
-        raise FUSEError(errno.ENOTSUP)
-
     _never: Any = _not_on_a_card
-    _unset: Any = _no_attribute
     symlink = link = _never
-    setxattr = removexattr = _unset
 
     # -- the file system --------------------------------------------------------------------------
 

@@ -98,6 +98,9 @@ OWN_FLAGS: Flags = {
 """default_permissions is always on, and not shown."""
 
 VALUES: Values = {**OWN_VALUES, **client.VALUES}
+LOCAL_PATHS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
+"""Options whose values are paths on this computer."""
+
 FLAGS: Flags = {**client.FLAGS, **OWN_FLAGS}
 
 

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 import pyfuse3
 import trio
-from pyfuse3 import EntryAttributes, FUSEError, RequestContext, SetattrFields, StatvfsData
+from pyfuse3 import EntryAttributes, FUSEError, RequestContext, StatvfsData
 
 from mavftpfs.client.mountpoint import XATTR_STATUS
 from mavftpfs.mount.guard import handler
@@ -124,59 +124,11 @@ class RootOperations(pyfuse3.Operations):
         """List the root's status."""
         return [XATTR_STATUS] if inode == ROOT_INO else []
 
-    async def access(self, inode: int, mode: int, ctx: RequestContext) -> bool:
-        """Not called, because default_permissions is always on."""
-        return True
+    async def _read_only(self, *_: object) -> NoReturn:
+        raise FUSEError(errno.EROFS)
 
-    # -- nothing can be made, changed or removed here
-
-    async def setattr(
-        self, inode: int, attr: EntryAttributes, fields: SetattrFields, fh: int | None, ctx: RequestContext
-    ) -> EntryAttributes:
-        """Refuse."""
-        _refuse()
-
-    async def mkdir(self, parent_inode: int, name: bytes, mode: int, ctx: RequestContext) -> EntryAttributes:
-        """Refuse."""
-        _refuse()
-
-    async def mknod(
-        self, parent_inode: int, name: bytes, mode: int, rdev: int, ctx: RequestContext
-    ) -> EntryAttributes:
-        """Refuse."""
-        _refuse()
-
-    async def create(
-        self, parent_inode: int, name: bytes, mode: int, flags: int, ctx: RequestContext
-    ) -> tuple[pyfuse3.FileInfo, EntryAttributes]:
-        """Refuse."""
-        _refuse()
-
-    async def symlink(
-        self, parent_inode: int, name: bytes, target: bytes, ctx: RequestContext
-    ) -> EntryAttributes:
-        """Refuse."""
-        _refuse()
-
-    async def unlink(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
-        """Refuse."""
-        _refuse()
-
-    async def rmdir(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
-        """Refuse."""
-        _refuse()
-
-    async def rename(
-        self,
-        parent_inode_old: int,
-        name_old: bytes,
-        parent_inode_new: int,
-        name_new: bytes,
-        flags: int,
-        ctx: RequestContext,
-    ) -> None:
-        """Refuse."""
-        _refuse()
+    _never: Any = _read_only
+    setattr = mkdir = mknod = create = symlink = link = unlink = rmdir = rename = _never
 
     def _attributes(self, ino: int) -> EntryAttributes:
         if ino != ROOT_INO and self._roster.at(ino) is None:
@@ -189,7 +141,3 @@ class RootOperations(pyfuse3.Operations):
         attributes.st_size = 0
         attributes.entry_timeout = attributes.attr_timeout = FOREVER
         return attributes
-
-
-def _refuse() -> NoReturn:
-    raise FUSEError(errno.EROFS)

@@ -300,10 +300,8 @@ _CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
     *((cls, ExitCode.USAGE) for cls in _NOT_POSSIBLE),
     (NotDelivered, ExitCode.UNDELIVERED),
     (MountFailed, ExitCode.MOUNT_FAILED),
-    (NoFtp, ExitCode.NO_VEHICLE),
-    (LinkError, ExitCode.NO_VEHICLE),
-    (RequestTimeout, ExitCode.NO_VEHICLE),
 )
+"""All others: NO_VEHICLE, no right answer came from it."""
 
 
 def exit_code_for(error: MavftpfsError) -> ExitCode:

@@ -83,6 +83,24 @@ def test_a_path_too_long_for_the_wire_is_enametoolong(field: Field, tmp_path: Pa
     assert mount.run("ls", inner.parent.parent.parent.parent).stdout.split() == ["d" * 40]
 
 
+REFUSALS = {
+    "os.fsync(os.open(sys.argv[1], os.O_RDONLY))": "",
+    "assert os.access(sys.argv[1] + '/README.txt', os.W_OK)": "",
+    "os.setxattr(sys.argv[1] + '/README.txt', 'user.x', b'1')": "ENOTSUP",
+    "os.removexattr(sys.argv[1] + '/README.txt', 'user.x')": "ENOTSUP",
+    "os.readlink(sys.argv[1] + '/README.txt')": "EINVAL",
+    "os.symlink('README.txt', sys.argv[1] + '/sym')": "EPERM",
+    "os.link(sys.argv[1] + '/README.txt', sys.argv[1] + '/hard')": "EPERM",
+    "os.mkfifo(sys.argv[1] + '/fifo')": "EPERM",
+}
+"""Snippets, and the errno of each: "" for success."""
+
+
+def test_what_no_card_has_is_refused_in_the_usual_way(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    assert {code: mount.errno_of(code, mount.path) for code in REFUSALS} == REFUSALS
+
+
 def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: Path, tmp_path: Path) -> None:
     mount = field.prepare(field.sim(small_tree).source)
     log = tmp_path / "daemon.log"
