@@ -48,6 +48,7 @@ class Endpoint:
         self._arrived: list[bytes] = []
         self._splitter = Framer(vehicle.address, stream=link.is_stream, on_frame=self._arrived.append)
         self._scope: trio.CancelScope | None = None
+        vehicle.on_news = self.kick
         self._set_room()
 
     async def run(self) -> None:
@@ -86,7 +87,6 @@ class Endpoint:
             self.vehicle.disarm()
         else:
             self.vehicle.arm()
-        self.kick()
         return self.vehicle.armed
 
     def _set_room(self) -> None:
@@ -243,7 +243,6 @@ def _react(number: int, endpoint: Endpoint) -> str:
     if number == signal.SIGUSR2:
         return "link cut" if endpoint.toggle_cut() else "link mended"
     endpoint.vehicle.reboot(trio.current_time())
-    endpoint.kick()
     return "rebooted"
 
 

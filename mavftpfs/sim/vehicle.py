@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -147,6 +147,7 @@ class SimVehicle:
 
     Attributes:
         tells_time: sends its boot time unasked. ArduCopter does so only if a program asked for its EXTRA3.
+        on_news: called when it was changed from outside, so that the link looks at it again.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class SimVehicle:
         self.telemetry = telemetry
         self.armed = armed
         self.tells_time = True
+        self.on_news: Callable[[], None] = lambda: None
         self.tells_storage = profile.tells_storage if tells_storage is None else tells_storage
         self.heard: dict[Address, Heartbeat] = {}
         self._uid = rng.getrandbits(64) ^ address.system  # another one beside it, of the same seed
@@ -198,6 +200,7 @@ class SimVehicle:
         self._down_until = now + downtime
         self._next_beat = self._down_until + beat_after
         self._next_telemetry = float("-inf")
+        self.on_news()
 
     def set_stream(self, stream: bool) -> None:
         """Say, before the first `receive`, whether it will get pieces of a stream or datagrams."""
@@ -230,10 +233,12 @@ class SimVehicle:
         if audible:
             self._ready.append(Framer(source, stream=False).encode_ftp(self.address, payload))
         self.server.handle(payload, source, now)
+        self.on_news()
 
     def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT."""
         self._ready.append(self.framer.encode("statustext", severity, text.encode()[:50]))
+        self.on_news()
 
     def outgoing(self, now: float) -> list[bytes]:
         """Return the frames to send now, in order."""
@@ -268,6 +273,7 @@ class SimVehicle:
     def _set_armed(self, armed: bool) -> None:
         self.armed = armed
         self._next_beat = float("-inf")
+        self.on_news()
 
     def _is_for_us(self, target: Address) -> bool:
         if target.system not in (0, self.address.system):

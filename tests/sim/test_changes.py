@@ -125,18 +125,12 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
 async def test_no_checksum_is_asked_for_in_flight(when_armed: Literal["ro", "ok"]) -> None:
     """The vehicle reads the whole file for it (promise 9)."""
     here = Rig("px4", {b"/d/file": b"content"})
-
-    async def fly(armed: bool) -> None:
-        (here.vehicle.arm if armed else here.vehicle.disarm)()
-        here.link.kick()
-        await trio.sleep(0.5)
-
     async with here.connected(ConnectOptions(when_armed=when_armed)) as connection:
-        await fly(True)
+        await here.arm()
         with pytest.raises(Armed):
             await connection.store.crc32(b"/d/file")
         assert Opcode.CALC_FILE_CRC32 not in here.faults.requests
-        await fly(False)
+        await here.disarm()
         assert await connection.store.crc32(b"/d/file") == crc32(b"content")
 
 

@@ -200,7 +200,6 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
         def restart() -> None:
             here.faults.ignore(Opcode.TERMINATE_SESSION)
             here.vehicle.reboot(trio.current_time(), 1.0)
-            here.link.kick()
 
         here.faults.at(Opcode.TERMINATE_SESSION, restart)
     assert up.connection.vehicle.reboots == 1

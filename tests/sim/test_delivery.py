@@ -395,12 +395,7 @@ async def test_no_checksum_is_asked_for_in_flight() -> None:
 async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> None:
     """What is there is compared after it was disarmed."""
     tree = here.mount(verify="crc")
-
-    def arm() -> None:
-        here.vehicle.arm()
-        here.link.kick()
-
-    here.faults.at(Opcode.TERMINATE_SESSION, arm)
+    here.faults.at(Opcode.TERMINATE_SESSION, here.vehicle.arm)
     with pytest.raises(Armed):
         await write_file(tree, path, b"x" * 5000)
     sent = here.count(Opcode.WRITE_FILE)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, Doubt, LateCopies
 from mavftpfs.shared.errors import MavftpfsError
@@ -119,10 +120,7 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt() -> 
         async def doubts(opcode: Opcode, pause: float = 0.0) -> bool:
             await trio.sleep(pause)
             before = len(sink.suspicions)
-            here.vehicle.foreign_request(
-                request(777, opcode, data=b"/").encode(), Address(255, 190), trio.current_time()
-            )
-            here.link.kick()
+            here.another_asks(opcode, b"/")
             await trio.sleep(1.0)
             return len(sink.suspicions) > before
 
@@ -139,9 +137,7 @@ async def test_a_session_that_vanished_raises_it() -> None:
     here = Rig("px4", {b"/d/f": data}, LinkSettings(rate=50_000.0, delay=0.02))
     async with here.connected() as connection:
         reader, sink = await begin_to_read(connection, b"/d/f", 10_000)
-        here.vehicle.foreign_request(
-            request(777, Opcode.RESET_SESSIONS).encode(), Address(255, 190), trio.current_time()
-        )
+        here.another_asks(Opcode.RESET_SESSIONS)
         assert await sink.wait_for(0, len(data)) == data
         assert connection.store.in_doubt()
         assert sink.suspicions
@@ -255,7 +251,6 @@ async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
 
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
-STRANGER = Address(255, 190)
 OPCODE = 3
 
 READY = 0.011
@@ -494,18 +489,16 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool) -
         await file.write(0, b"A" * 100)
         await file.fsync()
 
-        def stranger(seq: int, opcode: Opcode, data: bytes = b"") -> None:
-            here.server.handle(request(seq, opcode, data=data).encode(), STRANGER, trio.current_time())
-
         def take() -> None:
-            stranger(30_010, Opcode.RESET_SESSIONS)
-            stranger(30_020, Opcode.CREATE_FILE, here.root + b"/d/theirs")
+            here.another_asks(Opcode.RESET_SESSIONS, heard=False)
+            here.another_asks(Opcode.CREATE_FILE, here.root + b"/d/theirs", heard=False)
             here.connection.vehicle.foreign_at = trio.current_time()
             here.connection.vehicle.on_foreign(bytes(251), True)
 
         here.faults.at(Opcode.WRITE_FILE, take, nth=100)
         if leaves:
-            here.faults.at(Opcode.WRITE_FILE, lambda: stranger(30_030, Opcode.TERMINATE_SESSION), nth=200)
+            leave = partial(here.another_asks, Opcode.TERMINATE_SESSION, heard=False)
+            here.faults.at(Opcode.WRITE_FILE, leave, nth=200)
         await file.write(0, new)
         for _ in range(3):  # it may be told that the session is shared just now
             try:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import count as counted
 from pathlib import Path
 from random import Random
@@ -26,8 +27,7 @@ import trio
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
-from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES, Storage
@@ -285,12 +285,7 @@ def silence(scene: Scene, count: int) -> None:
 
 def reboot(scene: Scene, count: int) -> None:
     """Restart the vehicle."""
-
-    def action() -> None:
-        scene.here.vehicle.reboot(trio.current_time(), 2.0)
-        scene.here.link.kick()
-
-    scene.here.faults.after(count, action)
+    scene.here.faults.after(count, lambda: scene.here.vehicle.reboot(trio.current_time(), 2.0))
 
 
 def arm(scene: Scene, count: int) -> None:
@@ -298,7 +293,6 @@ def arm(scene: Scene, count: int) -> None:
 
     def action() -> None:
         scene.here.vehicle.arm()
-        scene.here.link.kick()
         scene.later(5.0, scene.whole)
         scene.later(20.0, scene.here.vehicle.disarm)
 
@@ -321,12 +315,8 @@ def fly_away(scene: Scene, count: int) -> None:
 def rival(scene: Scene, count: int) -> None:
     """Have another ground station reset the sessions, as QGroundControl does."""
 
-    def action() -> None:
-        wire = request(77, Opcode.RESET_SESSIONS).encode()
-        scene.here.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
-        scene.here.link.kick()
-
-    scene.here.faults.after(count, lambda: scene.later(0.0, action))
+    reset = partial(scene.here.another_asks, Opcode.RESET_SESSIONS)
+    scene.here.faults.after(count, lambda: scene.later(0.0, reset))
 
 
 def give_up(scene: Scene, count: int) -> None:

@@ -154,7 +154,6 @@ async def trouble(here: Rig, rng: Random) -> None:
             link.cut()
             await trio.sleep(rng.choice((0.5, 15.0, 50.0)))
             link.restore()
-        link.kick()
 
 
 async def work(model: Model, sequence: list[tuple[Any, ...]], rng: Random) -> None:
@@ -191,7 +190,6 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
             troubles.cancel_scope.cancel()
         here.link.restore()
         here.vehicle.disarm()
-        here.link.kick()
         await trio.sleep(20.0)
         for model in models:
             while model.handles:

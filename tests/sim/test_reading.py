@@ -170,17 +170,12 @@ async def test_a_whole_read_beside_another_client_is_not_believed(profile: str) 
         assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
 
 
-BROWSES = request(0, Opcode.LIST_DIRECTORY, data=b"/")
-LOADS = request(0, Opcode.READ_FILE, session=0, size=239)
-
-
 @pytest.mark.holds("rule 14.12")
 @pytest.mark.parametrize(
-    ("profile", "asks"),
-    [("px4", BROWSES), ("ardupilot", BROWSES), ("mavsdk", BROWSES), ("ardupilot5", LOADS)],
+    ("profile", "loads"), [("px4", False), ("ardupilot", False), ("mavsdk", False), ("ardupilot5", True)]
 )
 async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
-    profile: str, asks: Payload
+    profile: str, loads: bool
 ) -> None:
     """A ground station that shows directories all the time, or reads in a session of its own."""
     here = Rig(
@@ -190,19 +185,14 @@ async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
     )
     async with here.mounted(b"/") as tree, trio.open_nursery() as nursery:
 
-        def ask(seq: int, payload: Payload) -> None:
-            wire = payload._replace(seq=seq).encode()
-            here.vehicle.foreign_request(wire, STRANGER, trio.current_time())
-            here.link.kick()
-
         async def chatter() -> None:
-            if asks is LOADS:
-                ask(20_000, request(0, Opcode.OPEN_FILE_RO, data=b"/theirs"))
-            for seq in range(20_010, 30_000, 2):
+            if loads:
+                here.another_asks(Opcode.OPEN_FILE_RO, b"/theirs")
+            while True:
                 await trio.sleep(0.1)
-                ask(seq, asks)
+                here.another_asks(*((Opcode.READ_FILE,) if loads else (Opcode.LIST_DIRECTORY, b"/")))
 
-        if asks is LOADS:
+        if loads:
             assert await read_file(here.connection, b"/theirs")  # tells how session ids are given out
         nursery.start_soon(chatter)
         await trio.sleep(0.3)
@@ -228,9 +218,8 @@ async def test_a_whole_read_survives_a_lost_session(profile: str) -> None:
             session = connection.scheduler.server.session
             assert session is not None
             wire = request(777, Opcode.TERMINATE_SESSION, session=session.id).encode()
-            frame = connection.driver.framer.encode_ftp(Address(1, 1), wire)
-            here.vehicle.receive(frame, trio.current_time())
-            here.link.kick()
+            now, own = trio.current_time(), connection.vehicle.own
+            here.vehicle.foreign_request(wire, own, now, audible=False)
 
         nursery.start_soon(close_it)
         assert await connection.store.read_whole(b"/f", 100_000) == data
@@ -249,10 +238,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await sink.wait_for(0, 5)
         reader.close()
         await trio.sleep(pause)
-        here.vehicle.foreign_request(
-            request(777, Opcode.NONE).encode(), Address(255, 190), trio.current_time()
-        )
-        here.link.kick()
+        here.another_asks(Opcode.NONE)
         await trio.sleep(0.5)
         assert connection.vehicle.foreign_at is not None
         assert bool(sink.suspicions) is doubted
@@ -344,16 +330,10 @@ async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(p
 
         async def rival() -> None:
             await trio.sleep(0.5)
-            for seq, (opcode, path) in enumerate(
-                [(Opcode.RESET_SESSIONS, b""), (Opcode.OPEN_FILE_RO, root + b"/theirs")]
-            ):
-                wire = request(30_000 + 10 * seq, opcode, data=path).encode()
-                here.vehicle.foreign_request(wire, STRANGER, trio.current_time(), audible=False)
-            here.link.kick()
+            here.another_asks(Opcode.RESET_SESSIONS, heard=False)
+            here.another_asks(Opcode.OPEN_FILE_RO, root + b"/theirs", heard=False)
             await trio.sleep(0.3)
-            wire = request(30_100, Opcode.TERMINATE_SESSION, session=0).encode()
-            here.vehicle.foreign_request(wire, STRANGER, trio.current_time())
-            here.link.kick()
+            here.another_asks(Opcode.TERMINATE_SESSION)
 
         nursery.start_soon(rival)
         got = first + bytes(await file.read(1000, 299_000))

@@ -94,7 +94,6 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str) ->
             here.vehicle.reboot(now, downtime=2.7)
             here.vehicle._next_beat = now + 4.2
             replace(here)
-            here.link.kick()
 
         await trio.sleep(10)
         nursery.start_soon(reboot)
@@ -121,7 +120,6 @@ async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int | 
             here.vehicle.reboot(trio.current_time(), downtime=4.0)
             if size:
                 replace(here, NEW[:size])
-            here.link.kick()
 
         nursery.start_soon(reboot)
         if size:

@@ -13,9 +13,8 @@ import trio
 
 from mavftpfs.client.connect import _list_root
 from mavftpfs.client.options import Options
-from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
-from mavftpfs.protocol.payload import Opcode, decode_request, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN, OtherClients
 from mavftpfs.session.scheduler import Scheduler, SessionUser
@@ -123,7 +122,6 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str) -> Non
         assert await read_file(connection, path(profile, "small")) == b"hello"
         assert connection.engine.traits.ack_carries_own_session is not None
         here.vehicle.reboot(trio.current_time(), downtime=1.0)
-        here.link.kick()
         await trio.sleep(3)
         assert connection.vehicle.reboots == 1
         assert connection.engine.traits.ack_carries_own_session is None
@@ -141,7 +139,7 @@ async def test_a_session_left_by_a_killed_client_is_got_over(profile: str) -> No
             await begin_to_read(connection, path(profile, "big"), 1000)
             here.link.cut()  # so that the farewell does not arrive: kill -9
     here.link.restore()
-    async with here.connected(seed=4) as connection:
+    async with here.connected(seed=7) as connection:  # which asks for another session id
         assert await read_file(connection, path(profile, "big")) == data
         assert connection.engine.stats.by_opcode[Opcode.RESET_SESSIONS] == 0
 
@@ -277,8 +275,6 @@ async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(profile:
 
 # --- a session that is taken
 
-RIVAL = Address(255, 190)
-RIVALS_SESSION = 77
 LINK = LinkSettings(delay=0.02)
 SLOW = LinkSettings(rate=20_000.0, delay=0.02)
 DATA = content(60_000, 1)
@@ -288,56 +284,15 @@ CHECK_PERIOD = STALL / 2
 """How often a reading looks whether it stalled."""
 
 
-class Log:
-    """When the server was asked what by us, and what it should do after that."""
-
-    def __init__(self, here: Rig, *, after: Callable[[int], None] = lambda opcode: None) -> None:
-        self.asked: list[tuple[float, int]] = []
-        self._handle = here.server.handle
-        self._after = after
-        here.server.handle = self._take  # type: ignore[method-assign]
-
-    def _take(self, wire: bytes, source: Address, now: float) -> None:
-        self._handle(wire, source, now)
-        if source.system == 254:
-            opcode = decode_request(wire).opcode
-            self.asked.append((now, opcode))
-            self._after(opcode)
-
-    def count(self, opcode: Opcode) -> int:
-        return sum(asked == opcode for _, asked in self.asked)
-
-    def last(self, opcode: Opcode) -> float:
-        return max(now for now, asked in self.asked if asked == opcode)
-
-    @property
-    def silences(self) -> list[float]:
-        return [later - earlier for (earlier, _), (later, _) in pairwise(self.asked)]
-
-
-def rival_asks(here: Rig, opcode: Opcode, data: bytes = b"", *, seq: int, heard: bool = True) -> None:
-    """Let another client of the vehicle ask something, so that we hear it on our link or not."""
-    opens = opcode in (Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE)
-    session = RIVALS_SESSION if opens or here.profile.startswith("ardupilot") else 0
-    wire = request(seq, opcode, session=session, size=100 if not data else len(data), data=data).encode()
-    now = trio.current_time()
-    if heard:
-        here.vehicle.foreign_request(wire, RIVAL, now)
-    else:
-        here.server.handle(wire, RIVAL, now)
-    here.link.kick()
-
-
 @pytest.mark.holds("fault stale session", "rule 14.10")
 async def test_a_killed_clients_session_is_got_over_by_saying_nothing() -> None:
     """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
     here = Rig("ardupilot", {b"/d/f": DATA, b"/d/stale": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
-        rival_asks(here, Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), seq=5, heard=False)
+        here.another_asks(Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), heard=False)
         await trio.sleep(0.1)
         assert here.server.open_sessions == 1
         connection.scheduler.server.others = OtherClients()  # its answer went to its own link
-        log = Log(here)
 
         async def list_often() -> None:
             while True:
@@ -347,9 +302,10 @@ async def test_a_killed_clients_session_is_got_over_by_saying_nothing() -> None:
         nursery.start_soon(_tolerate_refusals, list_often)
         assert await read_file(connection, path("ardupilot", "f")) == DATA
         nursery.cancel_scope.cancel()
-    assert log.count(Opcode.RESET_SESSIONS) == 0
-    assert sum(silence > SILENCE_ARDUPILOT - 0.1 for silence in log.silences) == 1
-    assert log.count(Opcode.OPEN_FILE_RO) == 2
+    assert here.count(Opcode.RESET_SESSIONS) == 0
+    silences = [later - earlier for (earlier, _), (later, _) in pairwise(here.faults.asked)]
+    assert sum(silence > SILENCE_ARDUPILOT - 0.1 for silence in silences) == 1
+    assert here.count(Opcode.OPEN_FILE_RO) == 2
 
 
 async def _tolerate_refusals(work: Callable[[], object]) -> None:
@@ -371,13 +327,12 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
-        log = Log(here)
-        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
 
         async def rival_reads() -> None:
-            for seq in range(100, 2000, 2):
+            while True:
                 await trio.sleep(1.0)
-                rival_asks(here, Opcode.READ_FILE, seq=seq)
+                here.another_asks(Opcode.READ_FILE)
 
         nursery.start_soon(rival_reads)
         await trio.sleep(2.0)
@@ -387,8 +342,7 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
         assert trio.current_time() - began == pytest.approx(DEFAULTS.op_deadline, abs=1.0)
         await trio.sleep(3.0)
         assert here.server.open_paths == [path(profile, "theirs")]
-        asked = (Opcode.OPEN_FILE_RO, Opcode.RESET_SESSIONS, Opcode.TERMINATE_SESSION)
-        assert sum(map(log.count, asked)) == 0
+        assert here.count(Opcode.OPEN_FILE_RO, Opcode.RESET_SESSIONS, Opcode.TERMINATE_SESSION) == 0
         nursery.cancel_scope.cancel()
 
 
@@ -398,16 +352,15 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
 async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(closes: bool, profile: str) -> None:
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection:
-        log = Log(here)
-        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
         await trio.sleep(4.0)
-        rival_asks(here, Opcode.READ_FILE, seq=7)
+        here.another_asks(Opcode.READ_FILE)
         done = trio.current_time()
         if closes:
             await trio.sleep(1.0)
-            rival_asks(here, Opcode.TERMINATE_SESSION, seq=9)
+            here.another_asks(Opcode.TERMINATE_SESSION)
         assert await read_file(connection, path(profile, "f")) == DATA
-        opened = next(now for now, opcode in log.asked if opcode == Opcode.OPEN_FILE_RO)
+        (opened,) = here.faults.times(Opcode.OPEN_FILE_RO)
         assert opened - done == pytest.approx(1.0 if closes else LEFT_OPEN, abs=0.2)
 
 
@@ -419,9 +372,9 @@ async def test_another_clients_open_of_nothing_leaves_what_was_open(reads: bool,
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection:
         if reads:
-            rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+            here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
             await trio.sleep(0.5)
-        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "nothing"), seq=7)
+        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "nothing"))
         await trio.sleep(0.5)
         began = trio.current_time()
         assert await read_file(connection, path(profile, "f")) == DATA
@@ -440,13 +393,13 @@ async def test_a_session_that_another_client_took_is_its_own(profile: str, ours:
         else:
             nursery.start_soon(put, connection, path(profile, "new"), DATA)
             await trio.sleep(1.0)
-        rival_asks(here, Opcode.CREATE_FILE, path(profile, "its"), seq=5)
+        here.another_asks(Opcode.CREATE_FILE, path(profile, "its"))
         await trio.sleep(1.0)
         spoilt = here.data(b"/d/its")
         await trio.sleep(7.0)
         assert path(profile, "its") in here.server.open_paths
         assert here.data(b"/d/its") == spoilt
-        rival_asks(here, Opcode.TERMINATE_SESSION, seq=7)
+        here.another_asks(Opcode.TERMINATE_SESSION)
         if ours == "reading":
             assert await sink.wait_for(0, len(DATA)) == DATA
     if ours == "writing":
@@ -459,33 +412,29 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
     """Meanwhile the session of a PX4, which all share, may have become another client's."""
     here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, SLOW)
     async with here.connected() as connection:
-        log = Log(here)
         _, sink = await begin_to_read(connection, path("px4", "f"), 10_000)
         here.link.cut()
         await trio.sleep(0.2)
-        rival_asks(here, Opcode.TERMINATE_SESSION, seq=5, heard=False)
-        rival_asks(here, Opcode.OPEN_FILE_RO, path("px4", "theirs"), seq=7, heard=False)
+        here.another_asks(Opcode.TERMINATE_SESSION, heard=False)
+        here.another_asks(Opcode.OPEN_FILE_RO, path("px4", "theirs"), heard=False)
         assert here.server.open_paths == [path("px4", "theirs")]
         assert outage > STALL + CHECK_PERIOD
         await trio.sleep(outage)
         here.link.restore()
         assert await sink.wait_for(0, len(DATA)) == DATA
-        assert log.count(Opcode.OPEN_FILE_RO) == 2
+        assert here.count(Opcode.OPEN_FILE_RO) == 2
 
 
 @pytest.mark.holds("fault idle close")
 async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end() -> None:
     here = Rig("px4", {b"/d/f": DATA}, LINK)
-
-    def close_at_once(opcode: int) -> None:
-        if opcode == Opcode.OPEN_FILE_RO:
-            rival_asks(here, Opcode.TERMINATE_SESSION, seq=60_000 + len(log.asked), heard=False)
-
     async with here.connected() as connection:
-        log = Log(here, after=close_at_once)
+        here.faults.at(
+            Opcode.READ_FILE, lambda: here.another_asks(Opcode.TERMINATE_SESSION, heard=False), times=10_000
+        )
         with trio.fail_after(100), pytest.raises(SessionLost):
             await read_file(connection, path("px4", "f"))
-        assert log.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
+        assert here.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
 
 
 @pytest.mark.holds("promise 5", "fault idle close")
@@ -493,7 +442,6 @@ async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end() -> None
 async def test_a_server_that_closed_an_idle_session_during_an_outage(profile: str, outage: float) -> None:
     here = Rig(profile, {b"/d/f": DATA}, SLOW)
     async with here.connected() as connection:
-        log = Log(here)
         _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
         here.link.cut()
         await trio.sleep(outage)
@@ -503,7 +451,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(profile: st
         here.link.restore()
         assert await sink.wait_for(0, len(DATA)) == DATA
         assert sink.suspicions == []
-        assert log.count(Opcode.OPEN_FILE_RO) == 2
+        assert here.count(Opcode.OPEN_FILE_RO) == 2
 
 
 @pytest.mark.holds("rule 14.12", "fault growing file")
@@ -513,16 +461,15 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(shrinks: b
     """It is opened again for more. What is smaller then is another file."""
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
-        log = Log(here)
         sink = MemorySink(len(DATA))
         reader = await connection.store.open_reader(path(profile, "f"), sink)
         for offset in (0, 20_000):
             reader.want(offset, offset + 1000, demand=True)
             await sink.wait_for(offset, offset + 1000)
             await trio.sleep(1.0)
-        assert log.count(Opcode.TERMINATE_SESSION) == 0
+        assert here.count(Opcode.TERMINATE_SESSION) == 0
         await trio.sleep(5.0)
-        assert log.last(Opcode.TERMINATE_SESSION) - log.last(Opcode.READ_FILE) < 2.0
+        assert here.faults.times(Opcode.TERMINATE_SESSION)[-1] - here.faults.times(Opcode.READ_FILE)[-1] < 2.0
         assert here.server.open_sessions == 0
         if shrinks:
             here.put(b"/d/f", OTHER[:50_000])
@@ -533,7 +480,7 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(shrinks: b
             assert sink.have.total == 2000
         else:
             assert await sink.wait_for(40_000, 41_000) == DATA[40_000:41_000]
-        assert log.count(Opcode.OPEN_FILE_RO) == 2
+        assert here.count(Opcode.OPEN_FILE_RO) == 2
         await trio.sleep(5.0)
         assert here.server.open_sessions == 0
 
@@ -543,13 +490,11 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(shrinks: b
 async def test_in_flight_a_file_that_nobody_has_open_is_closed_at_once(profile: str) -> None:
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
-        log = Log(here)
         reader, sink = await begin_to_read(connection, path(profile, "f"), 1000)
         await sink.wait_for(0, 1000)
-        here.vehicle.arm()
-        here.link.kick()
+        await here.arm()
         await trio.sleep(0.5)
-        assert log.count(Opcode.TERMINATE_SESSION) == 0, "it is still open here"
+        assert here.count(Opcode.TERMINATE_SESSION) == 0, "it is still open here"
         reader.close()
         await trio.sleep(0.5)
         assert here.server.open_sessions == 0
@@ -560,15 +505,12 @@ async def test_two_silences_prove_that_listings_show_no_times() -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
     here = Rig("mavsdk-old", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
-        log = Log(here)
         for known in (None, False, False):
             assert await _listed(connection) == [b"f"]
             assert connection.engine.traits.lists_times is known
-        asked = [opcode for _, opcode in log.asked]
-        assert asked[-1] == Opcode.LIST_DIRECTORY
-        times = [now for now, opcode in log.asked if opcode == Opcode.LIST_DIRECTORY_WITH_TIME]
-        plain = [now for now, opcode in log.asked if opcode == Opcode.LIST_DIRECTORY]
-        assert times[-1] < plain[-3]
+        assert here.faults.requests[-1] == Opcode.LIST_DIRECTORY
+        plain = here.faults.times(Opcode.LIST_DIRECTORY)
+        assert here.faults.times(Opcode.LIST_DIRECTORY_WITH_TIME)[-1] < plain[-3]
         assert plain[-1] - plain[0] < 2 * TIME_PROBE_LIMIT
 
 
@@ -618,11 +560,10 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often() -> 
     options = ConnectOptions(op_deadline=20.0)
     async with here.connected(options) as connection, trio.open_nursery() as nursery:
         await open_elsewhere(connection)
-        wire = request(77, Opcode.NONE, session=others_session(connection)).encode()
 
         async def keep_in_use() -> None:
             while True:
-                here.server.handle(wire, Address(255, 190), trio.current_time())
+                here.another_asks(Opcode.NONE, session=others_session(connection), heard=False)
                 await trio.sleep(1)
 
         nursery.start_soon(keep_in_use)

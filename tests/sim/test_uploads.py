@@ -18,12 +18,12 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
+from tests.support.faults import STATION
 from tests.support.rigs import Rig, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySource, content, know, path, read_file, start, under_way
 
 EVERY_PROFILE = sorted(PROFILES)
-STRANGER = Address(255, 190)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
@@ -62,21 +62,19 @@ async def cut(here: Rig, connection: Connection, length: float) -> None:
 
 async def reboot(here: Rig, connection: Connection) -> None:
     here.vehicle.reboot(trio.current_time(), downtime=4.0)
-    here.link.kick()
 
 
 async def take_session(here: Rig, connection: Connection) -> None:
     """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
-    for source in (STRANGER, connection.vehicle.own):
+    for source in (STATION, connection.vehicle.own):
         steal(here, connection, source)
-    here.link.kick()
 
 
-def steal(here: Rig, connection: Connection, source: Address = STRANGER) -> None:
+def steal(here: Rig, connection: Connection, source: Address = STATION) -> None:
     """Have the session terminated; nobody hears it."""
     session = connection.scheduler.server.session
     wire = request(77, Opcode.TERMINATE_SESSION, session=session.id if session else 0).encode()
-    here.server.handle(wire, source, trio.current_time())
+    here.vehicle.foreign_request(wire, source, trio.current_time(), audible=False)
 
 
 INTERRUPTIONS: dict[str, Callable[[Rig, Connection], Awaitable[None]]] = {
@@ -120,7 +118,6 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(profile: s
         await trio.sleep(5)
         async with under_way(connection, profile, data):
             here.vehicle.reboot(trio.current_time(), beat_after=0.9)
-            here.link.kick()
             began = trio.current_time()
         assert connection.vehicle.reboots == 1
         assert trio.current_time() - began < 9
@@ -146,9 +143,7 @@ async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session() -
 
     server.outgoing = without_errno  # type: ignore[method-assign]
     async with here.connected() as connection, under_way(connection, "px4", data) as source:
-        wire = request(77, Opcode.RESET_SESSIONS).encode()
-        server.handle(wire, Address(255, 190), trio.current_time())
-        here.link.kick()
+        here.another_asks(Opcode.RESET_SESSIONS, heard=False)
     assert refused
     assert source.all_proven
     assert here.data(b"/d/new") == data
@@ -230,7 +225,6 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
             nursery.start_soon(finish_other)
             await trio.sleep(1.5)
             here.vehicle.arm()
-            here.link.kick()
             began = trio.current_time()
         assert trio.current_time() - began < 1
         await trio.sleep(0.5)
@@ -245,13 +239,11 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
         await trio.sleep(20)
         assert len(here.data(b"/d/new")) == written
         here.vehicle.disarm()
-        here.link.kick()
         await trio.sleep(20)  # by itself
         assert source.acked.total + source.proven.total == len(data)
         await upload.finish()
         assert source.all_proven
         here.vehicle.arm()
-        here.link.kick()
         await trio.sleep(0.5)
         source.add(b"more")
         with pytest.raises(Armed):
@@ -278,7 +270,6 @@ async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
         nursery.start_soon(read_file, connection, path("px4", "f"))
         await trio.sleep(1.0)
         here.vehicle.arm()
-        here.link.kick()
         await trio.sleep(0.2)
         assert connection.scheduler.server.session is None
 
@@ -350,9 +341,7 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool) -
         if probed:
             know(connection, "mavsdk")
         async with under_way(connection, "mavsdk", data) as source:
-            listing = request(9, Opcode.LIST_DIRECTORY, data=b"/").encode()
-            here.vehicle.foreign_request(listing, Address(255, 190), trio.current_time())
-            here.link.kick()
+            here.another_asks(Opcode.LIST_DIRECTORY, b"/")
             await trio.sleep(0.2)
             here.link.cut()
             await trio.sleep(3)

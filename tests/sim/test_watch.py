@@ -96,23 +96,15 @@ class Day:
     def put(self, name: str, data: bytes, mtime: int | None = None) -> None:
         self.rig.card.add(self.place + b"/" + name.encode(), data, mtime)
 
-    def arm(self) -> None:
-        self.vehicle.arm()
-        self.rig.link.kick()
-
-    def disarm(self) -> None:
-        self.vehicle.disarm()
-        self.rig.link.kick()
-
     async def fly(self, name: str, data: bytes, *, logs_on: float = 0.0) -> None:
         """Fly for half a minute, and log meanwhile; logs_on: seconds that it does after disarming."""
-        self.arm()
+        self.vehicle.arm()
         for second in range(1, 31):
             self.put(name, data[: len(data) * second // 60])
             await trio.sleep(1.0)
         if not logs_on:
             self.put(name, data)
-        self.disarm()
+        self.vehicle.disarm()
         if logs_on:
             for second in range(1, 31):
                 await trio.sleep(logs_on / 30)
@@ -196,12 +188,12 @@ async def test_a_transfer_lets_go_within_a_second(tmp_path: Path, profile: str, 
         assert day.rig.link.vehicle.server.open_sessions == 1
         match how:
             case "armed":
-                day.arm()
+                day.vehicle.arm()
             case "denied":
                 day.vehicle.say(3, "Arming denied: high throttle")
             case "refused":
                 day.vehicle._ready.append(day.vehicle.framer.encode("command_ack", 400, 4, 0, 0, 255, 190))
-        day.rig.link.kick()
+        day.vehicle.on_news()
         await trio.sleep(1.0)
         asked = day.requests
         assert day.rig.link.vehicle.server.open_sessions == 0
@@ -211,7 +203,7 @@ async def test_a_transfer_lets_go_within_a_second(tmp_path: Path, profile: str, 
         if how == "armed":
             await trio.sleep(100.0)
             assert day.requests == asked
-            day.disarm()
+            day.vehicle.disarm()
         await day.until("is here, verified")
     assert day.logs() == {"1.ulg": content(150_000)}
     assert day.saying("begins, 150.0 kB, from ") == 1
@@ -222,7 +214,6 @@ async def test_a_warning_before_arming_is_no_refusal(day: Day) -> None:
     async with day.watched():
         await day.until("begins")
         day.vehicle.say(4, "PreArm: Compass not calibrated")
-        day.rig.link.kick()
         await day.until("is here, verified")
     assert day.saying("waits") == 0
 
@@ -306,9 +297,9 @@ async def test_a_log_that_was_moved_away_stays_away(tmp_path: Path, profile: str
     (day.home / "1.ulg").unlink()
     async with day.watched(again=again):
         await trio.sleep(100.0)
-        day.arm()
+        day.vehicle.arm()
         await trio.sleep(10.0)
-        day.disarm()
+        day.vehicle.disarm()
         await trio.sleep(100.0)
     assert day.saying("is here, verified") == 1 + again
     assert (day.logs() != {}) is again

@@ -9,6 +9,9 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, Payload, decode_request
 from mavftpfs.sim.vehicle import FtpServer
 
+STATION = Address(255, 190)
+"""Another client of the vehicle, whose requests do not count."""
+
 _OPCODE, _SIZE, _REQ_OPCODE = 3, 4, 5
 _TAKING = (Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME)
 
@@ -41,7 +44,8 @@ class Faults:
     file nor one below it is open (promise 6).
 
     Attributes:
-        requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
+        requests: opcodes of ours that reached the server so far. asked: the same with their times.
+        refused: opcodes of requests that were NAKed.
         spoil: in so many more WriteFiles the first byte arrives as another one.
         orphans: files may be open that we cannot close: copies of requests come late, or the server gives
             its sessions numbers of its own, and the ACK of an open was lost.
@@ -49,6 +53,7 @@ class Faults:
 
     def __init__(self, server: FtpServer) -> None:
         self.requests: list[int] = []
+        self.asked: list[tuple[float, int]] = []
         self.refused: list[int] = []
         self._cut_after: int | None = None
         self._lose: list[int] = []
@@ -114,6 +119,10 @@ class Faults:
         self._meetings.clear()
         self._repeated.clear()
 
+    def times(self, opcode: Opcode) -> list[float]:
+        """Return when requests of this kind came."""
+        return [now for now, asked in self.asked if asked == opcode]
+
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         self._execute(wire, source, now)
         if len(self.requests) in self._repeated:
@@ -124,7 +133,9 @@ class Faults:
         if self._is_cut() or wire[_OPCODE] in self._deaf:
             return
         self._require_closed(wire)
-        self.requests.append(wire[_OPCODE])
+        if source != STATION:
+            self.requests.append(wire[_OPCODE])
+            self.asked.append((now, wire[_OPCODE]))
         self._counted.pop(len(self.requests), lambda: None)()
         met = [meeting for meeting in self._meetings if meeting.comes(wire[_OPCODE])]
         self._meetings = [meeting for meeting in self._meetings if not meeting.over]

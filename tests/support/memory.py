@@ -37,6 +37,7 @@ class MemoryLink:
         self._time = float("-inf")
         self._closed = False
         self._changed = trio.Event()
+        vehicle.on_news = self.kick
         vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
 
     @property
@@ -106,7 +107,7 @@ class MemoryLink:
         await trio.lowlevel.checkpoint()
 
     def kick(self) -> None:
-        """Look again: the vehicle was changed from outside (armed, rebooted, asked by somebody else)."""
+        """Look again at the vehicle, and at what is on its way."""
         self._notify()
 
     def _take(self) -> list[bytes]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
+from itertools import count
 from random import Random
 from typing import Any
 
@@ -24,7 +25,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import subscribe
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
@@ -32,7 +33,7 @@ from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family, Storage
 from mavftpfs.sim.tree import Kind, MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
-from tests.support.faults import Faults
+from tests.support.faults import STATION, Faults
 from tests.support.lying import LyingServer
 from tests.support.memory import MemoryLink
 from tests.support.transfers import ROOTS
@@ -88,6 +89,7 @@ class Rig:
         self.model = LinkModel(Random(seed + 1), link)
         self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []
+        self._numbers = count(30_000, 10)  # so far apart that no server takes one for the one before
         self.connection: Connection
         self.nursery: trio.Nursery
         self.card.add_directory(self.root or b"/")
@@ -209,13 +211,11 @@ class Rig:
     async def arm(self) -> None:
         """Have the vehicle armed, and wait until that is known."""
         self.vehicle.arm()
-        self.link.kick()
         await self._until(lambda: self.connection.vehicle.armed)
 
     async def disarm(self) -> None:
         """Have it disarmed, and wait until that is known."""
         self.vehicle.disarm()
-        self.link.kick()
         await self._until(lambda: not self.connection.vehicle.armed)
 
     async def reboot(self) -> None:
@@ -223,8 +223,20 @@ class Rig:
         await trio.sleep(5.0)  # a boot time has to go back by some seconds to tell of a restart
         before = self.connection.vehicle.reboots
         self.vehicle.reboot(trio.current_time())
-        self.link.kick()
         await self._until(lambda: self.connection.vehicle.reboots > before)
+
+    def another_asks(
+        self, opcode: Opcode, data: bytes = b"", *, session: int | None = None, heard: bool = True
+    ) -> None:
+        """Have another client of the vehicle ask something.
+
+        session: None for its own. heard: we hear what it asks; its answers we hear in any case.
+        """
+        if session is None:
+            session = 77 if PROFILES[self.profile].family is Family.ARDUPILOT else 0
+        size = 100 if opcode is Opcode.READ_FILE else None
+        asked = request(next(self._numbers), opcode, session=session, data=data, size=size)
+        self.vehicle.foreign_request(asked.encode(), STATION, trio.current_time(), audible=heard)
 
     async def _until(self, done: Callable[[], bool]) -> None:
         for _ in range(600):
