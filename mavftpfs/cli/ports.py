@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
-import socket
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +12,7 @@ from typing import Any
 
 from mavftpfs.client.status import said_of_double
 from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
-from mavftpfs.link.rendezvous import hubs
+from mavftpfs.link.rendezvous import Busy, hubs, knock_at
 from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount import daemon
@@ -68,7 +66,7 @@ def _stop(args: argparse.Namespace) -> int:
         for line in status_lines(facts):
             print(printable(line))
     if cut and not args.force:
-        raise UsageError("that would be cut (mounts start a new hub); --force does it")
+        raise UsageError("that would be cut (mounts open the port again); --force does it")
     for path, _ in found:
         _ask(path, {"stop": True})
     if not found:
@@ -113,10 +111,12 @@ def _hubs(source: str | None, request: Facts) -> Iterator[tuple[Path, Status]]:
 
 def _ask(path: Path, request: Facts) -> Status | None:
     """Return the reply of the hub behind a door; None if there is no hub, but perhaps a program alone."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock, suppress(OSError):
-        sock.settimeout(PATIENCE)
-        sock.connect(os.fspath(path))
-        sock.send(pack_facts({"protocol": PROTOCOL, **request}))
-        reply = unpack_facts(sock.recv(1 << 16))
-        return reply if reply is not None and "refused" not in reply else None
+    with suppress(OSError, Busy):
+        sock = knock_at(path)
+        if sock is not None:
+            with sock:
+                sock.settimeout(PATIENCE)
+                sock.send(pack_facts({"protocol": PROTOCOL, **request}))
+                reply = unpack_facts(sock.recv(1 << 16))
+            return reply if reply is not None and "refused" not in reply else None
     return None

@@ -143,10 +143,7 @@ class Hub:
 
     async def _accept(self, nursery: trio.Nursery) -> None:
         while True:
-            await self._door.knocked()
-            sock = self._door.accept()
-            if sock is not None:
-                nursery.start_soon(self._serve, sock, nursery)
+            nursery.start_soon(self._serve, await self._door.accept(), nursery)
 
     async def _serve(self, sock: socket.socket, nursery: trio.Nursery) -> None:
         """Answer one connection: a client that stays, or a question."""

@@ -1,4 +1,4 @@
-"""What a link is to the layers above, and what links share. Layer: link.
+"""What a link is to the layers above, and what links have in common. Layer: link.
 
 A link moves bytes and does not interpret them. When a peer goes away and comes back, the link reopens by
 itself and counts it. LinkClosed means that it will never work again.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ import trio
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
+from mavftpfs.shared.errors import LinkClosed
 
 MAX_DATAGRAM = 1400
 """Bytes: below any usual MTU, and far below PX4's receive buffer (31 frames in one datagram were cut)."""
@@ -181,6 +182,118 @@ class Outbox:
         self._items.clear()
         self.size = 0
         return count
+
+
+class DescriptorLink:
+    """What links over a descriptor have in common: they wait for it, and keep what the kernel does not take.
+
+    Args:
+        outbox_limit: bytes to keep for a slow peer.
+    """
+
+    is_stream = False
+    is_serial = False
+
+    def __init__(self, description: str, outbox_limit: int) -> None:
+        self.stats = LinkStats()
+        self.seat: Seat | None = None
+        self.description = description
+        self._outbox = Outbox(outbox_limit)
+        self._work = trio.Event()
+        self._closed = False
+
+    @property
+    def backlog(self) -> int:
+        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        return self._outbox.size
+
+    async def receive(self) -> list[bytes]:
+        """See Link."""
+        await trio.lowlevel.checkpoint_if_cancelled()
+        waited = False
+        while not self._closed:
+            pieces = self._drain()
+            if pieces is not None:
+                if not waited:  # one checkpoint per batch, and none where data could be lost
+                    await trio.lowlevel.cancel_shielded_checkpoint()
+                return pieces
+            if self._closed:
+                break
+            waited = True
+            with suppress(trio.ClosedResourceError, OSError):  # closed or replaced meanwhile; look again
+                await self._wait_readable()
+        raise LinkClosed(f"{self.description} is closed")
+
+    def answer(self, address: NetAddress) -> None:
+        """Nothing to choose."""
+
+    def keep_peer(self) -> None:
+        """Nothing to do."""
+
+    def focus(self, system: int) -> None:
+        """Nothing to leave out."""
+
+    async def run_writer(self) -> None:
+        """Send what had to wait for the kernel; runs until cancelled."""
+        while True:
+            await self._work.wait()
+            self._work = trio.Event()
+            while not self._closed and (item := self._outbox.head()) is not None:
+                taken = self._write(item)
+                if taken and self._outbox.head() is item:  # a pipe that broke has emptied the outbox
+                    self._outbox.advance(taken)
+                if taken < len(item):
+                    with suppress(trio.ClosedResourceError, OSError):
+                        await self._wait_writable()
+
+    def _keep(self, item: bytes, *, force: bool = False) -> None:
+        """Keep what the kernel did not take; drop and count it where there is no room."""
+        if self._outbox.offer(item, force=force):
+            self._work.set()
+        else:
+            self.stats.dropped_sends += 1
+
+    def _drain(self) -> list[bytes] | None:
+        """Return what is there: None for nothing, an empty list where the link was reopened. It may find that
+        the link is closed."""
+        raise NotImplementedError
+
+    def _write(self, item: bytes) -> int:
+        """Hand an item to the kernel; return how many bytes it took. What is lost counts as taken."""
+        raise NotImplementedError
+
+    async def _wait_readable(self) -> None:
+        """Wait until there is something to take, or the descriptor is closed."""
+        raise NotImplementedError
+
+    async def _wait_writable(self) -> None:
+        """Wait until the kernel has room, or the descriptor is closed."""
+        raise NotImplementedError
+
+
+class SocketLink(DescriptorLink):
+    """A link over one socket of whole messages, which is never replaced."""
+
+    def __init__(self, sock: socket.socket, description: str, outbox_limit: int) -> None:
+        super().__init__(description, outbox_limit)
+        self._sock = sock
+
+    async def aclose(self) -> None:
+        """Close; what the kernel has not taken by now is lost."""
+        self._close()
+        await trio.lowlevel.checkpoint()
+
+    def _close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            trio.lowlevel.notify_closing(self._sock)
+            self._sock.close()
+
+    async def _wait_readable(self) -> None:
+        await trio.lowlevel.wait_readable(self._sock)
+
+    async def _wait_writable(self) -> None:
+        await trio.lowlevel.wait_writable(self._sock)
 
 
 @asynccontextmanager

@@ -18,8 +18,9 @@ from typing import Any
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox, Seat
+from mavftpfs.link.base import Seat, SocketLink
 from mavftpfs.link.messages import Address
+from mavftpfs.link.rendezvous import SILENT, Busy
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
@@ -104,7 +105,7 @@ def set_buffers(sock: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What a client wants of a port: the address that it would like, the endpoints for `forward=`, its name
+    """What a program wants of a port: the address that it would like, the endpoints for `forward=`, its name
     for people. beats: it wants only heartbeats."""
 
     own: Address
@@ -112,62 +113,32 @@ class Wish:
     name: str = ""
     beats: bool = False
 
+    @property
+    def needs_hub(self) -> bool:
+        """Whether it wants what only a hub does, even if no other program wants the port."""
+        return self.beats or bool(self.forward)
 
-class HubLink:
-    """Implements link.base.Link by a hub. Made by `join`; run `run` beside it."""
 
-    is_stream = False
+class HubLink(SocketLink):
+    """Implements link.base.Link by a hub. Made by `join`; run `run_writer` beside it.
+
+    Attributes:
+        gone: the hub has ended, or we left it.
+    """
 
     def __init__(self, sock: socket.socket, spec: LinkSpec, welcome: Facts) -> None:
-        self.stats = LinkStats()
-        self.description = spec.description
+        super().__init__(sock, spec.description, _OUTBOX_LIMIT)
         self.is_serial = spec.kind is LinkKind.SERIAL
-        self.seat: Seat | None = Seat(Address(*welcome["own"]), welcome["number"])
+        self.seat = Seat(Address(*welcome["own"]), welcome["number"])
         self.gone = trio.Event()
-        self._sock = sock
         self._senders: list[NetAddress | None] = []
-        self._outbox = Outbox(_OUTBOX_LIMIT)
-        self._work = trio.Event()
         self._reopened = False
-        self._closed = False
-
-    @property
-    def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
-        return self._outbox.size
-
-    async def receive(self) -> list[bytes]:
-        """Wait for frames and return them, as they came together; an empty list says that the port was
-        reopened.
-
-        Raises:
-            LinkClosed: the hub is gone, or aclose was called.
-        """
-        await trio.lowlevel.checkpoint_if_cancelled()
-        waited = False
-        while True:
-            pieces = self._drain()
-            if pieces or self._reopened:
-                self._reopened = self._reopened and bool(pieces)
-                if not waited:
-                    await trio.lowlevel.cancel_shielded_checkpoint()
-                return pieces
-            if self._closed:
-                raise LinkClosed(f"{self.description}: the hub is gone")
-            waited = True
-            try:
-                await trio.lowlevel.wait_readable(self._sock)
-            except trio.ClosedResourceError:
-                continue
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Hand frames to the hub; drop and count what cannot be kept."""
         for message in pack_frames(frames):
-            if self._closed or (self._outbox.size and not self._outbox.offer(message)):
-                self.stats.dropped_sends += 1
-            elif not self._outbox.size and not self._send(message):
-                self._outbox.offer(message, force=True)
-                self._work.set()
+            if self._outbox.size or not self._write(message):
+                self._keep(message)
 
     def sender(self, index: int) -> NetAddress | None:
         """Return the network address that a piece of the last batch came from."""
@@ -176,9 +147,6 @@ class HubLink:
     def answer(self, address: NetAddress) -> None:
         """From now on the hub sends our frames to this address."""
         self.tell({"answer": address})
-
-    def keep_peer(self) -> None:
-        """Nothing to do: the hub hears its peers itself."""
 
     def focus(self, system: int) -> None:
         """Have the hub leave out what concerns only other systems."""
@@ -191,75 +159,66 @@ class HubLink:
     def tell(self, facts: Facts) -> None:
         """Send a request that needs no answer."""
         message = pack_facts(facts)
-        if self._outbox.size or not self._send(message):
-            self._outbox.offer(message, force=True)
-            self._work.set()
+        if self._outbox.size or not self._write(message):
+            self._keep(message, force=True)
 
-    async def run(self) -> None:
-        """Send what had to wait; runs until cancelled."""
-        while True:
-            await self._work.wait()
-            self._work = trio.Event()
-            while not self._closed and (message := self._outbox.head()) is not None:
-                if self._send(message):
-                    self._outbox.advance(len(message))
-                    continue
-                try:
-                    await trio.lowlevel.wait_writable(self._sock)
-                except trio.ClosedResourceError:
-                    return
+    def _close(self) -> None:
+        super()._close()
+        self.gone.set()
 
-    async def aclose(self) -> None:
-        """Leave the hub."""
-        self._end()
-        await trio.lowlevel.checkpoint()
-
-    def _end(self) -> None:
-        if not self._closed:
-            self._closed = True
-            trio.lowlevel.notify_closing(self._sock)
-            self._sock.close()
-            self.gone.set()
-
-    def _drain(self) -> list[bytes]:
+    def _drain(self) -> list[bytes] | None:
+        if self._reopened:
+            self._reopened = False
+            return []
         pieces: list[bytes] = []
         senders: list[NetAddress | None] = []
         for _ in range(_MAX_MESSAGES):
-            if self._closed:
+            message = self._next()
+            if message is None:
                 break
-            try:
-                message = self._sock.recv(_RECEIVE_SIZE)
-            except BlockingIOError:
-                break
-            except OSError:
-                message = b""
-            if not message:
-                self._end()
-            elif message[:1] == _FRAMES:
+            if message[:1] == _FRAMES:
                 tag, piece = unpack_frames(message)
                 pieces.append(piece)
                 senders.append(_address_of(tag))
             elif (unpack_facts(message) or {}).get("reopened"):
-                self._reopened = True
-        if pieces:
-            self._senders = senders
-            self.stats.received_bytes += sum(map(len, pieces))
+                if not pieces:
+                    return []
+                self._reopened = True  # what came before goes first
+                break
+        if not pieces:
+            return None
+        self._senders = senders
+        self.stats.received_bytes += sum(map(len, pieces))
         return pieces
 
-    def _send(self, message: bytes) -> bool:
-        """Return False if there is no room; a hub that is gone takes all."""
+    def _next(self) -> bytes | None:
+        """Return the next message, if there is one; notice that the hub is gone."""
         if self._closed:
-            return True
+            return None
         try:
-            self._sock.send(message)
+            message = self._sock.recv(_RECEIVE_SIZE)
         except BlockingIOError:
-            return False
+            return None
         except OSError:
-            self._end()
-            return True
+            message = b""
+        if not message:
+            self._close()
+        return message or None
+
+    def _write(self, item: bytes) -> int:
+        if self._closed:
+            self.stats.dropped_sends += 1
+            return len(item)
+        try:
+            self._sock.send(item)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            self._close()
+            return len(item)
         self.stats.writes += 1
-        self.stats.sent_bytes += len(message)
-        return True
+        self.stats.sent_bytes += len(item)
+        return len(item)
 
 
 class Refused(LinkClosed):
@@ -275,7 +234,7 @@ async def join(
 
     Raises:
         Refused: and why.
-        LinkClosed: no answer.
+        Busy: no answer.
     """
     hello = {
         "protocol": PROTOCOL,
@@ -300,7 +259,7 @@ async def ask(sock: socket.socket, request: Facts) -> Facts:
 
     Raises:
         Refused: the hub says no.
-        LinkClosed: no answer.
+        Busy: no answer.
     """
     set_buffers(sock)
     message = b""
@@ -313,7 +272,7 @@ async def ask(sock: socket.socket, request: Facts) -> Facts:
         message = b""
     reply = unpack_facts(message)
     if reply is None:
-        raise LinkClosed("the program that has the port does not answer; see: mavftpfs hub")
+        raise Busy(SILENT)
     if "refused" in reply:
         raise Refused(str(reply["refused"]))
     return reply

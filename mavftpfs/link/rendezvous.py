@@ -11,35 +11,62 @@ import errno
 import os
 import socket
 import struct
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import trio
 
-from mavftpfs.shared.private import own_directories, private_directory
+from mavftpfs.shared.errors import LinkClosed
+from mavftpfs.shared.private import MODE, own_directories, private_directory
 
 HUB = ".hub"
 ALONE = ".port"
 """The end of a door's name tells what is behind it: a hub, or a program that has the port alone."""
 
+SILENT = "the program that has the port does not answer; see: mavftpfs hub"
+
 _QUEUE = 64
+_LARGEST = 65536
 _LOCK_PATIENCE = 30.0
-_LOCK_PAUSE = 0.05
+_PAUSE = 0.05
+
+
+class Busy(LinkClosed):
+    """The port is taken. In a moment it may be free, or shared."""
 
 
 def knock(name: str) -> socket.socket | None:
-    """Return a connection to the program that has a port, None if none of ours has."""
+    """Return a connection to the program that has a port, None if none of ours has.
+
+    Raises:
+        Busy: it has the port, and does not answer.
+    """
     for path in [directory / (name + end) for directory in own_directories() for end in (HUB, ALONE)]:
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        sock.setblocking(False)  # the queue of a program that was stopped may be full
-        try:
-            sock.connect(str(path))
-        except OSError:
-            sock.close()
-        else:
-            if peer_uid(sock) == os.getuid():
-                return sock
-            sock.close()
+        sock = knock_at(path)
+        if sock is not None:
+            return sock
+    return None
+
+
+def knock_at(door: Path) -> socket.socket | None:
+    """Return a connection to the program of this user behind a door, None if there is none.
+
+    Raises:
+        Busy: as many programs wait there as can.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    sock.setblocking(False)  # so that a full queue is an error
+    try:
+        sock.connect(os.fspath(door))
+        if peer_uid(sock) == os.getuid():
+            return sock
+    except BlockingIOError as exc:
+        sock.close()
+        raise Busy(SILENT) from exc
+    except OSError:
+        pass  # of a program that was killed
+    sock.close()
     return None
 
 
@@ -69,27 +96,28 @@ class Door:
     def __init__(self, sock: socket.socket, path: Path) -> None:
         self.sock = sock
         self._path = path
-        self._ours = path.lstat().st_ino
+        self._inode: int | None = path.lstat().st_ino
 
     async def knocked(self) -> None:
         """Wait until another program connects."""
         await trio.lowlevel.wait_readable(self.sock)
 
-    def accept(self) -> socket.socket | None:
-        """Return a connection of this user's; None if there is none (any more)."""
-        try:
-            sock, _ = self.sock.accept()
-        except OSError:
-            return None
-        if peer_uid(sock) != os.getuid():
-            sock.close()
-            return None
-        return sock
+    async def accept(self) -> socket.socket:
+        """Return the next connection of this user's."""
+        while True:
+            await self.knocked()
+            sock = self._next()
+            if sock is not None:
+                return sock
+            await trio.sleep(_PAUSE)  # it was another user, or no descriptors are left
 
-    def turn_away(self) -> None:
-        """Close the connections of all programs that wait."""
-        while (sock := self.accept()) is not None:
-            sock.close()
+    def turn_away(self, words: bytes) -> None:
+        """Tell all programs that wait why they cannot come in."""
+        while (sock := self._next()) is not None:
+            with sock, suppress(OSError):
+                sock.setblocking(False)
+                sock.recv(_LARGEST)  # closed with something unread, the kernel would drop our words
+                sock.send(words)
 
     def is_hubs(self) -> None:
         """Make its name say that a hub is behind it."""
@@ -98,53 +126,80 @@ class Door:
         self._path = path
 
     def leave(self) -> None:
-        """Another process has it now: close it here, and leave it at its place."""
-        self._ours = -1
+        """Close it here, and leave it at its place: another process has it now."""
+        self._inode = None
         self.sock.close()
 
     def remove(self) -> None:
-        """Take it out of the file system, and close it."""
+        """Take it out of the file system, unless another program's is there by now, and close it."""
         with suppress(OSError):
-            if self._path.lstat().st_ino == self._ours:  # else it is another program's by now
+            if self._path.lstat().st_ino == self._inode:
                 self._path.unlink()
         self.sock.close()
 
-
-def open_door(name: str) -> Door | None:
-    """Make the door of a port that we have opened; None where there is no place for it."""
-    directory = private_directory(own_directories(), longest_name=len(name) + len(ALONE))
-    if directory is None:
-        return None
-    path = directory / (name + ALONE)
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    mask = os.umask(0o177)
-    try:
-        for left in (path, path.with_suffix(HUB)):
-            left.unlink(missing_ok=True)  # of a program that was killed
-        sock.setblocking(False)
-        sock.bind(str(path))
-        sock.listen(_QUEUE)
-        return Door(sock, path)
-    except OSError:
+    def _next(self) -> socket.socket | None:
+        try:
+            sock, _ = self.sock.accept()
+        except OSError:
+            return None
+        if peer_uid(sock) == os.getuid():
+            return sock
         sock.close()
         return None
-    finally:
-        os.umask(mask)
 
 
-async def only_one(name: str) -> socket.socket:
-    """Wait until no other program is about to open a port; return what keeps others out until it is closed.
+def open_door(name: str) -> Door:
+    """Make the door of a port that we have opened.
+
+    Raises:
+        LinkClosed: there is no place for it.
+    """
+    problem = "no directory is yours alone"
+    for directory in own_directories():
+        if private_directory([directory], longest_name=len(name) + len(ALONE)) is not None:
+            try:
+                return _made_in(directory, name)
+            except OSError as exc:
+                problem = f"{directory}: {exc.strerror}"
+    remedy = "set XDG_RUNTIME_DIR to a directory that only you can read"
+    raise LinkClosed(f"no place for the hub's socket ({problem}); {remedy}")
+
+
+def _made_in(directory: Path, name: str) -> Door:
+    path = directory / (name + ALONE)
+    for left in (path, path.with_suffix(HUB)):
+        left.unlink(missing_ok=True)  # of a program that was killed
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.setblocking(False)
+        sock.bind(os.fspath(path))
+        path.chmod(MODE)  # before it listens; the umask would be that of all threads
+        sock.listen(_QUEUE)
+        return Door(sock, path)
+    except BaseException:
+        sock.close()
+        raise
+
+
+@asynccontextmanager
+async def only_one(name: str) -> AsyncIterator[None]:
+    """Keep other programs from opening a port for the length of the body; waits until no other one does so.
 
     It is a name in the abstract namespace, so it goes away with its process. After a long wait we go on:
     then the port itself decides.
     """
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    deadline = trio.current_time() + _LOCK_PATIENCE
-    while True:
-        try:
-            sock.bind(f"\0mavftpfs {os.getuid()} {name}")
-            return sock
-        except OSError as exc:
-            if exc.errno != errno.EADDRINUSE or trio.current_time() > deadline:
-                return sock
-        await trio.sleep(_LOCK_PAUSE)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        deadline = trio.current_time() + _LOCK_PATIENCE
+        while not _takes_name(sock, f"\0mavftpfs {os.getuid()} {name}"):
+            if trio.current_time() > deadline:
+                break
+            await trio.sleep(_PAUSE)
+        yield
+
+
+def _takes_name(sock: socket.socket, name: str) -> bool:
+    try:
+        sock.bind(name)
+    except OSError as exc:
+        return exc.errno != errno.EADDRINUSE
+    return True

@@ -1,9 +1,18 @@
 """A port that we open ourselves, or share with other programs of ours through a hub. Layer: link.
 
-A program alone has the port itself, and its door open beside it. When a second program knocks, the first one
-starts the hub, which inherits port and door, and becomes its first client. A client whose hub is gone opens
-the port again, and starts another hub. The port goes from one process to the other as an open descriptor: no
-datagram is lost, no serial line falls, and no third program takes it.
+`SharedLink.run` is in one of three states:
+
+| state | what happens | then |
+|---|---|---|
+| SEEKING: we have no port | a program of ours has it: we join its hub | JOINED |
+| | no program of ours has it, and it opens: we make a door beside it | ALONE |
+| | neither | SEEKING; at the first start an error, after 2 s if it may pass |
+| ALONE: we have the port | another program knocks, or we need a hub: we start one, and join it | JOINED |
+| | the hub does not start | ALONE, and the others are told why; SEEKING if we need it |
+| JOINED: a hub has the port | the hub is gone | SEEKING |
+
+The port goes from one process to the other as an open descriptor, and so does the door: no datagram is lost,
+no serial line falls, and no third program takes the port.
 """
 
 from __future__ import annotations
@@ -16,16 +25,15 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
-from functools import partial
 from pathlib import Path
 
 import trio
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import Link, LinkStats, Seat, background
-from mavftpfs.link.hublink import HubLink, Refused, Wish, join
+from mavftpfs.link.hublink import HubLink, Wish, join, pack_facts
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door, knock, only_one, open_door
+from mavftpfs.link.rendezvous import Busy, Door, knock, only_one, open_door
 from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
@@ -35,9 +43,6 @@ log = logging.getLogger("mavftpfs.link")
 GRACE = 2.0
 """Seconds to wait for a port that is taken, because a hub may be just closing it."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
-_NO_PLACE = (
-    "no private directory for the hub's socket; set XDG_RUNTIME_DIR to a directory that only you can read"
-)
 _NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a port"
 _PAUSE = 0.1
 _LONG_PAUSE = 1.0
@@ -52,149 +57,142 @@ class SharedLink:
     def __init__(self, spec: LinkSpec, wish: Wish) -> None:
         self.stats = LinkStats()
         self.seat: Seat | None = None
-        self.is_stream = False
+        self.is_stream = spec.kind not in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
         self.is_serial = spec.kind is LinkKind.SERIAL
         self.description = spec.description
         self._spec = spec
         self._wish = wish
+        self._name = port_name(spec)
         self._inner: Link | None = None
         self._heard_by: Link | None = None
         self._address: NetAddress | None = None
         self._system = 0
+        self._was_open = False
         self._reopened = False
-        self._opened = False
         self._changed = trio.Event()
         self._closed = False
         self._task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED
 
-    # -- what is open
+    # -- the states
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Keep the port open, one way or the other, until cancelled.
+        """Keep the port open, one way or the other, until cancelled. It has started once the port is open.
 
         Raises:
             LinkClosed: it cannot be opened at all.
         """
         self._task_status = task_status
-        said = ""
+        try:
+            while True:
+                hub = await self._sought()
+                async with background(hub.run_writer, hub.aclose):
+                    await hub.gone.wait()
+                self._inner = None
+                self._reopened = True
+                self.stats.reopened += 1
+                log.warning("the hub of %s is gone; opening the port again", self.description)
+        finally:
+            if self._inner is not None:
+                with trio.CancelScope(shield=True):
+                    await self._inner.aclose()
+
+    async def _sought(self) -> HubLink:
+        """SEEKING, and ALONE as long as that lasts. Return our link when a hub has the port."""
+        began, pause, said = trio.current_time(), _PAUSE, ""
         while True:
             try:
-                hub = await self._obtained()
+                return await self._joined()
             except LinkClosed as exc:
-                if not self._opened:
+                may_pass = isinstance(exc, Busy) and trio.current_time() - began < GRACE
+                if not may_pass and not self._was_open:
                     raise
-                if str(exc) != said:
+                if not may_pass and str(exc) != said:
                     said = str(exc)
                     log.warning("%s; trying again", said)
-                await trio.sleep(_LONG_PAUSE)
-                continue
-            said = ""
-            async with background(hub.run, hub.aclose):
-                self._use(hub)
-                await hub.gone.wait()
-            self._inner = None
-            self._reopened = True
-            log.warning("the hub of %s is gone; starting another one", self.description)
+            await trio.sleep(pause)
+            pause = min(2 * pause, _LONG_PAUSE)
 
-    async def _obtained(self) -> HubLink:
-        """Return the link to the hub of the port. As long as no other program wants the port, we have it
-        alone."""
-        deadline = trio.current_time() + GRACE
-        while True:
-            try:
-                hub = await self._joined()
-                return hub or await self._alone()
-            except _Taken as exc:
-                if trio.current_time() > deadline:
-                    raise LinkClosed(str(exc)) from exc.__cause__
-                await trio.sleep(_PAUSE)
-
-    async def _joined(self) -> HubLink | None:
-        """Return a link to the program that has the port, if it is one of ours."""
-        sock = knock(port_name(self._spec)) if self._has_name else None
-        if sock is None:
-            return None
-        try:
-            return await join(sock, self._spec, self._wish, self.seat, again=self._opened)
-        except Refused:
-            raise
-        except LinkClosed as exc:
-            raise _Taken(str(exc)) from exc  # it ended just now, or could not start the hub
-
-    async def _alone(self) -> HubLink:
-        """Have the port to ourselves until another program knocks, or hand it to a hub at once if we need
-        one."""
-        name = port_name(self._spec)
-        async with AsyncExitStack() as stack:
-            with await only_one(name):
-                hub = await self._joined()
-                if hub is not None:
-                    return hub
-                try:
-                    link = await stack.enter_async_context(open_link(self._spec))
-                except LinkClosed as exc:
-                    if getattr(exc.__cause__, "errno", None) in _TAKEN:
-                        raise _Taken(str(exc)) from exc.__cause__
-                    raise
-                door = open_door(name) if self._has_name else None
-                if door is not None:
-                    stack.callback(door.remove)
-            if not self._needs_hub():
-                self._use(link)
-            while True:
-                hub = await self._handed_over(link, door)
-                if hub is not None:
-                    return hub
-
-    def _needs_hub(self) -> bool:
-        return self._opened or bool(self._wish.forward) or self._wish.beats
-
-    async def _handed_over(self, link: Link, door: Door | None) -> HubLink | None:
-        """Wait until another program wants to share the port, and start the hub; None if that cannot be done.
+    async def _joined(self) -> HubLink:
+        """Join the hub of the port. If there is none, have the port until a hub takes it over.
 
         Raises:
-            LinkClosed: we need it ourselves.
+            Busy: another program has the port, and may be just opening or closing it.
+            LinkClosed: it cannot be opened, or the hub refuses us, or does not start and we need it.
         """
-        if door is None:
-            if self._needs_hub() and self._inner is not link:
-                raise LinkClosed(_NO_PLACE if self._has_name else _NO_NUMBER)
-            await trio.sleep_forever()
-        assert door is not None
-        alone = self._inner is link
-        if alone:
-            await door.knocked()
+        async with AsyncExitStack() as stack:
+            async with only_one(self._name):
+                sock = knock(self._name)
+                if sock is None:
+                    link = await self._opened_port(stack)
+                    door = self._opened_door(stack)
+            if sock is not None:
+                hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
+                self._use(hub)
+                return hub
+            if door is None:
+                self._use(link)
+                await trio.sleep_forever()
+            if self._wish.needs_hub:
+                return await self._handed_over(link, door)
+            return await self._alone(link, door)
+
+    async def _opened_port(self, stack: AsyncExitStack) -> Link:
         try:
-            hub = await start_hub(link, door, self._spec, self._wish, self.seat)
+            return await stack.enter_async_context(open_link(self._spec))
         except LinkClosed as exc:
-            if not alone:
+            if getattr(exc.__cause__, "errno", None) in _TAKEN:
+                raise Busy(str(exc)) from exc.__cause__
+            raise
+
+    def _opened_door(self, stack: AsyncExitStack) -> Door | None:
+        """Return the door of our port. A program that does not need a hub goes on without one."""
+        try:
+            door = open_door(self._name)
+        except LinkClosed as exc:
+            if self._wish.needs_hub:
                 raise
-            log.warning("cannot share %s: %s", self.description, exc)
-            door.turn_away()
+            log.info("%s cannot be shared: %s", self.description, exc)
             return None
+        stack.callback(door.remove)
+        return door
+
+    async def _alone(self, link: Link, door: Door) -> HubLink:
+        """ALONE: use the port until another program wants it too, and a hub has taken it over."""
+        self._use(link)
+        while True:
+            await door.knocked()
+            try:
+                return await self._handed_over(link, door)
+            except LinkClosed as exc:
+                problem = f"{self.description} cannot be shared: {exc}"
+            log.warning("%s", problem)
+            door.turn_away(pack_facts({"refused": problem}))
+            await trio.sleep(_LONG_PAUSE)
+
+    async def _handed_over(self, link: Link, door: Door) -> HubLink:
+        """Start a hub that takes over port and door, and use it.
+
+        Raises:
+            LinkClosed: it does not start; both are still ours.
+        """
+        hub = await start_hub(link, door, self._spec, self._wish, self.seat, again=self._was_open)
+        self._use(hub)  # before ours is closed: what is sent meanwhile is not lost
         door.leave()
         return hub
 
-    @property
-    def _has_name(self) -> bool:
-        """Whether other programs can find the port. Port 0 is a different one for each."""
-        return self.is_serial or self._spec.port != 0
-
     def _use(self, link: Link) -> None:
-        """Go on with another link. What is known of the vehicle stays."""
+        """Go on with another link. What is known of the vehicle stays, and so does our seat."""
         link.stats = self.stats
-        self._inner = link
-        self.seat = link.seat
-        if not self._opened:
-            self._opened = True
-            self.is_stream = link.is_stream
-            self.description = link.description
-            self._task_status.started()
+        self.seat = link.seat or self.seat
         if self._address is not None:
             link.answer(self._address)
         if self._system:
             link.focus(self._system)
-        if self._reopened:
-            self.stats.reopened += 1
+        self._inner = link
+        if not self._was_open:
+            self._was_open = True
+            self.description = link.description
+            self._task_status.started()
         self._changed.set()
         self._changed = trio.Event()
 
@@ -267,10 +265,6 @@ class SharedLink:
         await trio.lowlevel.checkpoint()
 
 
-class _Taken(LinkClosed):
-    """The port cannot be opened now; soon it may."""
-
-
 @asynccontextmanager
 async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
     """Open the link that a SOURCE names, alone or with other programs of ours, for the length of the body.
@@ -278,6 +272,12 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
     Raises:
         LinkClosed: it cannot be opened; the text is one line that says what to do.
     """
+    if spec.kind is not LinkKind.SERIAL and spec.port == 0:  # no other program can find it
+        if wish.needs_hub:
+            raise LinkClosed(_NO_NUMBER)
+        async with open_link(spec) as alone:
+            yield alone
+        return
     link = SharedLink(spec, wish)
     failure: Exception | None = None
     lasting = trio.CancelScope()
@@ -307,35 +307,52 @@ def own_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-async def start_hub(link: Link, door: Door, spec: LinkSpec, wish: Wish, seat: Seat | None) -> HubLink:
-    """Start a hub that goes on with an open port, and return our link to it.
+async def start_hub(
+    link: Link, door: Door, spec: LinkSpec, wish: Wish, seat: Seat | None, *, again: bool = False
+) -> HubLink:
+    """Start a hub that goes on with an open port and its door, and return our link to it. again: as for join.
 
     Raises:
         LinkClosed: it did not start; we still have the port.
     """
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    except OSError as exc:
+        raise LinkClosed(f"the hub cannot be started: {exc.strerror}") from exc
     with theirs:
         inherited = [theirs.fileno(), door.sock.fileno(), *link.descriptors()]
-        words = [sys.executable, "-m", "mavftpfs", "hub", "--take-over", ",".join(map(str, inherited))]
-        command = partial(
-            subprocess.run,
-            [*words, spec.description],
-            pass_fds=inherited,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd="/",
-            env=own_environment(),
-            timeout=_START_PATIENCE,
-            check=False,
-        )
+        words = ["-m", "mavftpfs", "hub", "--take-over", ",".join(map(str, inherited)), spec.description]
         try:
-            done = await trio.to_thread.run_sync(command)
-        except (OSError, subprocess.TimeoutExpired) as exc:
+            await _run_until_ready([sys.executable, *words], inherited)
+        except BaseException:
             ours.close()
-            raise LinkClosed(f"the hub cannot be started: {exc}") from exc
+            raise
+    return await join(ours, spec, wish, seat, again=again)
+
+
+async def _run_until_ready(command: list[str], inherited: list[int]) -> None:
+    """Run the command that starts a hub; it ends when the hub is ready.
+
+    Raises:
+        LinkClosed: and why it is not.
+    """
+    try:
+        with trio.fail_after(_START_PATIENCE):
+            done = await trio.run_process(
+                command,
+                pass_fds=inherited,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                capture_stderr=True,
+                cwd="/",
+                env=own_environment(),
+                check=False,
+            )
+    except (OSError, trio.TooSlowError) as exc:
+        problem = (
+            exc.strerror if isinstance(exc, OSError) else f"it is not ready within {_START_PATIENCE:g} s"
+        )
+        raise LinkClosed(f"the hub cannot be started: {problem}") from exc
     if done.returncode != 0:
-        ours.close()
-        raise LinkClosed(done.stderr.strip().removeprefix("mavftpfs: ") or "the hub did not start")
-    return await join(ours, spec, wish, seat)
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise LinkClosed(said[-1].removeprefix("mavftpfs: ") if said else "the hub did not start")

@@ -10,13 +10,12 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
 from typing import Protocol
 
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox, Seat
+from mavftpfs.link.base import DescriptorLink
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_READS = 64
@@ -43,7 +42,7 @@ Opener = Callable[[], Awaitable[Pipe]]
 """Opens a new Pipe, waiting as long as it takes. Raises OSError or LinkClosed: try again later."""
 
 
-class StreamLink:
+class StreamLink(DescriptorLink):
     """Implements link.base.Link over whatever `opener` opens; without one, the owner calls `replace`.
 
     Args:
@@ -65,55 +64,21 @@ class StreamLink:
         is_serial: bool,
         outbox_limit: int,
     ) -> None:
-        self.stats = LinkStats()
-        self.seat: Seat | None = None
+        super().__init__(description, outbox_limit)
         self.listener: socket.socket | None = None
-        self.description = description
         self.is_serial = is_serial
         self._opener = opener
         self._pipe = pipe
         self._was_open = pipe is not None
         self._reopened = False
-        self._closed = False
         self._peer: NetAddress | None = None
         self._vouched_at = trio.current_time()
-        self._outbox = Outbox(outbox_limit)
-        self._work = trio.Event()
         self._changed = trio.Event()
-
-    @property
-    def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
-        return self._outbox.size
 
     @property
     def connected(self) -> bool:
         """Whether there is a pipe at the moment."""
         return self._pipe is not None
-
-    async def receive(self) -> list[bytes]:
-        """Wait for bytes; an empty list says that the stream was reopened.
-
-        Raises:
-            LinkClosed: aclose was called.
-        """
-        await trio.lowlevel.checkpoint_if_cancelled()
-        waited = False
-        while True:
-            if self._closed:
-                raise LinkClosed(f"{self.description} is closed")
-            pieces = None if self._reopened else self._drain()
-            if pieces is None or pieces:
-                self._reopened = False
-                if not waited:  # one checkpoint per batch, and none where data could be lost
-                    await trio.lowlevel.cancel_shielded_checkpoint()
-                return pieces or []
-            waited = True
-            if self._pipe is None:
-                await self._changed.wait()
-                continue
-            with suppress(trio.ClosedResourceError, OSError):  # replaced or lost meanwhile; look again
-                await trio.lowlevel.wait_readable(self._pipe.fileno())
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames in one write; drop and count, whole, what cannot be kept."""
@@ -123,32 +88,21 @@ class StreamLink:
         if not self._outbox.size:
             data = b"".join(frames)
             sent = self._write(data)
-            if sent:
-                # The rest of a frame must follow its beginning, whatever the limit says.
-                self._keep([data[sent:]] if sent < len(data) else [], force=True)
+            if sent == len(data):
                 return
-        self._keep(frames, force=False)
-
-    def _keep(self, frames: Sequence[bytes], *, force: bool) -> None:
+            if sent:
+                self._keep(data[sent:], force=True)  # the rest of a frame must follow its beginning
+                return
         for frame in frames:
-            if not self._outbox.offer(frame, force=force):
-                self.stats.dropped_sends += 1
-        if self._outbox.size:
-            self._work.set()
+            self._keep(frame)
 
     def sender(self, index: int) -> NetAddress | None:
         """Return the peer that connected; None where we opened the stream."""
         return self._peer
 
-    def answer(self, address: NetAddress) -> None:
-        """Nothing to choose: what we send goes to the peer."""
-
     def keep_peer(self) -> None:
         """Note that the present peer is served, and was heard just now."""
         self._vouched_at = trio.current_time()
-
-    def focus(self, system: int) -> None:
-        """Nothing to leave out."""
 
     def descriptors(self) -> list[int]:
         """Return the listener's, if there is one, and the pipe's, if there is one at the moment."""
@@ -178,7 +132,7 @@ class StreamLink:
     async def run(self) -> None:
         """Write what had to wait, and reopen what failed; runs until cancelled."""
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(self._write_waiting)
+            nursery.start_soon(self.run_writer)
             if self._opener is not None:
                 nursery.start_soon(self._keep_open, self._opener)
 
@@ -196,7 +150,10 @@ class StreamLink:
         self._changed.set()
         self._changed = trio.Event()
 
-    def _drain(self) -> list[bytes]:
+    def _drain(self) -> list[bytes] | None:
+        if self._reopened:
+            self._reopened = False
+            return []
         pieces: list[bytes] = []
         while self._pipe is not None and len(pieces) < MAX_READS:
             try:
@@ -211,25 +168,33 @@ class StreamLink:
             pieces.append(data)
             if len(data) < _READ_SIZE:
                 break  # saves the read that would say "nothing more"
-        if pieces:
-            self.stats.received_bytes += sum(map(len, pieces))
-        return pieces
+        self.stats.received_bytes += sum(map(len, pieces))
+        return pieces or None
 
-    def _write(self, data: bytes) -> int:
-        """Return how much the kernel took; a broken pipe takes all."""
+    def _write(self, item: bytes) -> int:
         if self._pipe is None:
-            return len(data)
+            return len(item)
         try:
-            sent = os.write(self._pipe.fileno(), data)
+            sent = os.write(self._pipe.fileno(), item)
         except BlockingIOError:
             return 0
         except OSError:
             self.stats.dropped_sends += 1
             self._lose()
-            return len(data)
+            return len(item)
         self.stats.sent_bytes += sent
         self.stats.writes += 1
         return sent
+
+    async def _wait_readable(self) -> None:
+        if self._pipe is None:
+            await self._changed.wait()
+        else:
+            await trio.lowlevel.wait_readable(self._pipe.fileno())
+
+    async def _wait_writable(self) -> None:
+        if self._pipe is not None:
+            await trio.lowlevel.wait_writable(self._pipe.fileno())
 
     def _lose(self) -> None:
         self._drop()
@@ -241,18 +206,6 @@ class StreamLink:
             trio.lowlevel.notify_closing(pipe.fileno())
             pipe.close()
         self.stats.dropped_sends += self._outbox.clear()
-
-    async def _write_waiting(self) -> None:
-        while True:
-            await self._work.wait()
-            self._work = trio.Event()
-            while self._pipe is not None and (data := self._outbox.head()) is not None:
-                sent = self._write(data)
-                if sent and self._outbox.head() is data:  # a pipe that broke has emptied the outbox
-                    self._outbox.advance(sent)
-                if sent < len(data) and self._pipe is not None:
-                    with suppress(trio.ClosedResourceError, OSError):
-                        await trio.lowlevel.wait_writable(self._pipe.fileno())
 
     async def _keep_open(self, opener: Opener) -> None:
         pause = FIRST_PAUSE

@@ -16,10 +16,8 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 
-import trio
-
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Outbox, Seat, background, look_up, pack
+from mavftpfs.link.base import SocketLink, background, look_up, pack
 from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
@@ -36,7 +34,7 @@ _MOST_SEGMENTS = 40
 _NO_SEGMENTS = frozenset((errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP, errno.ENOPROTOOPT))
 
 
-class UdpLink:
+class UdpLink(SocketLink):
     """A bound UDP socket; implements link.base.Link. Made by `open_udp`.
 
     Args:
@@ -44,56 +42,20 @@ class UdpLink:
         peer: udpout's target; then datagrams from other hosts are ignored. None: udpin.
     """
 
-    is_stream = False
-    is_serial = False
-
     def __init__(self, sock: socket.socket, description: str, peer: NetAddress | None = None) -> None:
-        self.stats = LinkStats()
-        self.seat: Seat | None = None
-        self.description = description
-        self._sock = sock
+        super().__init__(sock, description, _OUTBOX_LIMIT)
         self._peer = peer
         self._only_host = None if peer is None else peer[0]
         self._pinned = False
         self._senders: list[NetAddress] = []
         # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
-        self._outbox = Outbox(_OUTBOX_LIMIT)
-        self._work = trio.Event()
-        self._closed = False
         self._segments = sys.platform == "linux"
-
-    @property
-    def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
-        return self._outbox.size
 
     @property
     def local_address(self) -> NetAddress:
         """The bound address; its second item is the port."""
         return self._sock.getsockname()  # type: ignore[no-any-return]
-
-    async def receive(self) -> list[bytes]:
-        """Wait for datagrams and return 1..256 of them.
-
-        Raises:
-            LinkClosed: aclose was called.
-        """
-        await trio.lowlevel.checkpoint_if_cancelled()
-        waited = False
-        while True:
-            if self._closed:
-                raise LinkClosed(f"{self.description} is closed")
-            pieces = self._drain()
-            if pieces:
-                if not waited:  # one checkpoint per batch, and none where data could be lost
-                    await trio.lowlevel.cancel_shielded_checkpoint()
-                return pieces
-            waited = True
-            try:
-                await trio.lowlevel.wait_readable(self._sock)
-            except trio.ClosedResourceError:
-                continue
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
@@ -101,13 +63,8 @@ class UdpLink:
         if self._segments and len(datagrams) > 1 and not self._closed:
             datagrams = self._send_together(datagrams)
         for datagram in datagrams:
-            if self._peer is None or self._closed:
-                self.stats.dropped_sends += 1
-            elif self._outbox.size or not self._send(datagram):
-                if self._outbox.offer(datagram):
-                    self._work.set()
-                else:
-                    self.stats.dropped_sends += 1
+            if self._outbox.size or not self._write(datagram):
+                self._keep(datagram)
 
     def sender(self, index: int) -> NetAddress | None:
         """Return the sender of a piece of the last batch."""
@@ -121,39 +78,11 @@ class UdpLink:
             self._peer = address
             self._pinned = True
 
-    def keep_peer(self) -> None:
-        """Nothing to do: all senders are heard."""
-
-    def focus(self, system: int) -> None:
-        """Nothing to leave out."""
-
     def descriptors(self) -> list[int]:
         """Return the socket's."""
         return [self._sock.fileno()]
 
-    async def run_writer(self) -> None:
-        """Send what had to wait for the kernel; runs until cancelled."""
-        while True:
-            await self._work.wait()
-            self._work = trio.Event()
-            while (datagram := self._outbox.head()) is not None:
-                if self._send(datagram):
-                    self._outbox.advance(len(datagram))
-                    continue
-                try:
-                    await trio.lowlevel.wait_writable(self._sock)
-                except trio.ClosedResourceError:
-                    return
-
-    async def aclose(self) -> None:
-        """Close; what the kernel has not taken by now is lost."""
-        if not self._closed:
-            self._closed = True
-            trio.lowlevel.notify_closing(self._sock)
-            self._sock.close()
-        await trio.lowlevel.checkpoint()
-
-    def _drain(self) -> list[bytes]:
+    def _drain(self) -> list[bytes] | None:
         """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
         receive, buffer = self._sock.recvfrom_into, self._buffer
         pieces: list[bytes] = []
@@ -168,11 +97,12 @@ class UdpLink:
             if self._only_host is None or sender[0] == self._only_host:
                 pieces.append(bytes(buffer[:count]))
                 senders.append(sender)
-        if pieces:
-            self._senders = senders
-            self.stats.received_bytes += sum(map(len, pieces))
-            if self._only_host is None and not self._pinned:
-                self._peer = senders[-1]
+        if not pieces:
+            return None
+        self._senders = senders
+        self.stats.received_bytes += sum(map(len, pieces))
+        if self._only_host is None and not self._pinned:
+            self._peer = senders[-1]
         return pieces
 
     def _send_together(self, datagrams: Sequence[bytes]) -> Sequence[bytes]:
@@ -193,18 +123,20 @@ class UdpLink:
             datagrams = datagrams[run:]
         return datagrams
 
-    def _send(self, datagram: bytes) -> bool:
-        """Return False if the kernel has no room; anything else that goes wrong is a lost datagram."""
+    def _write(self, item: bytes) -> int:
+        if self._peer is None or self._closed:
+            self.stats.dropped_sends += 1
+            return len(item)
         try:
-            self._sock.sendto(datagram, self._peer)  # type: ignore[arg-type]
+            sent = self._sock.sendto(item, self._peer)
         except BlockingIOError:
-            return False
+            return 0
         except OSError:  # no route, no buffer: waiting would not help
             self.stats.dropped_sends += 1
-            return True
+            return len(item)
         self.stats.writes += 1
-        self.stats.sent_bytes += len(datagram)
-        return True
+        self.stats.sent_bytes += sent
+        return sent
 
 
 def equal_run(datagrams: Sequence[bytes]) -> int:

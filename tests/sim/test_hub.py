@@ -32,7 +32,7 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import ALONE, Door, knock, open_door
+from mavftpfs.link.rendezvous import ALONE, Door
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
@@ -217,21 +217,6 @@ async def test_frames_from_made_up_addresses_take_no_memory() -> None:
         tracemalloc.stop()
         theirs.close()
         await link.aclose()
-
-
-async def test_the_full_queue_of_a_stopped_program_does_not_stop_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    door = open_door("port")
-    assert door is not None
-    waiting = []
-    while (sock := await trio.to_thread.run_sync(knock, "port", abandon_on_cancel=True)) is not None:
-        waiting.append(sock)
-        assert len(waiting) < 1000
-    for sock in waiting:
-        sock.close()
-    door.remove()
 
 
 async def test_a_port_without_a_number_cannot_be_shared() -> None:

@@ -1,0 +1,321 @@
+"""A port that goes from a program alone to a hub and back: link.sharing, with real hubs."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import stat
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trio
+
+from mavftpfs.cli import ports
+from mavftpfs.client.connect import plain_nursery
+from mavftpfs.link.base import Link
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.hublink import Wish
+from mavftpfs.link.messages import Address
+from mavftpfs.link.rendezvous import ALONE, knock, open_door
+from mavftpfs.link.samelink import port_name
+from mavftpfs.link.sharing import open_shared
+from mavftpfs.link.uri import parse_source
+from mavftpfs.shared.errors import LinkClosed
+from tests.support.vehicles import HOST, free_udp_port
+
+pytestmark = pytest.mark.real_time
+US = Address(254, 191)
+VEHICLE = Address(1, 1)
+
+
+@pytest.fixture(autouse=True)
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where the doors of this test are: a path that is short enough for a socket."""
+    with tempfile.TemporaryDirectory(prefix="mavftpfs") as folder:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+        monkeypatch.setenv("HOME", folder)
+        yield Path(folder)
+        deadline = time.monotonic() + 60
+        while ports.statuses(None):
+            assert time.monotonic() < deadline, "a hub stayed"
+            time.sleep(0.05)
+
+
+class Port:
+    """A UDP port that programs of ours share, and the vehicle that sends there."""
+
+    def __init__(self) -> None:
+        self.source = f"udpin:{HOST}:{free_udp_port()}"
+        self.spec = parse_source(self.source)
+        self.vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.vehicle.connect((HOST, self.spec.port))
+        self.vehicle.setblocking(False)
+        self._beat = Framer(VEHICLE, stream=False).encode_heartbeat(2, 12)
+
+    def shared(self, *forward: str) -> Any:
+        """Return the context manager of one more program's link."""
+        return open_shared(self.spec, Wish(US, forward))
+
+    async def run_program(self, *, task_status: trio.TaskStatus[tuple[Link, trio.CancelScope]]) -> None:
+        """Be one more program until cancelled; starts with its link, and what cancels it."""
+        with trio.CancelScope() as scope:
+            async with self.shared() as link:
+                task_status.started((link, scope))
+                await trio.sleep_forever()
+
+    def hub(self) -> int | None:
+        """Return the process id of the hub."""
+        found = ports.statuses(self.source)
+        return found[0]["pid"] if found else None
+
+    async def hears(self, *links: Link) -> None:
+        """Wait until the vehicle reaches all of these, and they reach it."""
+        for link in links:
+            with trio.fail_after(60):
+                while not await self._heard(link):
+                    pass
+
+    async def _heard(self, link: Link) -> bool:
+        try:
+            self.vehicle.send(self._beat)
+        except ConnectionRefusedError:
+            await trio.sleep(0.02)
+        with trio.move_on_after(0.1):
+            if await link.receive():
+                address = link.sender(0)
+                assert address == self.vehicle.getsockname()
+                link.answer(address)
+                link.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
+                await trio.lowlevel.wait_readable(self.vehicle)
+                self.vehicle.recv(2048)
+                return True
+        return False
+
+
+@pytest.fixture
+def port() -> Iterator[Port]:
+    """A port, and its vehicle."""
+    made = Port()
+    yield made
+    made.vehicle.close()
+
+
+async def kill_hub(port: Port) -> None:
+    pid = await trio.to_thread.run_sync(port.hub)
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+
+
+@asynccontextmanager
+async def listening(link: Link) -> AsyncIterator[list[int]]:
+    """Take what comes in the background; yields how many pieces each batch had, so 0 for "reopened"."""
+    batches: list[int] = []
+
+    async def listen() -> None:
+        while True:
+            batches.append(len(await link.receive()))
+
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(listen)
+        yield batches
+        nursery.cancel_scope.cancel()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    with trio.fail_after(60):
+        while True:
+            if condition():
+                return
+            await trio.sleep(0.02)
+
+
+# -- who has the port -----------------------------------------------------------------------------
+
+
+async def test_a_program_alone_starts_no_hub_and_a_second_one_does(port: Port) -> None:
+    async with port.shared() as one:
+        await port.hears(one)
+        assert await trio.to_thread.run_sync(port.hub) is None
+        async with port.shared() as two:
+            await port.hears(two)
+            assert await trio.to_thread.run_sync(port.hub) is not None
+            assert one.seat is not None
+            assert two.seat is not None
+            assert {one.seat.own, two.seat.own} == {US, Address(254, 192)}
+        await port.hears(one)
+
+
+async def test_the_last_client_of_a_killed_hub_has_the_port_itself_and_keeps_its_seat(port: Port) -> None:
+    async with plain_nursery() as nursery:
+        _, first = await nursery.start(port.run_program)
+        two, _ = await nursery.start(port.run_program)
+        first.cancel()
+        seat = two.seat
+        assert seat is not None
+        assert seat.own == Address(254, 192)
+        async with listening(two) as batches:
+            await kill_hub(port)
+            await until(lambda: 0 in batches)
+        await port.hears(two)
+        assert await trio.to_thread.run_sync(port.hub) is None
+        async with port.shared() as three:
+            await port.hears(three, two)
+            assert two.seat == seat
+            assert three.seat is not None
+            assert three.seat.own == US
+
+
+def bind_when_free(sock: socket.socket, number: int) -> None:
+    deadline = time.monotonic() + 30
+    while True:
+        try:
+            sock.bind((HOST, number))
+            return
+        except OSError:
+            assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+async def test_an_endpoint_that_is_taken_when_its_hub_was_killed_does_not_cut_the_vehicle(port: Port) -> None:
+    taken = free_udp_port()
+    async with port.shared(f"udpin:{HOST}:{taken}") as link:
+        await port.hears(link)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            await kill_hub(port)
+            bind_when_free(other, taken)  # our task does not run meanwhile
+            await port.hears(link)
+            (facts,) = await trio.to_thread.run_sync(ports.statuses, port.source)
+            assert "in use" in facts["endpoints"][0]["problem"]
+
+
+async def test_programs_that_begin_at_once_all_share_the_port(port: Port) -> None:
+    links: list[Link] = []
+
+    async def begin() -> None:
+        link, _ = await nursery.start(port.run_program)
+        links.append(link)
+
+    async with plain_nursery() as nursery:
+        async with trio.open_nursery() as beginning:
+            for _ in range(6):
+                beginning.start_soon(begin)
+        await until(lambda: all(link.seat is not None for link in links))
+        seats = [link.seat for link in links if link.seat is not None]
+        assert len({seat.own for seat in seats}) == 6
+        assert len({seat.number for seat in seats}) == 6
+        await port.hears(*links)
+
+
+# -- what cannot be -------------------------------------------------------------------------------
+
+
+async def test_why_a_port_cannot_be_shared_is_told_to_the_program_that_wants_it(
+    port: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with port.shared() as one:
+        monkeypatch.setattr(sys, "executable", "/bin/false")
+        with pytest.raises(LinkClosed, match="cannot be shared: the hub did not start"):
+            async with port.shared():
+                pass
+        monkeypatch.undo()
+        await port.hears(one)
+
+
+@contextmanager
+def no_descriptors_left() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))), before[1]))
+    taken = []
+    with suppress(OSError):
+        while True:
+            taken.append(os.open(os.devnull, os.O_RDONLY))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        for descriptor in taken:
+            os.close(descriptor)
+
+
+async def test_a_program_without_descriptors_left_keeps_its_port(
+    port: Port, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with port.shared() as one:
+        sock = knock(port_name(port.spec))
+        assert sock is not None
+        with sock, no_descriptors_left():
+            await until(lambda: "cannot be shared: the hub cannot be started" in caplog.text)
+        await port.hears(one)
+
+
+async def test_a_program_that_does_not_answer_keeps_its_door_and_its_port() -> None:
+    """It was stopped, and as many wait there as can. Two sockets would speak to one vehicle."""
+    spec = parse_source(f"udpout:{HOST}:{free_udp_port()}")
+    door = open_door(port_name(spec))
+    place = door.sock.getsockname()
+    inode = os.lstat(place).st_ino
+    with ExitStack() as stack:
+        stack.callback(door.remove)
+        fill_queue(place, stack)
+        with pytest.raises(LinkClosed, match="does not answer"):
+            async with open_shared(spec, Wish(US)):
+                pass
+        assert os.lstat(place).st_ino == inode
+
+
+def fill_queue(place: str, stack: ExitStack) -> None:
+    """Have as many connections wait behind a door as can."""
+    for _ in range(1000):
+        sock = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        sock.setblocking(False)
+        try:
+            sock.connect(place)
+        except BlockingIOError:
+            return
+    raise AssertionError("the queue has no end")
+
+
+# -- doors ----------------------------------------------------------------------------------------
+
+
+def test_a_door_is_its_users_alone_and_no_other_file_gets_its_mode(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The umask is that of the whole process: other threads make files meanwhile."""
+    monkeypatch.setattr(os, "umask", None)
+    door = open_door("port")
+    place = runtime / "mavftpfs" / f"port{ALONE}"
+    assert stat.S_IMODE(place.lstat().st_mode) == 0o600
+    assert stat.S_IMODE(place.parent.lstat().st_mode) == 0o700
+    door.remove()
+    assert not place.exists()
+
+
+async def test_where_the_first_directory_has_no_room_the_door_is_in_the_next_one(
+    port: Port, runtime: Path
+) -> None:
+    obstacle = runtime / "mavftpfs" / (port_name(port.spec) + ALONE)
+    (obstacle / "file").mkdir(parents=True)
+    obstacle.parent.chmod(0o700)
+    async with port.shared(), port.shared() as two:
+        await port.hears(two)
+
+
+async def test_a_stale_door_of_a_killed_program_is_in_nobodys_way(port: Port, runtime: Path) -> None:
+    folder = runtime / "mavftpfs"
+    folder.mkdir(mode=0o700)
+    for end in (".port", ".hub"):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+            left.bind(str(folder / (port_name(port.spec) + end)))
+            left.listen(1)
+    async with port.shared(), port.shared() as two:
+        await port.hears(two)
+    await until(lambda: not os.listdir(folder))
