@@ -90,8 +90,8 @@ class Port:
             await trio.sleep(0.02)
         with trio.move_on_after(0.1):
             if await link.receive():
-                address = link.sender(0)
-                assert address == self.vehicle.getsockname()
+                address = self.vehicle.getsockname()
+                assert link.sender(0) == address
                 link.answer(address)
                 link.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
                 await trio.lowlevel.wait_readable(self.vehicle)
