@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 
 import trio
@@ -24,7 +23,6 @@ from mavftpfs.cache.draft import Draft, Event, State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
-from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.together import together
@@ -46,6 +44,7 @@ from mavftpfs.shared.errors import (
     VerificationFailed,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.sameness import Known
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -78,10 +77,9 @@ def may_pass(node: Node) -> bool:
 class Deliverer:
     """Brings files to the vehicle."""
 
-    def __init__(self, context: Context, names: Names, cleaner: Cleaner, throttle: Throttle) -> None:
+    def __init__(self, context: Context, names: Names, throttle: Throttle) -> None:
         self._context = context
         self._names = names
-        self._cleaner = cleaner
         self._throttle = throttle
         self.verifier = Verifier(context, names)
 
@@ -254,19 +252,22 @@ class Deliverer:
         draft.
 
         Raises:
-            As Directories.ask and Verifier.check.
+            As Directories.current, Verifier.check and Verifier.is_same.
         """
-        context = self._context
-        await self._cleaner.mend(node)
-        there = await context.directories.current(node.path)
-        record = context.unfinished.get(node.path)
-        if there is None and not draft.base_limit:
-            draft.base = None
-        elif record is not None and record.placed is None and draft.whole:
-            with suppress(VerificationFailed):
-                crc32 = await self.verifier.check(node.path, draft, doubted=True)
+        context, path = self._context, node.path
+        there = await context.directories.current(path)  # the cleaner mends the name after a listing
+        record = context.unfinished.get(path)
+        if draft.whole and there is None:
+            draft.base, draft.base_limit = None, 0
+        elif draft.whole and record is not None and record.placed is None:
+            try:
+                crc32 = await self.verifier.check(path, draft, doubted=True)
+            except VerificationFailed:  # a program wrote more since, or others replaced the file
+                if record.sent is not None and await self.verifier.is_same(path, record.sent):
+                    draft.base = record.sent
+            else:
                 self._on_delivered(node, draft, crc32)
-        context.unfinished.end(node.path)
+        context.unfinished.end(path)
 
     # --- sending
 
@@ -290,7 +291,7 @@ class Deliverer:
         try:
             await self._end(draft, attempt)
             if not attempt.in_place:
-                await self._commit(node, draft, attempt, summed=crc32 is not None)
+                await self._commit(node, draft, attempt, crc32)
         finally:
             self._context.own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         self._on_delivered(node, draft, crc32)
@@ -364,8 +365,8 @@ class Deliverer:
         elif draft.base is None and not draft.sent_in_place and not await self._names.is_free(node.path):
             raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
 
-    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, *, summed: bool) -> None:
-        """Rename what was sent and verified into place. summed: the vehicle told its CRC32.
+    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, crc32: int | None) -> None:
+        """Rename what was sent and verified into place. crc32: as the vehicle told it, if it did.
 
         Raises:
             As Names.rename and replace, and as _confirm.
@@ -374,18 +375,17 @@ class Deliverer:
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.on(Event.COMMITS)
         try:
-            compared = summed or store.in_doubt()  # as quick as a listing, and tells more
+            compared = crc32 is not None or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
                 await self._names.rename(attempt.path, path, compared=compared)
             else:
                 await self._names.replace(attempt.path, path, compared=compared)
         except BaseException as error:
+            draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
             if unknown or unfinished.is_unknown(path):
-                unfinished.on_unknown(path)
-                draft.interrupted()
+                unfinished.on_unknown(path).sent = Known(draft.size, crc32=crc32)
             else:
-                draft.on(Event.REFUSED)
                 await self._names.discard(attempt.path)
             raise
         await self._confirm(node, draft, attempt)
@@ -419,7 +419,7 @@ class Deliverer:
         except BaseException as error:
             old = self._context.unfinished.on_unknown(path).aside
             self._context.own.in_use.discard(old or b"")  # if the name has no file, the old one gets it back
-            draft.interrupted(ours=True)
+            draft.not_confirmed()
             if unproven and isinstance(error, VerificationFailed):
                 await self._names.find_out(path)
             raise

@@ -48,8 +48,8 @@ class Event(Enum):
 
     CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
     BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
-    is verified, and the first rename is about to be asked for. PLACED: it has its name. REFUSED: it does not
-    have its name, or that is not known. REPLACED: others replaced the base.
+    is verified, and the first rename is about to be asked for. PLACED: it has its name. NOT_PLACED: it does
+    not have its name, or that is not known. REPLACED: others replaced the base.
     """
 
     CHANGED = "changed"
@@ -58,7 +58,7 @@ class Event(Enum):
     GIVEN_UP = "given up"
     COMMITS = "commits"
     PLACED = "placed"
-    REFUSED = "refused"
+    NOT_PLACED = "not placed"
     REPLACED = "replaced"
 
 
@@ -83,7 +83,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     },
     State.COMMITTING: {
         Event.PLACED: State.CLEAN,
-        Event.REFUSED: State.DIRTY,
+        Event.NOT_PLACED: State.DIRTY,
     },
     State.STALE: {
         Event.EMPTIED: State.DIRTY,
@@ -145,6 +145,11 @@ class Draft:
     def whole(self) -> bool:
         """Whether all bytes of it are here."""
         return self._held.covers(0, min(self.base_limit, self.size))
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it is sent, or gets its name, just now."""
+        return self.state in (State.SENDING, State.COMMITTING)
 
     @property
     def unacked(self) -> int:
@@ -264,15 +269,11 @@ class Draft:
         if self.state is State.SENDING:
             self.on(Event.GIVEN_UP)
 
-    def interrupted(self, *, ours: bool = False) -> None:
-        """Note that it is not known which file has the name. All of the draft is here, so no base counts any
-        more.
-
-        ours: the file that has the name is the one that was sent, or what became of it."""
-        self.on(Event.REFUSED)
-        self.base_limit = 0
-        if ours:
-            self.base = Known(self.size)
+    def not_confirmed(self) -> None:
+        """Note that the name got what was sent, and that the comparison afterwards failed: whatever became of
+        it may be replaced. All of the draft is here."""
+        self.on(Event.NOT_PLACED)
+        self.base, self.base_limit = Known(self.size), 0
 
     def delivered(self, crc32: int | None = None) -> None:
         """Note that the vehicle has it, verified: from now on that is the base. crc32: of the content, if
@@ -312,7 +313,7 @@ class Draft:
         assert self.base_limit <= self.size
         assert (self.sending is not None) == (self.state is State.SENDING)
         assert self.base is not None or self.base_limit == 0
-        if self.state in (State.SENDING, State.COMMITTING):
+        if self.under_way:
             assert self.whole
 
     # --- inside

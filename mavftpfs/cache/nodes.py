@@ -95,11 +95,11 @@ class Node:
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:
         """Have the lock for a body that takes the name or the content away. A delivery under way is
-        cancelled, and its caller begins it again later. A rename into place is not cancelled."""
+        cancelled, and its caller begins it again later. If it was giving the file its name, the replacement
+        is unfinished then."""
         self.claims += 1
         try:
-            committing = self.draft is not None and self.draft.state is State.COMMITTING
-            if self.delivery is not None and not committing:  # else its outcome would not be known
+            if self.delivery is not None:
                 self.delivery.cancel()
             await self.lock.acquire()
         finally:

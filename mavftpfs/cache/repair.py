@@ -17,7 +17,6 @@ from contextlib import suppress
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import Kind, Reserved, is_reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split
@@ -59,7 +58,6 @@ class Cleaner:
         self._dead_owners = dead_owners | {context.own.owner}
         self._seen: dict[bytes, tuple[int, float]] = {}
         self._busy: set[bytes] = set()
-        self._being_delivered: set[Node] = set()
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """Clean up after a directory was listed. Raises no MavftpfsError: the listing is right in any
@@ -111,14 +109,6 @@ class Cleaner:
                     if split(path)[0] == directory and record.placed and record.until <= now:
                         context.unfinished.end(path)
 
-    async def mend(self, node: Node) -> None:
-        """Mend the name of one file by a listing. The caller has the node's lock."""
-        self._being_delivered.add(node)
-        try:
-            await self._list(split(node.path)[0])
-        finally:
-            self._being_delivered.discard(node)
-
     # --- inside
 
     async def _list(self, directory: bytes) -> bool:
@@ -164,8 +154,8 @@ class Cleaner:
             await self._names.remove(left)
         else:
             node = context.nodes.get(target)
-            if node is not None and node.delivery is not None and node not in self._being_delivered:
-                return  # its delivery is under way: a later listing shows the outcome
+            if node is not None and node.draft is not None and node.draft.under_way:
+                return  # a new file is about to get the name: a later listing shows the outcome
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
             await self._names.rename(left, target, completes=owner is not None)
             if owner is not None:

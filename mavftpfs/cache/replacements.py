@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from math import inf
 
 from mavftpfs.shared.model import rename_keys, renamed
+from mavftpfs.shared.sameness import Known
 
 
 @dataclass(slots=True)
@@ -29,12 +30,14 @@ class Replacement:
     """What is known of one name.
 
     aside: where the old file lies, or may lie; None if none does. placed: whether the new file has the name;
-    None if that is not known. until: when the old file is to be removed, by the caches' clock.
+    None if that is not known. until: when the old file is to be removed, by the caches' clock. sent: the new
+    file, None if any file may be replaced.
     """
 
     aside: bytes | None = None
     placed: bool | None = None
     until: float = inf
+    sent: Known | None = None
 
     @property
     def lacks_file(self) -> bool:

@@ -90,8 +90,8 @@ class Writeback:
         )
         self._throttle = throttle = Throttle(context, limit)
         self._names = names = Names(context)
-        self.cleaner = cleaner = Cleaner(context, names, dead)
-        self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
+        self.cleaner = Cleaner(context, names, dead)
+        self._deliverer = deliverer = Deliverer(context, names, throttle)
         self._nursery = nursery
         self._retrying = False
         self.namespace = Namespace(context, names, deliverer)

@@ -11,8 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-import trio
-
 from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
@@ -22,7 +20,7 @@ from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.shared.errors import FileBusy, FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
+from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
 
 TRIES = 3
 """How often a read starts again because the file was delivered meanwhile."""
@@ -216,11 +214,8 @@ class WriteFile(ReadFile):
         if self._closed:
             raise LocalProtocolError("truncate of a closed handle")
         # The bytes under way to the vehicle are not wanted any more, and new ones need no room.
-        with trio.move_on_after(self._context.options.op_deadline):
-            async with node.claim():
-                await self._truncate(node, 0)
-                return
-        raise FileBusy(f"{node.path!r} is just getting its place")
+        async with node.claim():
+            await self._truncate(node, 0)
 
     async def flush(self) -> None:
         """Deliver, but not a file that was only emptied: bytes are about to come.

@@ -23,6 +23,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
+    FileChanged,
     MavftpfsError,
     NoSpace,
     NotDeliveredYet,
@@ -184,6 +185,57 @@ async def test_what_a_close_did_not_deliver_is_delivered_without_news(here: Rig,
     assert here.data(NEW) == b"content"
     assert tree._writing is not None
     assert list(tree._writing._context.nodes) == []
+
+
+RENAMES = [("px4", 1), ("mavsdk", 1), *((name, nth) for name in ("px4-nuttx", "ardupilot5") for nth in (1, 2))]
+"""Which requests give a file its name instead of an old one."""
+
+
+async def interrupt(here: Rig, file: OpenFile, *, carried_out: bool, nth: int) -> None:
+    """Deliver it, and fall silent at a rename."""
+    here.faults.at(Opcode.RENAME, lambda: fall_silent(here), nth=nth, drop=not carried_out)
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+
+
+@pytest.mark.parametrize("carried_out", [False, True])
+@pytest.mark.parametrize(("profile", "nth"), RENAMES)
+async def test_what_others_put_there_after_an_interruption_stays(
+    profile: str, nth: int, carried_out: bool
+) -> None:
+    """A part of the old file was to stay, and that is gone."""
+    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/other", b"found out how it renames")
+        file = await tree.open(FILE, write=True)
+        await file.write(len(OLD), b"more")
+        await interrupt(here, file, carried_out=carried_out, nth=nth)
+        here.replace(FILE, b"theirs")
+        speak(here)
+        with pytest.raises(FileChanged):
+            await file.release()
+        assert here.data(FILE) == b"theirs"
+
+
+@pytest.mark.parametrize("carried_out", [False, True])
+@pytest.mark.parametrize("path", [FILE, NEW])
+@pytest.mark.parametrize(("profile", "nth"), RENAMES)
+async def test_what_is_written_after_an_interruption_goes_there(
+    profile: str, nth: int, path: bytes, carried_out: bool
+) -> None:
+    """The name may have what was sent before: that is ours, and may be replaced."""
+    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree, before = here.mount(), OLD if path == FILE else b""
+        await write_file(tree, b"/d/other", b"found out how it renames")
+        file = await (tree.open(path, write=True) if before else tree.create(path, exclusive=True))
+        await file.write(len(before), b"more")
+        await interrupt(here, file, carried_out=carried_out, nth=nth if before else 1)
+        await file.write(len(before) + 4, b" and more")
+        speak(here)
+        await file.release()
+        assert here.data(path) == before + b"more and more"
+        await trio.sleep(20)
+        assert here.litter() == []
 
 
 async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree: Tree) -> None:

@@ -67,13 +67,13 @@ def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) 
         assert draft.state is state
 
 
-def test_after_an_interrupted_commit_no_base_counts_any_more() -> None:
+def test_after_a_comparison_that_failed_no_base_counts_any_more() -> None:
     draft = draft_over(b"old")
     draft.fill(0, b"old")
     draft.write(0, b"X")
     draft.begin(in_place=False)
     draft.on(Event.COMMITS)
-    draft.interrupted()
+    draft.not_confirmed()
     assert draft.state is State.DIRTY
     draft.lose_base()
     draft.write(0, b"Y")
@@ -220,7 +220,7 @@ class DraftMachine(RuleBasedStateMachine):
         assert self.remote == self.model
         self.draft.on(Event.COMMITS)
         if end.startswith("interrupted"):
-            self.draft.interrupted()
+            self.draft.not_confirmed()
         if end.endswith("placed"):
             self.draft.delivered()
             self.base = bytes(self.model)
