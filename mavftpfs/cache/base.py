@@ -25,10 +25,17 @@ async def open_node(context: Context, node: Node) -> VersionHandle:
         async with context.paths.steady(node) as path:
             node.require_reachable()
             try:
-                return await context.files.open(path)
+                handle = await context.files.open(path)
             except (NotFound, FtpNak):
                 if node.path == path:
                     raise  # else the file got a reserved name meanwhile
+                continue
+            try:
+                node.require_reachable()  # else it was now seen that others replaced the file
+            except FileChanged:
+                handle.close()
+                raise
+            return handle
 
 
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:
@@ -53,8 +60,8 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
         except (FileChanged, LocalProtocolError) as error:
             if node.base is not base:
                 continue  # we replaced the file ourselves meanwhile
-            if isinstance(error, FileChanged) and node.draft and not context.is_changing(node.path):
-                context.on_replaced(node, node.draft)
+            if isinstance(error, FileChanged) and not node.removed and not context.is_changing(node.path):
+                context.on_replaced(node.path)
             raise
 
 

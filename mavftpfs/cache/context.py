@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 from mavftpfs.cache.attributes import SECOND, Times
 from mavftpfs.cache.directories import Directories, Directory
-from mavftpfs.cache.draft import Draft, State
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.nodes import Node, Nodes
+from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
@@ -93,15 +93,19 @@ class Context:
             if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue
             if compare(draft.base, Listed(entry)) is Sameness.OTHER:
-                self.on_replaced(node, draft)
+                self.on_replaced(node.path)
             elif draft.base.mtime is None and entry.size == draft.base.size:
                 draft.base = replace(draft.base, mtime=entry.mtime)
 
-    def on_replaced(self, node: Node, draft: Draft) -> None:
-        """Note that others replaced the base of a draft."""
-        if node.delivery is not None:
-            return  # its delivery compares the base itself
-        draft.lose_base()
-        if draft.state is State.STALE and not draft.lacked:
+    def on_replaced(self, path: bytes) -> None:
+        """Note that others replaced the file of a path. Handles that are open never read the new one. A draft
+        of which no byte of the old file is to stay goes on."""
+        node = self.nodes.get(path)
+        if node is None or node.delivery is not None:
+            return  # a delivery compares the base itself
+        draft = node.draft
+        if draft is not None:
+            draft.lose_base()
+        if draft is None or (draft.state is State.STALE and not draft.lacked):
             self.nodes.replaced(node)
-            self.files.forget_pages(node.path)
+            self.files.forget_pages(path)

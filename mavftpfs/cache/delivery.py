@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 
 import trio
@@ -31,6 +32,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
     FileChanged,
+    FtpNak,
     LinkError,
     MavftpfsError,
     NoSpace,
@@ -136,9 +138,9 @@ class Deliverer:
                 return
             node.start_after = float("inf")  # a program that changed sent bytes will do so again
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
-        if not due or draft.unacked < START_AT or not may_pass(node):
+        if not due or not draft.whole or draft.unacked < START_AT or not may_pass(node):
             return
-        if context.unfinished.is_unknown(node.path) or not draft.whole:
+        if context.unfinished.is_unknown(node.path):
             node.start_after = float("inf")
             return
         try:
@@ -255,8 +257,12 @@ class Deliverer:
             As Directories.current, Verifier.check and Verifier.is_same.
         """
         context, path = self._context, node.path
-        there = await context.directories.current(path)  # the cleaner mends the name after a listing
-        record = context.unfinished.get(path)
+        there, record = await context.directories.current(path), context.unfinished.get(path)
+        if there is None and record is not None and record.aside is not None:
+            with suppress(FtpNak):  # the cleaner was faster, or it is gone
+                await self._names.rename(record.aside, path, completes=True)
+                record.placed = False
+            there = await context.directories.current(path)
         if draft.whole and there is None:
             draft.base, draft.base_limit = None, 0
         elif draft.whole and record is not None and record.placed is None:
@@ -430,7 +436,7 @@ class Deliverer:
     def _on_delivered(self, node: Node, draft: Draft, crc32: int | None) -> None:
         """Note that the vehicle has the draft: update listings, blocks and checksums."""
         context = self._context
-        context.directories.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
+        context.directories.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size))
         if crc32 is None and draft.size <= context.options.verify_max:
             crc32 = draft.crc32()
         draft.delivered(crc32)

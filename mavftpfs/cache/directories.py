@@ -81,8 +81,7 @@ class Directory:
     entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
     after that it proves nothing. complete: the vehicle listed it to its end.
     sizes: what replies to opens told since; they beat the listing. growing: when a file was last seen to be
-    larger than before, though we did not write it. proven: when the vehicle last confirmed that an own change
-    gave this name to the entry.
+    larger than before, though we did not write it.
     """
 
     entries: dict[bytes, DirEntry]
@@ -92,7 +91,6 @@ class Directory:
     complete: bool
     sizes: dict[bytes, int] = field(default_factory=dict)
     growing: dict[bytes, float] = field(default_factory=dict)
-    proven: dict[bytes, float] = field(default_factory=dict)
 
     def size_of(self, name: bytes) -> int:
         """Return the best known size of a listed name in bytes."""
@@ -210,12 +208,9 @@ class Directories:
         if size > before:
             directory.growing[name] = self.clock()
 
-    def put(self, path: bytes, entry: DirEntry | None, *, proven: bool = False) -> None:
+    def put(self, path: bytes, entry: DirEntry | None) -> None:
         """Note that we made, wrote, renamed or removed (None) this name. Directories below it are listed
-        again.
-
-        proven: the vehicle has just confirmed it.
-        """
+        again."""
         self.forget(path)
         parent, name = split(path)
         if entry is not None and entry.name != name:
@@ -225,12 +220,10 @@ class Directories:
             sweep.changes[name] = entry
         if directory is None:
             return
-        for facts in (directory.entries, directory.sizes, directory.growing, directory.proven):
+        for facts in (directory.entries, directory.sizes, directory.growing):
             facts.pop(name, None)
         if entry is not None:
             directory.entries[name] = entry
-            if proven:
-                directory.proven[name] = self.clock()
 
     @contextmanager
     def changing(self, *paths: bytes) -> Iterator[None]:
@@ -250,7 +243,7 @@ class Directories:
         """Note a rename, perhaps over another file, that the vehicle has just confirmed."""
         entry = self.entry(old)
         self.put(old, None)
-        self.put(new, entry, proven=True)
+        self.put(new, entry)
         if entry is None:
             self.expire(split(new)[0])
 
@@ -261,7 +254,6 @@ class Directories:
             sweep.void = True
         if directory is not None:
             directory.fresh_until = min(directory.fresh_until, self.clock())
-            directory.proven.clear()
 
     def forget(self, path: bytes) -> None:
         """Drop the listings of `path` and of all below it."""
@@ -311,9 +303,8 @@ class Directories:
         return Found(entry, directory)
 
     async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
-        """Return what the vehicle has at a path, whatever drafts say. The answer is a change of ours or a
-        listing that began at most `within` seconds ago; longer where listings take long (LOOK_FACTOR). 0:
-        list now.
+        """Return what the vehicle has at a path, whatever drafts say. It is listed now, or was listed at most
+        `within` seconds ago; longer where listings take long (LOOK_FACTOR).
 
         Raises:
             As ask, but None where its directory is gone.
@@ -322,8 +313,6 @@ class Directories:
         known, began = self.known(parent), None
         if known is not None and within:
             began = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
-            if known.proven.get(name, -inf) >= began:
-                return known.entries.get(name)
         try:
             return (await self.ask(parent, began=began)).entries.get(name)
         except (NotFound, NotADirectory):

@@ -136,7 +136,6 @@ class Draft:
         self.sending: SendBuffer | None = None
         self.sent_in_place = False
         self._held = ExtentSet()
-        self._changed = ExtentSet()
         self.lacked = False
 
     # --- what it is
@@ -147,15 +146,12 @@ class Draft:
         return self._held.covers(0, min(self.base_limit, self.size))
 
     @property
-    def under_way(self) -> bool:
-        """Whether it is sent, or gets its name, just now."""
-        return self.state in (State.SENDING, State.COMMITTING)
-
-    @property
     def unacked(self) -> int:
-        """Bytes that programs wrote and that are not ACKed yet."""
+        """Bytes that are to be sent, and not ACKed yet. A file is sent as a whole."""
         sending = self.sending
-        return self._changed.total if sending is None or sending.overtaken else sending.unacked
+        if sending is not None and not sending.overtaken:
+            return sending.unacked
+        return self.size if self.state in (State.DIRTY, State.SENDING) else 0
 
     @property
     def held(self) -> ExtentSet:
@@ -218,7 +214,7 @@ class Draft:
         self.content.put(offset, data)
         self.on(Event.CHANGED)
         self._held.add(offset, stop)
-        self._note_changed(min(offset, self.size), stop)
+        self._tell_changed(min(offset, self.size), stop)
         self.size = max(self.size, stop)
 
     def truncate(self, size: int) -> None:
@@ -231,14 +227,13 @@ class Draft:
             return
         if size > self.size:
             self.on(Event.CHANGED)
-            self._note_changed(self.size, size)
+            self._tell_changed(self.size, size)
         else:
             self.content.cut(size)
             if self.sending is not None:
                 self.sending.on_changed(size, size)
             self.on(Event.CHANGED if size else Event.EMPTIED)
-            for extents in (self._held, self._changed):
-                extents.discard(size, max(size, extents.end))
+            self._held.discard(size, max(size, self._held.end))
             self.base_limit = min(self.base_limit, size)
         self.size = size
 
@@ -283,7 +278,6 @@ class Draft:
         self.on(Event.PLACED)
         self.base, self.base_limit = Known(self.size, crc32=crc32), self.size
         self.sent_in_place = False
-        self._changed = ExtentSet()
         self.content.mark_unneeded()
 
     def lose_base(self) -> None:
@@ -309,16 +303,14 @@ class Draft:
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self._held.end <= self.size
-        assert self._changed.end <= self.size
         assert self.base_limit <= self.size
         assert (self.sending is not None) == (self.state is State.SENDING)
         assert self.base is not None or self.base_limit == 0
-        if self.under_way:
+        if self.state in (State.SENDING, State.COMMITTING):
             assert self.whole
 
     # --- inside
 
-    def _note_changed(self, start: int, stop: int) -> None:
-        self._changed.add(start, stop)
+    def _tell_changed(self, start: int, stop: int) -> None:
         if self.sending is not None:
             self.sending.on_changed(start, max(self.size, stop))

@@ -83,14 +83,15 @@ class Files:
         directories: Directories,
         invalidate: Callable[[bytes], None],
         is_changing: Callable[[bytes], bool],
+        on_replaced: Callable[[bytes], None],
         kept: KeptCache | None = None,
     ) -> None:
-        """`is_changing`: see Context.is_changing.
+        """`is_changing`: see Context.is_changing. `on_replaced(path)`: others replaced the file of that path.
 
         `proof_time`: seconds for which a proof that a version is the vehicle's file holds.
         """
         self.kept = kept
-        self._is_changing = is_changing
+        self._is_changing, self._on_replaced = is_changing, on_replaced
         self._store = store
         self.cache = cache
         self._clock = cache.clock
@@ -119,8 +120,7 @@ class Files:
         version, same = await self._opening.run(path, partial(self._open_version, path, found))
         keep_cache, direct_io = same and version.in_kernel, False
         for other in self.open_versions:
-            if other.path == path and other is not version:
-                direct_io |= not other.replaced or other.by_others
+            direct_io |= other.path == path and other is not version
         version.in_kernel = (
             not direct_io
         )  # the kernel may fetch pages for programs that read an older version
@@ -304,14 +304,15 @@ class Files:
 
     def kill(self, version: Version) -> None:
         """Make a version REPLACED, and with the newest one of a path all older ones."""
-        by_others = not self._is_changing(version.path)
-        newest = self._current.get(version.path) is version
-        older = [v for v in self.open_versions if newest and v.path == version.path]
+        path = version.path
+        newest = self._current.get(path) in (version, None)
+        older = [v for v in self.open_versions if newest and v.path == path]
         for one in dict.fromkeys((version, *older)):
             if not one.replaced:
-                one.by_others = by_others
-                one.replace(f"{one.path!r} changed on the vehicle after it was opened")
-                self._invalidate(one.path)
+                one.replace(f"{path!r} changed on the vehicle after it was opened")
+                self._invalidate(path)
+        if newest and not self._is_changing(path):
+            self._on_replaced(path)
 
     def forget_pages(self, path: bytes) -> None:
         """Drop the kernel's pages of a path: they may be of a file that had it before."""
@@ -336,10 +337,6 @@ class Files:
             version.on_restart(self._restarted_at)
 
     # --- we changed the file ourselves
-
-    def others_replaced(self, path: bytes) -> bool:
-        """Return whether a version of the path is open that others replaced: it may not be read any more."""
-        return any(v.path == path and v.by_others for v in self.open_versions)
 
     def kill_all(self, path: bytes) -> None:
         """Make all open versions of a path REPLACED: their handles must not read what we are about to write
@@ -459,11 +456,6 @@ class VersionHandle(OpenFile):
                     version.close_reader()
                 await trio.sleep(pause)
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
-
-    def require_not_replaced_by_others(self) -> None:
-        """Raise FileChanged if others replaced the file."""
-        if self._version.by_others:
-            self._version.require_not_replaced()
 
     def close(self) -> None:
         """Release the handle."""

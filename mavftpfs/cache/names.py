@@ -163,7 +163,7 @@ class Names:
         """Make a directory. Raises as VehicleStore."""
         async with self._changing(path):
             await self._context.store.make_directory(path)
-        self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
+        self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY))
 
     async def discard(self, path: bytes) -> None:
         """Remove a reserved name that is not needed any more. If that fails, it is removed after the next

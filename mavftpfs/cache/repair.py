@@ -154,8 +154,8 @@ class Cleaner:
             await self._names.remove(left)
         else:
             node = context.nodes.get(target)
-            if node is not None and node.draft is not None and node.draft.under_way:
-                return  # a new file is about to get the name: a later listing shows the outcome
+            if node is not None and node.delivery is not None:
+                return  # its delivery is under way: a later listing shows the outcome
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
             await self._names.rename(left, target, completes=owner is not None)
             if owner is not None:

@@ -97,6 +97,7 @@ class Tree:
             directories=self._directories,
             invalidate=self._invalidate,
             is_changing=self._is_changing,
+            on_replaced=self._on_replaced,
             kept=self._kept,
         )
         self._virtual = VirtualTrees(
@@ -504,6 +505,9 @@ class Tree:
 
     def _is_changing(self, remote: bytes) -> bool:
         return self._context.is_changing(remote)
+
+    def _on_replaced(self, remote: bytes) -> None:
+        self._context.on_replaced(remote)
 
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):

@@ -2,8 +2,7 @@
 
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
 one version share its bytes and its remote reader. When another file turns out to have the path, the version
-is REPLACED: its handles get FileChanged, and later opens start a new version. If others replaced the file,
-its handles never read the file that has the path now, even if we wrote that one.
+is REPLACED: its handles get FileChanged, and later opens start a new version.
 
 A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
@@ -162,13 +161,11 @@ class Version:
     clock.
 
     Attributes:
-        state: see VersionState.
         path: its present path. size: in bytes, by the open reply. mtime: None if not known to belong to this
             size. ours: we wrote it.
         proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the present session.
         compare_after: until then no listing is asked for only to compare it.
-        by_others: others replaced it.
         reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
             local disk, if it may have one. in_kernel: the kernel may have pages of it, and all of them are
             right.
@@ -191,13 +188,12 @@ class Version:
         self.mtime = mtime
         self.reader: Reader | None = None
         self.handles = 0
-        self.state = VersionState.CURRENT
         self.proven_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
-        self.ours = self.by_others = self.in_kernel = self.ignores_data = False
+        self.ours = self.in_kernel = self.ignores_data = False
         self.kept: Kept | None = None
         self.drops = 0
-        self._why = ""
+        self._why = ""  # it was replaced
         self._on_dropped = on_dropped
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
@@ -238,7 +234,6 @@ class Version:
     def on_opened(self, at: float) -> None:
         """See ReadSink: the bytes from now on are of the file that was opened at that time."""
         self.opened_at = max(self.opened_at, at)
-        self._look()
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes that are not here yet, up to the opened size."""
@@ -315,6 +310,13 @@ class Version:
     # --- life of the version
 
     @property
+    def state(self) -> VersionState:
+        """See VersionState."""
+        if self._why:
+            return VersionState.REPLACED
+        return VersionState.CURRENT if self.proven_at >= self.opened_at else VersionState.UNPROVEN
+
+    @property
     def current(self) -> bool:
         """Whether it is in the state CURRENT."""
         return self.state is VersionState.CURRENT
@@ -338,18 +340,12 @@ class Version:
     def prove(self, at: float) -> None:
         """Note a proof that the path was this file at that time."""
         self.proven_at = max(self.proven_at, at)
-        self._look()
 
     def on_restart(self, at: float) -> None:
         """Forget all proofs, because the vehicle restarted."""
         self.proven_at = self.compare_after = NEVER
         self.kept = None
         self.on_opened(at)
-
-    def _look(self) -> None:
-        if not self.replaced:
-            proven = self.proven_at >= self.opened_at
-            self.state = VersionState.CURRENT if proven else VersionState.UNPROVEN
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -360,7 +356,7 @@ class Version:
 
     def replace(self, why: str) -> None:
         """Become REPLACED, because another file has the path. Reads that wait get the error."""
-        self.state, self.kept, self._why = VersionState.REPLACED, None, why
+        self.kept, self._why = None, why
         self.close_reader()
         self.on_failed(FileChanged(why))
         self.clear()

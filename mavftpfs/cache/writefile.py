@@ -64,8 +64,7 @@ class ReadFile(OpenFile):
     @property
     def direct_io(self) -> bool:
         """Whether the kernel's pages could be those of another file that had the path."""
-        path = self._node.path
-        if self._context.nodes.has_another(path) or self._context.files.others_replaced(path):
+        if self._context.nodes.has_another(self._node.path):
             return True
         return self._node.draft is None and self._handle is not None and self._handle.direct_io
 
@@ -149,8 +148,6 @@ class ReadFile(OpenFile):
         """Read a file that was written here since the handle was opened, or that is not open yet."""
         node = self._node
         handle = self._handle
-        if handle is not None:
-            handle.require_not_replaced_by_others()
         if node.draft is not None:
             return await self._read_draft(node.draft, offset, offset + size)
         if handle is not None:

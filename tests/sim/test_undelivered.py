@@ -187,7 +187,14 @@ async def test_what_a_close_did_not_deliver_is_delivered_without_news(here: Rig,
     assert list(tree._writing._context.nodes) == []
 
 
-RENAMES = [("px4", 1), ("mavsdk", 1), *((name, nth) for name in ("px4-nuttx", "ardupilot5") for nth in (1, 2))]
+RENAMES = [
+    ("px4", 1),
+    ("mavsdk", 1),
+    ("px4-nuttx", 1),
+    ("px4-nuttx", 2),
+    ("ardupilot5", 1),
+    ("ardupilot5", 2),
+]
 """Which requests give a file its name instead of an old one."""
 
 

@@ -159,18 +159,6 @@ def test_what_we_changed_shows_at_once() -> None:
     assert directories.entry(b"/a") is None
 
 
-def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: HandClock) -> None:
-    directories = make(clock)
-    directory = put(directories, b"/")
-    clock.now = 3
-    directories.put(b"/a", file(b"a"))
-    assert directory.proven == {}
-    directories.put(b"/a", file(b"a"), proven=True)
-    assert directory.proven == {b"a": 3}
-    directories.expire(b"/")
-    assert directory.proven == {}
-
-
 @pytest.mark.holds("fault odd listing")
 def test_a_change_during_a_listing_beats_what_it_saw_and_lets_it_expire() -> None:
     directories = make()

@@ -205,7 +205,7 @@ class DraftMachine(RuleBasedStateMachine):
         if self.draft.sending is not None:
             self.draft.sending.check_point()
 
-    @rule(end=st.sampled_from(["placed", "refused", "interrupted, and placed", "interrupted"]))
+    @rule(end=st.sampled_from(["placed", "not placed", "not confirmed, and placed", "not confirmed"]))
     def finish(self, end: str) -> None:
         """Everything is sent: the remote file is the model."""
         sending = self.draft.sending
@@ -219,14 +219,14 @@ class DraftMachine(RuleBasedStateMachine):
             self.answer(0, 12)
         assert self.remote == self.model
         self.draft.on(Event.COMMITS)
-        if end.startswith("interrupted"):
+        if end.startswith("not confirmed"):
             self.draft.not_confirmed()
-        if end.endswith("placed"):
+        if end in ("placed", "not confirmed, and placed"):
             self.draft.delivered()
             self.base = bytes(self.model)
-        elif end == "refused":
-            self.draft.on(Event.REFUSED)
-        assert (self.draft.state is State.CLEAN) == end.endswith("placed")
+        elif end == "not placed":
+            self.draft.on(Event.NOT_PLACED)
+        assert (self.draft.state is State.CLEAN) == (end in ("placed", "not confirmed, and placed"))
 
     def give_up_if_overtaken(self) -> None:
         if self.draft.sending is None or self.draft.sending.overtaken:
