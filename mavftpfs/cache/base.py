@@ -46,22 +46,26 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """
     while True:
         node.require_current()
-        if node.base is None:
-            handle = await open_node(context, node)
-            if node.base is None:
-                node.base = handle
+        if node.base_handle is None:
+            opened = await open_node(context, node)
+            if node.base_handle is None:
+                node.base_handle = opened
             else:
-                handle.close()
-        base = node.base
-        if node.draft is not None and base.size < stop:
+                opened.close()
+        handle = node.base_handle
+        if node.draft is not None and handle.size < stop:
             raise FileChanged(f"{node.path!r} became shorter on the vehicle")
         try:
-            return await base.read(start, stop - start)
+            return await handle.read(start, stop - start)
         except (FileChanged, LocalProtocolError) as error:
-            if node.base is not base:
+            if node.base_handle is not handle:
                 continue  # we replaced the file ourselves meanwhile
-            if isinstance(error, FileChanged) and not node.removed and not context.is_changing(node.path):
-                context.on_replaced(node.path)
+            if (
+                isinstance(error, FileChanged)
+                and not node.removed
+                and not context.nodes.is_changing(node.path)
+            ):
+                context.files.on_replaced(node.path)
             raise
 
 

@@ -34,6 +34,7 @@ class Context:
     store: VehicleStore
     directories: Directories
     files: Files
+    nodes: Nodes
     options: CacheOptions
     clock: Callable[[], float]
     wall: Callable[[], float]
@@ -41,10 +42,13 @@ class Context:
     paths: PathLocks
     spool: Spool
     retry_later: Callable[[], None]
-    nodes: Nodes = field(default_factory=Nodes)
-    unfinished: Replacements = field(default_factory=Replacements)
     times: Times = field(default_factory=Times)
     blocked: bool = False
+
+    @property
+    def unfinished(self) -> Replacements:
+        """The replacements of files that are not finished."""
+        return self.nodes.unfinished
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""
@@ -76,12 +80,6 @@ class Context:
             return DirEntry(name, EntryKind.FILE, node.draft.size)
         return (await self.directories.get(parent)).entries.get(name)
 
-    def is_changing(self, path: bytes) -> bool:
-        """Return whether we are changing what the vehicle has under a path, or a change may have happened in
-        part."""
-        node = self.nodes.get(path)
-        return self.unfinished.is_unknown(path) or (node is not None and node.changing)
-
     def on_listed(self, path: bytes, directory: Directory) -> None:
         """Find in a new listing which files others replaced since they were opened or delivered here."""
         for node in self.nodes:
@@ -90,22 +88,9 @@ class Context:
             draft = node.draft
             if entry is None or draft is None or draft.base is None or directory.listed_at <= node.proven_at:
                 continue
-            if self.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
+            if self.nodes.is_changing(node.path) or draft.state not in (State.CLEAN, State.DIRTY):
                 continue
             if compare(draft.base, Listed(entry)) is Sameness.OTHER:
-                self.on_replaced(node.path)
+                self.files.on_replaced(node.path)
             elif draft.base.mtime is None and entry.size == draft.base.size:
                 draft.base = replace(draft.base, mtime=entry.mtime)
-
-    def on_replaced(self, path: bytes) -> None:
-        """Note that others replaced the file of a path. Handles that are open never read the new one. A draft
-        of which no byte of the old file is to stay goes on."""
-        node = self.nodes.get(path)
-        if node is None or node.delivery is not None:
-            return  # a delivery compares the base itself
-        draft = node.draft
-        if draft is not None:
-            draft.lose_base()
-        if draft is None or (draft.state is State.STALE and not draft.lacked):
-            self.nodes.replaced(node)
-            self.files.forget_pages(path)

@@ -113,8 +113,7 @@ class Deliverer:
     async def _deliver(self, node: Node, draft: Draft) -> None:
         context = self._context
         try:
-            if not context.unfinished.lacks_file(node.path):  # else it is mended in flight
-                context.require_disarmed()
+            context.require_disarmed()
             await self._try(node, draft)
             node.error, node.start_after = None, float("-inf")
         except MavftpfsError as error:
@@ -187,7 +186,7 @@ class Deliverer:
             if node.writers > 1:
                 return None
             # Where a part was delivered meanwhile, the vehicle has neither the old file nor the new one.
-            there: bool | None = False if node.generation == node.opened_at else None
+            there: bool | None = None if node.delivered_since_open else False
             try:
                 if context.unfinished.is_unknown(node.path):
                     await self._mend(node, draft)
@@ -441,6 +440,7 @@ class Deliverer:
             crc32 = draft.crc32()
         draft.delivered(crc32)
         node.generation += 1
+        node.delivered_since_open = True
         node.proven_at = context.clock()
         node.close_base()
         context.files.on_changed(node.path)

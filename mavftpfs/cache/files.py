@@ -29,6 +29,7 @@ import trio
 
 from mavftpfs.cache.directories import COST_FACTOR, Directories, Directory, Found
 from mavftpfs.cache.kept import KeptCache
+from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
@@ -81,17 +82,16 @@ class Files:
         *,
         proof_time: float,
         directories: Directories,
+        nodes: Nodes,
         invalidate: Callable[[bytes], None],
-        is_changing: Callable[[bytes], bool],
-        on_replaced: Callable[[bytes], None],
         kept: KeptCache | None = None,
     ) -> None:
-        """`is_changing`: see Context.is_changing. `on_replaced(path)`: others replaced the file of that path.
+        """`invalidate(path)`: the kernel's copies of a file are wrong.
 
         `proof_time`: seconds for which a proof that a version is the vehicle's file holds.
         """
         self.kept = kept
-        self._is_changing, self._on_replaced = is_changing, on_replaced
+        self._nodes = nodes
         self._store = store
         self.cache = cache
         self._clock = cache.clock
@@ -167,7 +167,7 @@ class Files:
         version = self._version(path)
         reader = await self._store.open_reader(path, version)
         try:
-            if reader.size < entry.size and not self._is_changing(path):
+            if reader.size < entry.size and not self._nodes.is_changing(path):
                 entry = await self._require_listed(path, reader.size)
         except BaseException:
             reader.close()
@@ -254,7 +254,7 @@ class Files:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
         soon = not now and self._clock() < version.compare_after
-        if not (soon or self._is_sure(version) or self._is_changing(version.path)):
+        if not (soon or self._is_sure(version) or self._nodes.is_changing(version.path)):
             await self._compare(version)
         version.require_not_replaced()
 
@@ -274,7 +274,7 @@ class Files:
             self.kill(version)
             return
         async with self.paths.steady(version) as present:
-            if present != path or self._is_changing(path):
+            if present != path or self._nodes.is_changing(path):
                 return  # it is compared under its new name, by the next read
         took = directory.ended_at - directory.listed_at
         version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
@@ -299,7 +299,11 @@ class Files:
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and not version.replaced
-            if known and directory.listed_at > version.proven_at and not self._is_changing(version.path):
+            if (
+                known
+                and directory.listed_at > version.proven_at
+                and not self._nodes.is_changing(version.path)
+            ):
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
@@ -311,8 +315,13 @@ class Files:
             if not one.replaced:
                 one.replace(f"{path!r} changed on the vehicle after it was opened")
                 self._invalidate(path)
-        if newest and not self._is_changing(path):
-            self._on_replaced(path)
+        if newest and not self._nodes.is_changing(path):
+            self.on_replaced(path)
+
+    def on_replaced(self, path: bytes) -> None:
+        """Note that others replaced the file of a path."""
+        if self._nodes.on_replaced(path):
+            self.forget_pages(path)
 
     def forget_pages(self, path: bytes) -> None:
         """Drop the kernel's pages of a path: they may be of a file that had it before."""

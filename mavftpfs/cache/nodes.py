@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import trio
 
 from mavftpfs.cache.draft import Draft, State
-from mavftpfs.cache.files import VersionHandle
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import Upload
+from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
@@ -51,14 +52,14 @@ class Node:
 
     path: its name, or the reserved name that it was hidden under. draft: its content here, if it was
     written. handles: how many are open; writers: how many of them are for writing. generation: counts how
-    often we changed its content on the vehicle; opened_at: that count when its first writer opened it.
-    removed: it has no name any more. hidden: it was unlinked while it was open, and is still on the vehicle
-    under a reserved name. error: why the last delivery failed. attempt: the present attempt to deliver it.
-    base: a handle on the vehicle's file. start_after: no upload begins by itself before that time
-    (infinite: only a close sends the file). proven_at: when the vehicle was last proven to have what the
-    draft says it has. lock: a program writes the file, a delivery is under way, or a call takes its name
-    away. delivery: the scope of the delivery under way. claims: how many calls wait for the lock to take
-    its name or content away; they go before deliveries.
+    often it was delivered; delivered_since_open: since its first writer opened it. removed: it has no name
+    any more. hidden: it was unlinked while it was open, and is still on the vehicle under a reserved name.
+    error: why the last delivery failed. attempt: the present attempt to deliver it. base_handle: on the
+    vehicle's file below the draft. start_after: no upload begins by itself before that time (infinite: only
+    a close sends the file). proven_at: when the vehicle was last proven to have what the draft says it has.
+    lock: a program writes the file, a delivery is under way, or a call takes its name away. delivery: the
+    scope of the delivery under way. claims: how many calls wait for the lock to take its name or content
+    away; they go before deliveries.
     """
 
     path: bytes
@@ -66,12 +67,12 @@ class Node:
     handles: int = 0
     writers: int = 0
     generation: int = 0
-    opened_at: int = 0
+    delivered_since_open: bool = False
     removed: bool = False
     hidden: bool = False
     error: MavftpfsError | None = None
     attempt: Attempt | None = None
-    base: VersionHandle | None = None
+    base_handle: OpenFile | None = None
     start_after: float = float("-inf")
     proven_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
@@ -88,7 +89,7 @@ class Node:
 
     @property
     def changing(self) -> bool:
-        """Whether we are changing the file that has its name on the vehicle (see Context.is_changing)."""
+        """Whether we are changing the file that has its name on the vehicle (see Nodes.is_changing)."""
         draft = self.draft
         return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
 
@@ -127,9 +128,9 @@ class Node:
 
     def close_base(self) -> None:
         """Close the handle on the vehicle's file: that is another file now, or is not needed."""
-        base, self.base = self.base, None
-        if base is not None:
-            base.close()
+        handle, self.base_handle = self.base_handle, None
+        if handle is not None:
+            handle.close()
 
     def lose_name(self) -> None:
         """Note that it has no name any more. Only programs that have it open need its bytes."""
@@ -155,9 +156,14 @@ class Node:
 
 
 class Nodes:
-    """All nodes that have a name, and those that are hidden."""
+    """All nodes that have a name, and those that are hidden.
+
+    Attributes:
+        hidden: by their reserved names. unfinished: replacements of files that are not finished.
+    """
 
     def __init__(self) -> None:
+        self.unfinished = Replacements()
         self._by_path: dict[bytes, Node] = {}
         self.hidden: dict[bytes, Node] = {}
         self._stale: list[Node] = []
@@ -198,6 +204,26 @@ class Nodes:
         self.detach(node)
         if not node.handles:
             node.drop_draft()
+
+    def is_changing(self, path: bytes) -> bool:
+        """Return whether we are changing what the vehicle has under a path, or a change may have happened in
+        part."""
+        node = self._by_path.get(path)
+        return self.unfinished.is_unknown(path) or (node is not None and node.changing)
+
+    def on_replaced(self, path: bytes) -> bool:
+        """Note that others replaced the file of a path. Handles that are open never read the new one. A draft
+        of which no byte of the old file is to stay goes on. Returns whether the path has no node any more."""
+        node = self._by_path.get(path)
+        if node is None or node.delivery is not None:
+            return False  # a delivery compares the base itself
+        draft = node.draft
+        if draft is not None:
+            draft.lose_base()
+        gone = draft is None or (draft.state is State.STALE and not draft.lacked)
+        if gone:
+            self.replaced(node)
+        return gone
 
     def replaced(self, node: Node) -> None:
         """Note that another file has the node's name. Open handles keep the node; later opens get a new

@@ -72,11 +72,6 @@ class Replacements:
         record = self._records.get(path)
         return record is not None and record.placed is not True
 
-    def lacks_file(self, path: bytes) -> bool:
-        """Return whether the name may have no file (see Replacement)."""
-        record = self._records.get(path)
-        return record is not None and record.lacks_file
-
     def on_unknown(self, path: bytes) -> Replacement:
         """Note that it is not known whether the new file has the name; return the record."""
         record = self._records.setdefault(path, Replacement())

@@ -23,6 +23,7 @@ from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import CLOCK_SET, KeptCache
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.missions import Missions
+from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.parameters import Parameters
@@ -90,14 +91,14 @@ class Tree:
         if keep is not None:
             self._kept = keep(self._directories, self._blocks)
             nursery.start_soon(self._kept.run)
+        nodes = Nodes()
         self._files = Files(
             store,
             self._blocks,
             proof_time=options.proof_time,
             directories=self._directories,
+            nodes=nodes,
             invalidate=self._invalidate,
-            is_changing=self._is_changing,
-            on_replaced=self._on_replaced,
             kept=self._kept,
         )
         self._virtual = VirtualTrees(
@@ -111,6 +112,7 @@ class Tree:
             store=store,
             directories=self._directories,
             files=self._files,
+            nodes=nodes,
             options=options,
             wall=wall,
             rng=rng or Random(),
@@ -502,12 +504,6 @@ class Tree:
         """A listing is to be given out: leftovers in it are mended first."""
         if not self._options.read_only:
             await self._writing.cleaner.on_swept(remote, directory)
-
-    def _is_changing(self, remote: bytes) -> bool:
-        return self._context.is_changing(remote)
-
-    def _on_replaced(self, remote: bytes) -> None:
-        self._context.on_replaced(remote)
 
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):

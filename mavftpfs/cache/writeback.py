@@ -21,7 +21,7 @@ from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
-from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.nodes import Node, Nodes
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory, describe, move
@@ -58,6 +58,7 @@ class Writeback:
         store: VehicleStore,
         directories: Directories,
         files: Files,
+        nodes: Nodes,
         options: CacheOptions,
         wall: Callable[[], float],
         rng: Random,
@@ -76,6 +77,7 @@ class Writeback:
             store=store,
             directories=directories,
             files=files,
+            nodes=nodes,
             options=options,
             clock=directories.clock,
             wall=wall,
@@ -168,7 +170,7 @@ class Writeback:
             node = context.nodes.need(path)
             if node.draft is None:
                 node.begin_draft(context.spool, base, context.clock())
-                node.base, handle = handle, node.base
+                node.base_handle, handle = handle, node.base_handle
         finally:
             if handle is not None:
                 handle.close()
@@ -206,7 +208,7 @@ class Writeback:
         async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
-            if node.writers or draft is None or self._context.is_changing(node.path):
+            if node.writers or draft is None or self._context.nodes.is_changing(node.path):
                 return
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
@@ -286,11 +288,12 @@ class Writeback:
     # --- delivering while nobody waits for it
 
     async def _try_all(self) -> None:
-        """Finish and deliver everything that failed or was refused: it may work now."""
+        """Finish and deliver everything that failed or was refused: it may work now. A file that a program
+        writes is left to its next fsync or close."""
         await self.cleaner.finish()
         for node in self._context.nodes:
             node.start_after = float("-inf")
-        await self._deliver_each(self._is_left_to_us)
+        await self._deliver_each(lambda node: not node.writers)
 
     async def _deliver_each(self, wanted: Callable[[Node], bool]) -> None:
         """Try once to deliver each file that is wanted, as long as it is; errors are kept with the file."""
@@ -319,10 +322,6 @@ class Writeback:
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
                 await self.cleaner.finish()
-                await self._deliver_each(lambda node: may_pass(node) and self._is_left_to_us(node))
+                await self._deliver_each(lambda node: may_pass(node) and not node.writers)
         finally:
             self._retrying = False
-
-    def _is_left_to_us(self, node: Node) -> bool:
-        """Return whether we deliver a file unasked: no program writes it, or its name may lack its file."""
-        return not node.writers or self._context.unfinished.lacks_file(node.path)

@@ -183,7 +183,7 @@ class WriteFile(ReadFile):
         super().__init__(parts, node)
         self._made = made
         if not node.writers:
-            node.opened_at = node.generation
+            node.delivered_since_open = False
         node.writers += 1
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:

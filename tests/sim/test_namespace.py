@@ -423,7 +423,7 @@ async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: 
     now = trio.current_time()
     shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True)
     await tree._writing.cleaner.on_swept(b"/d", shown)
-    assert unfinished.lacks_file(FILE)
+    assert unfinished.asides()
     torn.put(FILE, OLD)
     await tree.list(b"/d")
     assert not unfinished

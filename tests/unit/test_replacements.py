@@ -23,10 +23,8 @@ def test_what_is_known_of_a_name(
 ) -> None:
     unfinished = Replacements()
     assert not unfinished.is_unknown(FILE)
-    assert not unfinished.lacks_file(FILE)
     unfinished.put(FILE, Replacement(aside, placed))
     assert unfinished.is_unknown(FILE) == is_unknown
-    assert unfinished.lacks_file(FILE) == lacks_file
     assert unfinished.asides() == ({aside} if lacks_file else set())
 
 
