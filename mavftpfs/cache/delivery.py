@@ -380,11 +380,11 @@ class Deliverer:
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.on(Event.COMMITS)
         try:
-            compared = crc32 is not None or store.in_doubt()  # as quick as a listing, and tells more
+            compares_later = crc32 is not None or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
-                await self._names.rename(attempt.path, path, compared=compared)
+                await self._names.rename(attempt.path, path, compares_later=compares_later)
             else:
-                await self._names.replace(attempt.path, path, compared=compared)
+                await self._names.replace(attempt.path, path, compares_later=compares_later)
         except BaseException as error:
             draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)

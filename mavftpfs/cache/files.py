@@ -35,7 +35,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import NEVER, BlockCache, Version
+from mavftpfs.cache.versions import NEVER, PIECE, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -147,7 +147,7 @@ class Files:
         return version, False
 
     def _version(self, path: bytes, size: int = 0, mtime: int | None = None) -> Version:
-        return Version(self.cache, path, size, mtime, on_dropped=self._on_dropped)
+        return Version(self.cache, path, size, mtime, on_doubt=self._on_doubt)
 
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
         """Return whether a version is proven to be the vehicle's file now."""
@@ -236,9 +236,9 @@ class Files:
         """Return counters; `reads`: the files that are being fetched, with path, size and done in bytes."""
         recent = self._clock() - READING
         reads = [
-            {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.done}
+            {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.progress}
             for v in self.open_versions
-            if v.waited_for or (v.received_at > recent and v.done < v.size)
+            if v.waited_for or (v.received_at > recent and v.progress < v.size)
         ]
         kept = {} if self.kept is None else self.kept.status()
         return {"reads": reads, **kept}
@@ -330,7 +330,7 @@ class Files:
             current.in_kernel = False
         self._invalidate(path)
 
-    def _on_dropped(self, version: Version) -> None:
+    def _on_doubt(self, version: Version) -> None:
         """Drop the kernel's pages of a version whose bytes were dropped."""
         version.in_kernel = False
         current = self._current.get(version.path) is version
@@ -449,18 +449,18 @@ class VersionHandle(OpenFile):
         files, version = self._files, self._version
         for pause in (*PAUSES, 0.0):
             version.require_not_replaced()
-            drops = version.drops
+            doubts = version.doubts
             pieces: list[bytes | memoryview] = []
-            for start in range(offset, stop, files.cache.piece):
-                piece = await self._read_piece(start, min(start + files.cache.piece, stop))
+            for start in range(offset, stop, PIECE):
+                piece = await self._read_piece(start, min(start + PIECE, stop))
                 if piece is None:  # some of it was dropped meanwhile, or the file got another name
                     break
                 pieces.append(piece)
             else:
                 await files.compare(version, now=stop == self.size)
-                if version.drops == drops:
+                if version.doubts == doubts:
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-            if version.drops != drops:
+            if version.doubts != doubts:
                 if version.ignores_data:  # else another read opened the file anew, and waits for its bytes
                     version.close_reader()
                 await trio.sleep(pause)

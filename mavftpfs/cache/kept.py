@@ -129,14 +129,14 @@ class KeptCache:
         if kept is None or not kept.key.version:
             return
         for index in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)):
-            first, last = _extent(version.size, index)
-            if version.missing(max(start, first), min(stop, last)):
-                data = await self._run(self._disk.read, kept.key.block(first, last))
+            begin, end = _extent(version.size, index)
+            if version.missing(max(start, begin), min(stop, end)):
+                data = await self._run(self._disk.read, kept.key.block(begin, end))
                 if version.kept is not kept:
                     return
                 if data is not None:
-                    version.preload(first, data)
-                    kept.done.add(index)
+                    version.preload(begin, data)
+                    kept.on_disk.add(index)
 
     def _key(self, path: bytes, entry: DirEntry) -> FileKey | None:
         """Return the key of a freshly listed file, None if nothing of it may be kept or used now."""
@@ -193,7 +193,7 @@ class KeptCache:
         here: dict[Version, dict[int, bytearray]] = {}
         for version, index in self._blocks.used:
             block = version.block(index)
-            if block is None or version.kept is None or index in version.kept.done:
+            if block is None or version.kept is None or index in version.kept.on_disk:
                 continue
             if not version.missing(*_extent(version.size, index)):
                 here.setdefault(version, {})[index] = block
@@ -241,7 +241,7 @@ class KeptCache:
             if version.kept is not kept or version.block(index) is not block:
                 return  # it is in doubt, or another file, by now
             await self._run(self._disk.write, key.block(*_extent(version.size, index)), bytes(block))
-            kept.done.add(index)
+            kept.on_disk.add(index)
             self.written += 1
         if not _is_dated(kept.key):
             kept.key = key

@@ -56,11 +56,11 @@ class FileKey:
 
 @dataclass(slots=True)
 class Kept:
-    """The part of one version of a file that is on the disk, or will be. done: blocks that are on the
-    disk."""
+    """The part of one version of a file that is on the disk, or will be. on_disk: the blocks that are
+    there."""
 
     key: FileKey
-    done: set[int] = field(default_factory=set)
+    on_disk: set[int] = field(default_factory=set)
 
 
 class KeptDisk:

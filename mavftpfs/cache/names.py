@@ -181,13 +181,13 @@ class Names:
         *,
         completes: bool = False,
         over: bool = False,
-        compared: bool = False,
+        compares_later: bool = False,
     ) -> None:
         """Rename; both paths fit a request. A listing confirms it in doubt, and until this server was seen to
         rename.
 
-        completes: see VehicleStore. over: a file has the new name. compared: the caller compares the file
-        afterwards, so no listing is needed.
+        completes: see VehicleStore. over: a file has the new name. compares_later: the caller
+        compares the file afterwards, so no listing is needed.
 
         Raises:
             NotSupported: the card cannot rename, even if its server says that it did. AlreadyExists: the new
@@ -198,7 +198,7 @@ class Names:
             raise NotSupported("this server cannot rename")
         try:
             async with self._changing(old, new):
-                confirm = not compared and (store.traits.rename_works is None or store.in_doubt())
+                confirm = not compares_later and (store.traits.rename_works is None or store.in_doubt())
                 await store.rename(old, new, completes=completes, confirm=confirm)
         except NotSupported:
             if store.traits.rename_works is None:
@@ -213,7 +213,7 @@ class Names:
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
-        if not compared:
+        if not compares_later:
             store.traits.rename_works = True
         self._context.directories.rename(old, new)
 
@@ -279,9 +279,9 @@ class Names:
     # --- giving a verified file its name
 
     async def replace(
-        self, source: bytes, target: bytes, *, keep_old: bool = False, compared: bool = False
+        self, source: bytes, target: bytes, *, keep_old: bool = False, compares_later: bool = False
     ) -> bytes | None:
-        """Rename over a file that exists. compared: see rename.
+        """Rename over a file that exists. compares_later: see rename.
 
         keep_old: keep the old file, and return its reserved name, which is in `OwnNames.in_use`; None if the
         old file was gone.
@@ -296,7 +296,7 @@ class Names:
         traits = self._context.store.traits
         if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
             try:
-                await self.rename(source, target, over=True, compared=compared)
+                await self.rename(source, target, over=True, compares_later=compares_later)
                 traits.rename_replaces = True
                 return None
             except FtpNak as nak:
@@ -311,7 +311,7 @@ class Names:
         own.in_use.add(aside)
         stays = False
         try:
-            if await self._swap(source, target, aside, compared=compared):
+            if await self._swap(source, target, aside, compares_later=compares_later):
                 stays = keep_old or await self._discard_old(target, aside)
         finally:
             if not stays:
@@ -320,7 +320,7 @@ class Names:
 
     # --- inside
 
-    async def _swap(self, source: bytes, target: bytes, aside: bytes, *, compared: bool) -> bool:
+    async def _swap(self, source: bytes, target: bytes, aside: bytes, *, compares_later: bool) -> bool:
         """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
 
         Raises:
@@ -329,14 +329,14 @@ class Names:
         moved: bool | None = None  # not known
         try:
             try:
-                await self.rename(target, aside, compared=compared)
+                await self.rename(target, aside, compares_later=compares_later)
                 moved = True
             except FtpNak as nak:
                 gone = errno_for(nak) == errno.ENOENT
                 if not gone or await self._context.directories.current(target) is not None:
                     raise
                 moved = False
-            await self.rename(source, target, completes=moved, compared=compared)
+            await self.rename(source, target, completes=moved, compares_later=compares_later)
         except (OutcomeUnknown, trio.Cancelled):
             if moved is not False:
                 self._note_unfinished(target, aside, placed=None if moved else False)

@@ -63,20 +63,20 @@ class Cleaner:
         """Clean up after a directory was listed. Raises no MavftpfsError: the listing is right in any
         case."""
         unfinished = self._context.unfinished
-        owners = {record.aside: owner for owner, record in unfinished if record.aside is not None}
+        targets = {record.aside: target for target, record in unfinished if record.aside is not None}
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
         if directory is self._context.directories.known(path):
-            for owner, record in unfinished:
-                parent, name = split(owner)
+            for target, record in unfinished:
+                parent, name = split(target)
                 if parent == path and name in directory.entries and record.lacks_file:
-                    self._on_found(owner)
+                    self._on_found(target)
         if path in self._busy or not reserved:
             return
         self._busy.add(path)
         try:
             for left, ours in leftovers(path, reserved, self._is_dead)[:MAX_LEFTOVERS]:
                 if not self._context.blocked or left in unfinished.asides():
-                    await self._mend(left, ours, owners.get(left))
+                    await self._mend(left, ours, targets.get(left))
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
         finally:
@@ -94,7 +94,7 @@ class Cleaner:
         for path, record in context.unfinished:
             if record.lacks_file and record.aside not in context.own.in_use:
                 directories.add(split(path)[0])
-            elif record.aside is None and not self._is_asked_for(path):
+            elif record.aside is None and not self._waits_for_delivery(path):
                 context.unfinished.end(path)
             elif record.placed and (at_once or record.until <= now):
                 context.own.in_use.discard(record.aside or b"")
@@ -104,32 +104,28 @@ class Cleaner:
                 directories.add(split(path)[0])
                 record.until = now
         for directory in directories:
-            if await self._list(directory):
-                for path, record in context.unfinished:
-                    if split(path)[0] == directory and record.placed and record.until <= now:
-                        context.unfinished.end(path)
+            try:
+                await context.directories.ask(directory)
+            except MavftpfsError as error:
+                log.info("%r is mended at a later listing: %s", directory, error)
+                continue
+            for path, record in context.unfinished:
+                if split(path)[0] == directory and record.placed and record.until <= now:
+                    context.unfinished.end(path)
 
     # --- inside
-
-    async def _list(self, directory: bytes) -> bool:
-        try:
-            await self._context.directories.ask(directory)
-        except MavftpfsError as error:
-            log.info("%r is mended at a later listing: %s", directory, error)
-            return False
-        return True
 
     def _on_found(self, path: bytes) -> None:
         """Note that a name has a file. If a draft waits to be delivered there, its delivery compares that
         file; else nothing is unfinished any more."""
         unfinished = self._context.unfinished
         record = unfinished.get(path)
-        if record is not None and record.placed is None and self._is_asked_for(path):
+        if record is not None and record.placed is None and self._waits_for_delivery(path):
             record.aside = None
         else:
             unfinished.end(path)
 
-    def _is_asked_for(self, path: bytes) -> bool:
+    def _waits_for_delivery(self, path: bytes) -> bool:
         """Return whether a draft of this path waits to be delivered."""
         node = self._context.nodes.get(path)
         return node is not None and node.undelivered
@@ -146,10 +142,11 @@ class Cleaner:
                 del self._seen[next(iter(self._seen))]
         return now - seen[1] >= DEAD_AFTER
 
-    async def _mend(self, left: bytes, name: Reserved, owner: bytes | None) -> None:
-        """Remove what is left, or give it its name. owner: the path whose replacement left it, if known."""
+    async def _mend(self, left: bytes, name: Reserved, known_target: bytes | None) -> None:
+        """Remove what is left, or give it its name. known_target: the path whose replacement left it, if this
+        mount made it."""
         context, parent = self._context, split(left)[0]
-        target = owner or join(parent, name.target or b"recovered-o" + name.serial)
+        target = known_target or join(parent, name.target or b"recovered-o" + name.serial)
         if name.kind is not Kind.OLD or await self._exists(target):
             await self._names.remove(left)
         else:
@@ -157,9 +154,9 @@ class Cleaner:
             if node is not None and node.delivery is not None:
                 return  # its delivery is under way: a later listing shows the outcome
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
-            await self._names.rename(left, target, completes=owner is not None)
-            if owner is not None:
-                self._on_found(owner)
+            await self._names.rename(left, target, completes=known_target is not None)
+            if known_target is not None:
+                self._on_found(known_target)
 
     async def _exists(self, path: bytes) -> bool:
         with suppress(NotFound, NotADirectory):

@@ -14,9 +14,9 @@ T = TypeVar("T")
 
 @dataclass(slots=True, eq=False)
 class _Call(Generic[T]):
-    """done: it ended; results: one, or none after an error or a cancellation."""
+    """ended: its work ended; results: one, or none after an error or a cancellation."""
 
-    done: trio.Event = field(default_factory=trio.Event)
+    ended: trio.Event = field(default_factory=trio.Event)
     results: list[T] = field(default_factory=list)
     error: Exception | None = None
 
@@ -47,8 +47,8 @@ class SingleFlight(Generic[K, T]):
                     await self._run(key, call, work)
                 else:
                     self._nursery.start_soon(self._run, key, call, work)
-            if not call.done.is_set():
-                await call.done.wait()
+            if not call.ended.is_set():
+                await call.ended.wait()
             if call.results:
                 return call.results[0]
             if call.error is not None:
@@ -62,4 +62,4 @@ class SingleFlight(Generic[K, T]):
             call.error = error
         finally:
             del self._running[key]
-            call.done.set()
+            call.ended.set()

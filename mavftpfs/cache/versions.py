@@ -94,8 +94,7 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
-        self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
-        self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
+        self.reads = trio.Semaphore(max(1, budget // 2 // (PIECE + BLOCK_SIZE)))
         """Each read that waits for a piece has it: its piece is not evicted, and all such pieces take at most
         half of the budget. It is a lock, see `pathlocks`: a task that holds a path alone must not wait for
         it."""
@@ -140,7 +139,7 @@ class _Waiter:
     start: int
     stop: int
     missing: list[tuple[int, int]]
-    done: trio.Event
+    woken: trio.Event
     scope: trio.CancelScope
     error: Exception | None = None
 
@@ -170,7 +169,7 @@ class Version:
             local disk, if it may have one. in_kernel: the kernel may have pages of it, and all of them are
             right.
         ignores_data: what comes from the present reader is ignored, until a new one is opened.
-        drops: how often all bytes were dropped because they were in doubt.
+        doubts: how often all bytes were dropped because they were in doubt.
     """
 
     def __init__(
@@ -180,9 +179,9 @@ class Version:
         size: int = 0,
         mtime: int | None = None,
         *,
-        on_dropped: Callable[[Version], None] = lambda version: None,
+        on_doubt: Callable[[Version], None] = lambda version: None,
     ) -> None:
-        """`on_dropped` is called when its bytes are dropped in doubt: the kernel may have copies."""
+        """`on_doubt` is called when its bytes are dropped in doubt: the kernel may have copies."""
         self.path = path
         self.size = size
         self.mtime = mtime
@@ -192,9 +191,9 @@ class Version:
         self.opened_at = self.compare_after = NEVER
         self.ours = self.in_kernel = self.ignores_data = False
         self.kept: Kept | None = None
-        self.drops = 0
+        self.doubts = 0
         self._why = ""  # it was replaced
-        self._on_dropped = on_dropped
+        self._on_doubt = on_doubt
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
@@ -216,7 +215,7 @@ class Version:
         return bool(self._waiters)
 
     @property
-    def done(self) -> int:
+    def progress(self) -> int:
         """How many of the file's bytes came, or were here before."""
         return min(self.size, max(self.received, self._present.total))
 
@@ -255,14 +254,14 @@ class Version:
         for at, stop in self._present.missing(offset, min(offset + len(data), self.size)):
             while at < stop:
                 index = at // BLOCK_SIZE
-                first = index * BLOCK_SIZE
+                block_start = index * BLOCK_SIZE
                 block = self._blocks.get(index)
                 if block is None:
-                    length = min(BLOCK_SIZE, self.size - first)
+                    length = min(BLOCK_SIZE, self.size - block_start)
                     self._cache.add(self, index, length)
                     block = self._blocks[index] = bytearray(length)
-                end = min(stop, first + BLOCK_SIZE)
-                block[at - first : end - first] = whole[at - offset : end - offset]
+                end = min(stop, block_start + BLOCK_SIZE)
+                block[at - block_start : end - block_start] = whole[at - offset : end - offset]
                 self._present.add(at, end)
                 at = end
 
@@ -274,7 +273,7 @@ class Version:
         for waiter in self._waiters:
             missing = self.missing(waiter.start, waiter.stop)
             if not missing:
-                waiter.done.set()
+                waiter.woken.set()
             elif missing != waiter.missing:
                 waiter.scope.deadline = trio.current_time() + self._cache.patience
             waiter.missing = missing
@@ -289,23 +288,23 @@ class Version:
         if self.ignores_data:
             return
         self.ignores_data = True
-        self.drops += 1
+        self.doubts += 1
         for index in list(self._blocks):
             self.evict(index)
         self.ask_again()
-        self._on_dropped(self)
+        self._on_doubt(self)
 
     def on_failed(self, error: Exception) -> None:
         """Reads that wait get the error; later ones ask again."""
         for waiter in self._waiters:
-            if not waiter.done.is_set():
+            if not waiter.woken.is_set():
                 waiter.error = error
-                waiter.done.set()
+                waiter.woken.set()
 
     def ask_again(self) -> None:
         """Make reads that wait ask again for their missing bytes, because their reader is gone."""
         for waiter in self._waiters:
-            waiter.done.set()
+            waiter.woken.set()
 
     # --- life of the version
 
@@ -397,9 +396,11 @@ class Version:
         while start < stop:
             index = start // BLOCK_SIZE
             self._cache.used.move_to_end((self, index))
-            first = index * BLOCK_SIZE
-            end = min(stop, first + BLOCK_SIZE)
-            parts.append(memoryview(self._blocks[index])[start - first : end - first].toreadonly())
+            block_start = index * BLOCK_SIZE
+            end = min(stop, block_start + BLOCK_SIZE)
+            parts.append(
+                memoryview(self._blocks[index])[start - block_start : end - block_start].toreadonly()
+            )
             start = end
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
@@ -419,16 +420,16 @@ class Version:
         self._waiters.append(waiter)
         try:
             with scope:
-                await waiter.done.wait()
+                await waiter.woken.wait()
         finally:
             self._waiters.remove(waiter)
-            if not waiter.done.is_set() and self.reader is not None:
+            if not waiter.woken.is_set() and self.reader is not None:
                 self.reader.drop()
                 for other in self._waiters:
                     self.reader.want(other.start, other.stop, demand=True)
         if waiter.error is not None:
             raise waiter.error.with_traceback(None)
-        if not waiter.done.is_set():
+        if not waiter.woken.is_set():
             raise RequestTimeout(f"no data came for {self._cache.patience:g} s")
 
     def check_invariants(self) -> None:

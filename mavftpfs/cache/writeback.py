@@ -95,7 +95,7 @@ class Writeback:
         self.cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, throttle)
         self._nursery = nursery
-        self._retrying = False
+        self._retrying, self._news = False, trio.Event()
         self.namespace = Namespace(context, names, deliverer)
         self._parts = Parts(context, deliverer, throttle, self.namespace)
 
@@ -265,7 +265,8 @@ class Writeback:
     def retry(self) -> None:
         """Deliver what no program writes any more: the vehicle is back, or may be written again."""
         if self._context.unfinished or self.undelivered():
-            self._nursery.start_soon(self._try_all)
+            self._news.set()
+            self._retry_later()
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes. bytes_undelivered: of whole files; bytes_held: what they take
@@ -287,14 +288,6 @@ class Writeback:
 
     # --- delivering while nobody waits for it
 
-    async def _try_all(self) -> None:
-        """Finish and deliver everything that failed or was refused: it may work now. A file that a program
-        writes is left to its next fsync or close."""
-        await self.cleaner.finish()
-        for node in self._context.nodes:
-            node.start_after = float("-inf")
-        await self._deliver_each(lambda node: not node.writers)
-
     async def _deliver_each(self, wanted: Callable[[Node], bool]) -> None:
         """Try once to deliver each file that is wanted, as long as it is; errors are kept with the file."""
         for node in self._context.nodes:
@@ -314,14 +307,25 @@ class Writeback:
             self._nursery.start_soon(self._retry)
 
     async def _retry(self) -> None:
-        """Try again, with growing pauses, as long as that may help. A link may fail and return between two
-        heartbeats, and nothing tells of that."""
+        """End unfinished replacements, and deliver what no program writes: with growing pauses as long as
+        that may help, because a link may fail and return between two heartbeats. When there are news of the
+        vehicle, everything is tried at once, also what was refused."""
         nodes, unfinished, (pause, longest) = self._context.nodes, self._context.unfinished, PAUSES
         try:
-            while unfinished or any(n.undelivered and may_pass(n) for n in nodes):
-                await trio.sleep(pause)
-                pause = min(2 * pause, longest)
+            while self._news.is_set() or unfinished or any(n.undelivered and may_pass(n) for n in nodes):
+                with trio.move_on_after(pause):
+                    await self._news.wait()
+                is_new, pause = self._news.is_set(), min(2 * pause, longest)
+                if is_new:
+                    self._news, pause = trio.Event(), PAUSES[0]
+                    for node in nodes:
+                        node.start_after = float("-inf")
                 await self.cleaner.finish()
-                await self._deliver_each(lambda node: may_pass(node) and not node.writers)
+                await self._deliver_each(partial(self._is_left_to_us, is_new))
         finally:
             self._retrying = False
+
+    @staticmethod
+    def _is_left_to_us(is_new: bool, node: Node) -> bool:
+        """Return whether a file is to be delivered unasked."""
+        return not node.writers and (is_new or may_pass(node))
