@@ -202,27 +202,37 @@ class _Delivery:
     def __init__(self, socket: Path) -> None:
         self._socket = socket
         self._said_at: float | None = None
+        self._explained = False
         self._in_place = sys.stderr.isatty()
 
     def show(self) -> None:
         """Ask the mount what it delivers, and say so; called about each second."""
         try:
             status = control.ask(self._socket, {"command": "status"}, timeout=PATIENCE)["status"]
-        except control.ControlError:
+        except control.NobodyThere:
             return  # it ends just now
+        except control.ControlError as exc:
+            self._say(f"{exc}; if it is stopped, `fg` continues it; fusermount3 -uz unmounts without it")
+            return
         # A mount that is still in use has held bytes, too, but does not end.
         line = report.delivery_line(status) if status["state"] == "unmounting" else ""
-        now = time.monotonic()
-        if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
+        if not line:
             return
-        if self._said_at is None:
+        if not self._explained:
             self._explain(status["pid"])
-        self._said_at = now
+        self._say(line)
+
+    def _say(self, line: str) -> None:
+        """Say a line in the place of the last one; where that is a file, not too often."""
+        now = time.monotonic()
         if self._in_place:
             shown = line[: shutil.get_terminal_size().columns - 1]
             print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
+        elif self._said_at is not None and now < self._said_at + SAY_AGAIN:
+            return
         else:
             say(line)
+        self._said_at = now
 
     def end(self) -> None:
         """Leave the line."""
@@ -230,6 +240,7 @@ class _Delivery:
             print(file=sys.stderr)
 
     def _explain(self, pid: int) -> None:
+        self._explained = True
         from mavftpfs.client.leftovers import recovered_directory
         from mavftpfs.mount.farewell import DRAIN_LIMIT
 

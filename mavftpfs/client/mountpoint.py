@@ -78,8 +78,12 @@ def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
         DeadMount: a mount that was killed is still there.
         MountFailed: anything else, and what to do about it.
     """
+    if is_dead(path, table=table):
+        raise DeadMount(
+            f"mountpoint {path} is a dead mount whose program is gone; run: mavftpfs umount {path}"
+        )
     if is_ours(path, table=table):
-        raise MountFailed(_describe_mounted(path))
+        raise MountFailed(f"a vehicle is already mounted on {path}; run: mavftpfs umount {path}")
     try:
         mode = os.stat(path).st_mode
     except OSError as exc:
@@ -123,6 +127,17 @@ def is_ours(path: str, *, table: str = MOUNT_TABLE) -> bool:
     """Return whether the topmost mount on `path` is of this program."""
     mount = mounts(table).get(path)
     return mount is not None and mount.type == OUR_TYPE
+
+
+def is_dead(path: str, *, table: str = MOUNT_TABLE) -> bool:
+    """Return whether the mount on `path` is of this program, and has lost its process."""
+    if not is_ours(path, table=table):
+        return False
+    try:
+        os.statvfs(path)  # the kernel may still know the answer to a stat
+    except OSError as exc:
+        return exc.errno in (errno.ENOTCONN, errno.ECONNABORTED)
+    return False
 
 
 def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
@@ -210,19 +225,10 @@ def stderr_of() -> Iterator[Callable[[], str]]:
 
 def _describe(path: str, exc: OSError) -> str:
     if exc.errno == errno.ENOTCONN:
-        return f"mountpoint {path} is a dead mount whose program is gone; run: mavftpfs umount {path}"
+        return f"mountpoint {path} is a dead mount of another program; run: fusermount3 -u {path}"
     if exc.errno == errno.ENOENT:
         return f"mountpoint {path} does not exist; run: mkdir -p {path}"
     return f"mountpoint {path}: {os.strerror(exc.errno or errno.EIO)}"
-
-
-def _describe_mounted(path: str) -> str:
-    try:
-        os.stat(path)
-    except OSError as exc:
-        if exc.errno == errno.ENOTCONN:
-            raise DeadMount(_describe(path, exc)) from exc
-    return f"a vehicle is already mounted on {path}; run: mavftpfs umount {path}"
 
 
 def _describe_unmount(path: str, said: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import pyfuse3
 import trio
 
-from mavftpfs.client.mountpoint import stderr_of, unmount, why_not_mounted
+from mavftpfs.client.mountpoint import is_dead, stderr_of, unmount, why_not_mounted
 from mavftpfs.mount.handles import Presentation
 from mavftpfs.mount.options import MountOptions
 from mavftpfs.shared.errors import MountFailed
@@ -83,6 +83,8 @@ def kernel_mount(
             unmount(mountpoint, lazy=True)
         else:
             pyfuse3.close(unmount=True)
+            if is_dead(mountpoint):  # libfuse leaves it if the kernel aborted it: `umount -f` of one in use
+                unmount(mountpoint, lazy=True)
 
 
 @contextmanager

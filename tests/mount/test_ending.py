@@ -191,6 +191,15 @@ def test_a_mount_with_few_descriptors_and_idle_connections_ends_in_order(
     assert process.text().count("no descriptor") <= 1
 
 
+def test_a_mount_that_the_kernel_aborted_is_gone(field: Field, big_tree: Path) -> None:
+    """`umount -f` of one in use fails, and has cut the programs off all the same."""
+    mount = field.mount(field.sim(big_tree).source)
+    with mount.started("sleep", "600", cwd=mount.path):
+        assert mount.run("umount", "-f", mount.path, code=None).returncode != 0
+        assert mount.alive_or_ended().wait() == 0
+        assert not mounted_at(mount.path)
+
+
 def test_a_busy_mount_refuses_umount_and_goes_on(field: Field, big_tree: Path) -> None:
     mount = field.mount(field.sim(big_tree).source)
     with mount.started("sleep", "600", cwd=mount.path):

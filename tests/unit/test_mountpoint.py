@@ -51,7 +51,8 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
     [
         ("missing", None, "mkdir -p"),
         ("file", None, "not a directory"),
-        ("file", errno.ENOTCONN, "mavftpfs umount"),
+        ("file", errno.ENOTCONN, "fusermount3 -u"),
+        ("ours", errno.ENOTCONN, "mavftpfs umount"),
         ("file", errno.EACCES, "Permission denied"),
         ("ours", None, "already mounted"),
     ],
@@ -68,6 +69,7 @@ def test_a_bad_mountpoint(
     with monkeypatch.context() as patch:
         if number is not None:
             patch.setattr(os, "stat", fail)
+            patch.setattr(os, "statvfs", fail)
         with pytest.raises(MountFailed, match=reason):
             check_mountpoint(str(tmp_path / name), table=known)
 
