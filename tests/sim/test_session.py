@@ -14,14 +14,15 @@ import trio
 from mavftpfs.client.connect import _list_root
 from mavftpfs.client.options import Options
 from mavftpfs.protocol.operations import OpenRequest
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN, OtherClients
 from mavftpfs.session.scheduler import Scheduler, SessionUser
-from mavftpfs.session.serversession import REOPENS, SILENCE_ARDUPILOT, STALL
+from mavftpfs.session.serversession import REOPENS, SILENCE_ARDUPILOT, SILENCE_PX4, STALL
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
     FileChanged,
+    FtpNak,
     MavftpfsError,
     NoFtp,
     RequestTimeout,
@@ -315,6 +316,38 @@ async def _tolerate_refusals(work: Callable[[], object]) -> None:
             await work()  # type: ignore[misc]
         except MavftpfsError:
             await trio.sleep(0.3)
+
+
+@pytest.mark.parametrize("heard", [False, True])
+async def test_a_taken_session_is_waited_out_then_reset_if_nobody_is_heard_then_given_up(heard: bool) -> None:
+    here = Rig("ardupilot", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        here.faults.refuse(Opcode.OPEN_FILE_RO, NakCode.NO_SESSIONS_AVAILABLE, times=99)
+        if heard:
+            connection.vehicle.foreign_at = trio.current_time() + SILENCE_PX4
+        with pytest.raises(SessionBusy):
+            await connection.scheduler.server.open(path("ardupilot", "f"))
+        assert not connection.scheduler.server.maybe_open
+        silences = [later - earlier for earlier, later in pairwise(here.faults.times(Opcode.OPEN_FILE_RO))]
+        assert silences[:2] == pytest.approx([SILENCE_ARDUPILOT, SILENCE_PX4], abs=0.2)
+        assert here.count(Opcode.RESET_SESSIONS) == len(silences[2:]) == (0 if heard else 1)
+
+
+@pytest.mark.parametrize("may_be_ours", ["", "sent twice", "copies come late"])
+async def test_an_open_that_plainly_fails_costs_no_silence(may_be_ours: str) -> None:
+    """If an open of ours may have worked, that is closed before it is asked again."""
+    here = Rig("ardupilot", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        here.faults.refuse(Opcode.OPEN_FILE_RO, NakCode.FAIL, times=99)
+        if may_be_ours == "sent twice":
+            here.faults.lose_reply_to(Opcode.OPEN_FILE_RO)
+        if may_be_ours == "copies come late":
+            connection.scheduler.doubt.raise_it(may_be_ours)
+        with pytest.raises(FtpNak):
+            await connection.scheduler.server.open(path("ardupilot", "f"))
+        opens = here.faults.times(Opcode.OPEN_FILE_RO)
+        assert opens[-1] - opens[0] < SILENCE_ARDUPILOT
+        assert bool(here.count(Opcode.TERMINATE_SESSION)) is bool(may_be_ours)
 
 
 ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
