@@ -358,9 +358,10 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
 
     def stopped() -> str:
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"
-        return (
-            f"{line}; {bar.name} was on its way: look what is there before you use it" if bar.name else line
-        )
+        if not bar.name:
+            return line
+        left = "the vehicle has what it had" if bar.untouched else "look what is there before you use it"
+        return f"{line}; {bar.name} was on its way: {left}"
 
     with _on_interrupt(stopped), shown(bar):
         with_session(args, work, component, writing=True)

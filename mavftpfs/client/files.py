@@ -176,7 +176,7 @@ class Writing:
 
 
 @asynccontextmanager
-async def written(file: File) -> AsyncIterator[None]:
+async def written(file: File) -> AsyncIterator[Writing]:
     """Write a file in the body. After it the file is delivered; after an error it is taken back.
 
     Raises:
@@ -184,7 +184,7 @@ async def written(file: File) -> AsyncIterator[None]:
     """
     writing = Writing(file)
     try:
-        yield
+        yield writing
     except BaseException as exc:
         await writing.fail(exc)
     await writing.deliver()

@@ -20,7 +20,8 @@ WAITING = "waiting for the vehicle"
 
 
 class Progress:
-    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is."""
+    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is. untouched: under the name of
+    the file that is being sent the vehicle has what it had."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -31,6 +32,7 @@ class Progress:
         self.size = self.here = 0
         self.state = ""
         self.lost = False
+        self.untouched = True
 
     def plan(self, files: int, total: int) -> None:
         """Note how much there is to do in all, from now on; no files: nothing."""
@@ -40,6 +42,7 @@ class Progress:
     def begin(self, name: str, size: int, here: int = 0) -> None:
         """Begin a file, or begin it again; `here` bytes of it need not move."""
         self.name, self.size, self.here, self.state = name, size, here, ""
+        self.untouched = True
 
     def at(self, here: int) -> None:
         """Note how many bytes of the file are safe."""

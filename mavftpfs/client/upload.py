@@ -210,8 +210,12 @@ async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Pro
         except CrossDevice:  # this server cannot rename
             source.seek(0)
     file = await emptied(session.files, remote)
-    async with watched(session, remote, progress), written(file):
-        return await _copy(source, file)
+    progress.untouched = False
+    try:
+        async with watched(session, remote, progress), written(file) as writing:
+            return await _copy(source, file)
+    finally:
+        progress.untouched = writing.there is False
 
 
 async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
@@ -227,6 +231,7 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
         if exc.there is not False:
             await _remove(files, beside)
         raise NotDelivered(str(exc), there=False) from exc.__cause__  # `remote` was not touched
+    progress.untouched = False
     try:
         await files.rename(beside, remote)
     except BaseException as exc:

@@ -135,7 +135,7 @@ class Watch:
 
     def _tell_of(self, system: int, news: str) -> None:
         self._end_step()
-        stopped = isinstance(self._step, Look | Fetch) and self._scope.cancel_called
+        stopped = isinstance(self._step, Fetch) and self._scope.cancel_called
         self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
 
     def _end_step(self) -> None:

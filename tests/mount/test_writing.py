@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import command
+from tests.support.mounts import command, wait_until
 from tests.support.places import FOLDERS, NO_RENAME, start_place
 from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
@@ -179,3 +180,28 @@ def test_put_mv_and_rm_without_a_mount(field: Field, tiny_tree: Path) -> None:
     subprocess.run(["diff", "-r", local, card], check=True, timeout=30)
     command("rm", "-r", source, "/new", "/sizes")
     assert list(card.iterdir()) == []
+
+
+def test_a_put_that_is_interrupted_says_that_the_old_file_is_there(field: Field, tmp_path: Path) -> None:
+    card = field.local("card")
+    (card / "f").write_bytes(b"old")
+    (tmp_path / "f").write_bytes(os.urandom(500_000))
+    vehicle = field.sim(card)
+    argv = (
+        sys.executable,
+        "-m",
+        "mavftpfs",
+        "put",
+        vehicle.source,
+        tmp_path / "f",
+        "/f",
+        "-o",
+        "bwlimit=50000",
+    )
+    with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True, cwd=PROJECT) as put:
+        wait_until("it is being sent", lambda: any(path.stat().st_size > 10_000 for path in card.iterdir()))
+        put.send_signal(signal.SIGINT)
+        said = put.communicate(timeout=60)[1]
+    assert said.endswith("0 of 1 files are on the vehicle; /f was on its way: the vehicle has what it had\n")
+    assert put.returncode == 130
+    assert [path.read_bytes() for path in card.iterdir()] == [b"old"]
