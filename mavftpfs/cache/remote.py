@@ -159,8 +159,8 @@ class Upload(Protocol):
         ...
 
     async def end(self) -> None:
-        """Let it go, finished or not: Terminate, best effort, and ask the source for nothing more. It may be
-        called twice, and raises nothing."""
+        """Let it go, finished or not, and ask the source for nothing more. If its file is open it is closed
+        soon, and before its name changes. It may be called twice, and raises nothing."""
         ...
 
 

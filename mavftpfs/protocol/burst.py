@@ -152,11 +152,6 @@ class BurstTransfer(ReadTransfer):
         self._gave_up = False
 
     @property
-    def bursting(self) -> bool:
-        """Whether a burst is running."""
-        return self._burst is not None
-
-    @property
     def idle(self) -> bool:
         """Whether nothing is wanted, on its way or streaming."""
         return self._burst is None and super().idle

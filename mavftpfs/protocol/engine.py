@@ -16,12 +16,11 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from operator import attrgetter
 
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
-from mavftpfs.protocol.requests import Operation, Priority, Request, encode
+from mavftpfs.protocol.requests import Operation, Request, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
@@ -143,13 +142,14 @@ class Engine:
         if op.patience == inf:
             op.patience = self._op_deadline
         self._ops.append(op)
+        self._ops.sort(key=lambda one: not one.urgent)
 
     def take_finished(self) -> list[Operation]:
         """Return the operations that ended since the last call."""
         finished, self._finished = self._finished, []
         return finished
 
-    def drop(self, op: Operation) -> None:
+    def remove(self, op: Operation) -> None:
         """Forget an operation, ended or not; late replies to it are discarded. A second call is harmless."""
         if op not in self._ops:
             return
@@ -181,7 +181,7 @@ class Engine:
             op = request.op
             op.on_reply(request, reply, now)
             if op.done:
-                self.drop(op)
+                self.remove(op)
 
     def receive_run(self, wires: Sequence[bytes], now: float) -> int:
         """Take replies of 251 bytes that came together as `receive` does; return how many were malformed."""
@@ -194,7 +194,7 @@ class Engine:
                 self._on_answers(run[-1][0], len(run), now)
                 op.on_run(run, now)
                 if op.done:
-                    self.drop(op)
+                    self.remove(op)
             else:
                 try:
                     self.receive(reply_of(replies[at]), now)
@@ -256,7 +256,7 @@ class Engine:
         self._heard_at = now
         op.progress_at = now
         if op.done:
-            self.drop(op)
+            self.remove(op)
         return True
 
     # --- what goes out
@@ -265,13 +265,11 @@ class Engine:
         """Return the payloads (251 bytes each) to send now, most urgent first, within the window."""
         wires: list[bytes] = []
         self.flow.begin()
-        if len(self._ops) > 1:
-            self._ops.sort(key=attrgetter("priority"))
         starved = True
         for op in self._ops.copy():
             starved = starved and self._serve(op, now, wires)
             if op.done:
-                self.drop(op)
+                self.remove(op)
         if starved:
             self.flow.on_starved()
         if self.flow.budget is not None and self.flow.budget.exhausted:
@@ -289,15 +287,13 @@ class Engine:
         if op.done or not op.waits(now):
             return True
         ledger = self._ledger
-        # Metadata may use one slot more than bulk work: a full window must not make it wait.
-        urgent = op.rank is Priority.METADATA
+        # An urgent one may use one slot more than bulk work: a full window must not make it wait.
+        urgent = op.urgent
         in_flight = len(ledger.flying) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
-        if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
-            room = self.flow.room(in_flight - unheard, now, paced=op.paced)
         if room <= 0 and urgent and in_flight < self.flow.most_beside:
-            # A window that shrank may be full of requests that get no answer. Metadata passes those, too.
-            others = sum(other.sent and other.rank is Priority.METADATA for other in self._ops)
+            # A window that shrank may be full of requests that get no answer. Urgent ones pass those, too.
+            others = sum(other.sent and other.urgent for other in self._ops)
             room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room
         while left > 0:
@@ -358,9 +354,9 @@ class Engine:
                 # silence proves nothing then (servers.md 4).
                 due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(request)
                 paused = request.manner.ordered and not flow.starved and len(ledger.flying) > _FEW
-                patience = flow.pause if paused else 0.0
+                pause = flow.pause if paused else 0.0
                 # A stream of other answers is no pause.
-                request.timer = max(due, min(due, self._heard_at) + patience)
+                request.timer = max(due, min(due, self._heard_at) + pause)
             if request.timer > now:
                 self._due = min(self._due, request.timer)
                 continue
@@ -380,4 +376,4 @@ class Engine:
             if (op in late or op.progress_at + op.patience <= now) and not op.done:
                 op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
             if op.done:
-                self.drop(op)
+                self.remove(op)

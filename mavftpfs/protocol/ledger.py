@@ -94,8 +94,8 @@ class Ledger:
 
     Attributes:
         again: lost requests which go out again as soon as there is room.
-        newest_answered: order of the last transmission that was answered. first: order of the oldest
-            transmission that may still be found lost.
+        newest_answered: order of the last transmission that was answered. looked_at: all transmissions of a
+            lower order were looked at for losses.
         flying: the requests on their way by the order of their transmission, oldest first, ghosts included.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
@@ -109,21 +109,12 @@ class Ledger:
         self.flying: dict[int, Request] = {}
         self.find = self._table.get
         """Returns the unanswered request to which a reply with a seq belongs, or None."""
-        self.first = 0
+        self.looked_at = 0
         self.newest_answered = -1
         self.again: list[Request] = []
         self.ghost = Ghost()
         self.order = 0
         self.reorder = _MIN_REORDER
-
-    def unheard(self) -> int:
-        """Return how many requests other than reads, writes and listings were repeated in vain: they may
-        never be answered.
-
-        A checksum is waited for two minutes. So long it would take a place of a narrow window from all
-        others.
-        """
-        return sum(request.sends > 1 and not request.manner.ordered for request in self.flying.values())
 
     # --- going out
 
@@ -260,14 +251,14 @@ class Ledger:
         """Lose the requests that later answers prove to be lost, and return them."""
         lost = []
         proven = self.newest_answered - self.reorder
-        for order in range(self.first, proven + 1):  # looks at each transmission once
+        for order in range(self.looked_at, proven + 1):  # looks at each transmission once
             request = self.flying.get(order)
             # One that was lost so often may never be answered: only its timer repeats it from now on.
             if request is not None and request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
                 request.outrun = True
                 self.lose(request)
                 lost.append(request)
-        self.first = max(self.first, proven + 1)
+        self.looked_at = max(self.looked_at, proven + 1)
         return lost
 
     def lose(self, request: Request) -> None:

@@ -12,11 +12,11 @@ from math import inf
 from typing import NamedTuple
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import MANNERS, Operation, Priority, Request, nak_of
+from mavftpfs.protocol.requests import MANNERS, Operation, Request, nak_of
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
-__all__ = ["ListDirectory", "OpenRequest", "Operation", "Priority", "Simple"]
+__all__ = ["ListDirectory", "OpenRequest", "Operation", "Simple"]
 
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
@@ -65,7 +65,7 @@ class Simple(Operation):
         if side_effect is not None:
             manner = manner._replace(same_seq=side_effect)
         if server_time is not None:
-            manner = manner._replace(family="work", free_sends=2, patient_after=1, patience=server_time)
+            manner = manner._replace(family="work", free_sends=2, slow_from=1, slowest=server_time)
         count = len(data) if size is None else size
         request = Request(self, opcode, manner, session or 0, offset, count, data, follows=session is None)
         self._requests = [request]

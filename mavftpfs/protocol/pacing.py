@@ -20,10 +20,12 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
-_FEW = 24
-_MANY = 96
-_BOLD = 2.0
-_CAREFUL = 1.25
+_BOLD, _CAREFUL = 2.0, 1.25
+"""The rate is doubled while that helps. Then it is raised by a quarter, to find the limit more exactly."""
+
+_FEW, _MANY = 24, 96
+"""Answers that make a trial: few tell what a doubling does, a small raise needs many."""
+
 _WORTH = 0.5
 """The share of a raise that must show in the answers for the raise to be kept."""
 
@@ -35,17 +37,25 @@ _UNLIKELY = 1.5
 """Standard deviations beyond that: a queue that a raise of a quarter overflows loses a fifth more."""
 
 _ALARMING_LOSS = 0.2
+"""A share of losses that is by so much larger than the usual one begins all again."""
+
 _SMOOTHING = 0.3
+"""What one trial counts for in the usual share of losses."""
+
 _SHORT = 0.7
 """Share of what should be answered below which the link is slower than it was, or the way longer."""
 
-_HOLD = 20.0
-_SHORT_HOLD = 2.0
+_HOLD, _SHORT_HOLD = 20.0, 2.0
+"""Seconds for which the rate is kept: after a limit was found, and after raises that failed without one."""
+
 _STANDING = 1.3
 """How much longer than the shortest round trip even the quickest of a trial takes where a queue stands."""
 
 _DEPTH = 2.0
+"""Requests that may go out at once, if none went out before."""
+
 _SPREAD = 1.1
+"""The window is by so much wider than what is on its way at the rate."""
 
 
 class Pacer:

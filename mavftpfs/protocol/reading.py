@@ -10,11 +10,9 @@ from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import READ_MANNER, Operation, Priority, Request, Run, nak_of
+from mavftpfs.protocol.requests import READ_MANNER, Operation, Request, Run, nak_of
 from mavftpfs.shared.errors import (
     DataUnproven,
-    FileChanged,
-    FtpNak,
     LocalProtocolError,
     MavftpfsError,
     SessionLost,
@@ -24,14 +22,13 @@ from mavftpfs.shared.extents import ExtentSet
 SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals that mean "no file is open" (servers.md 1)."""
 
-_MAYBE_SESSION_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
-"""Refusals that may mean it: MAVSDK says 1, PX4 says 8 for everything after one "file exists" (servers.md
-12)."""
+_LOST_CODES = SESSION_CODES | {NakCode.FAIL, NakCode.FILE_EXISTS, NakCode.EOF}
+"""Refusals of a read within the file's size that may mean it, too. MAVSDK says 1, or EOF when another client
+closed the file; PX4 says 8 for everything after one "file exists" (servers.md 1, 12). Reopening tells."""
 
 _READ = int(Opcode.READ_FILE)
 _NAK = int(Opcode.NAK)
 _EBADF = 9
-_ERRORS_TOLERATED = 2
 _BLOCKS_AHEAD = 3
 
 
@@ -107,11 +104,11 @@ class ReadTransfer(Operation):
     Attributes:
         received_bytes: delivered to the sink so far.
 
-    Fails with SessionLost (reopen, and start another with `wants`), FileChanged (the file ends before its
-    size), FtpNak, or RequestTimeout. Then, and after `give_back`, all that did not come is in `wants`.
+    Fails with SessionLost (reopen, and start another with `wants`; the file may have become shorter, too),
+    FtpNak, or RequestTimeout. Then, and after `give_back`, all that did not come is in `wants`.
     """
 
-    rank = Priority.DEMAND
+    urgent = False
     bulk = _READ
 
     def __init__(
@@ -128,9 +125,7 @@ class ReadTransfer(Operation):
         self.received_bytes = 0
         self.wants = Wants() if wants is None else wants
         self._sink = sink
-        # Whether a program waits for it; None: it was dropped since. A lost one is still repeated.
-        self._unanswered: dict[Request, bool | None] = {}
-        self._errors = 0
+        self._unanswered: dict[Request, bool] = {}  # whether a program waits for it
 
     # --- what the owner says and sees
 
@@ -140,15 +135,14 @@ class ReadTransfer(Operation):
         for request in self._unanswered:
             lacking.discard(request.offset, request.offset + request.size)
             if request.offset < stop and start < request.offset + request.size:
-                self._unanswered[request] = demand or bool(self._unanswered[request])
+                self._unanswered[request] |= demand
         self.wants.add(lacking, demand=demand)
 
     def drop(self, *, demand: bool = True) -> None:
         """Want nothing more; demand: False: no readahead. What is on its way still arrives."""
         self.wants.clear(demand=demand)
-        for request, waited_for in self._unanswered.items():
-            if demand or not waited_for:
-                self._unanswered[request] = None
+        if demand:
+            self._unanswered = dict.fromkeys(self._unanswered, False)
 
     def give_back(self) -> None:
         """Want again all that was asked for and did not come. Answers that still come are not taken."""
@@ -156,10 +150,8 @@ class ReadTransfer(Operation):
             self._want_again(request)
 
     def _want_again(self, request: Request, got: int = 0) -> None:
-        waited_for = self._unanswered.pop(request)
-        if waited_for is not None:
-            rest = (request.offset + got, request.offset + request.size)
-            self.wants.add([rest], demand=waited_for)
+        rest = (request.offset + got, request.offset + request.size)
+        self.wants.add([rest], demand=self._unanswered.pop(request))
 
     @property
     def in_flight(self) -> int:
@@ -175,11 +167,6 @@ class ReadTransfer(Operation):
     def demanded(self) -> bool:
         """Whether a program waits for some of it."""
         return not self.wants.demand.empty or any(self._unanswered.values())
-
-    @property
-    def priority(self) -> Priority:
-        """DEMAND if `wants` has some."""
-        return Priority.READAHEAD if self.wants.demand.empty else Priority.DEMAND
 
     # --- requests
 
@@ -207,13 +194,9 @@ class ReadTransfer(Operation):
         if reply.opcode != _NAK:
             self.on_run([(request, reply.data)], now)
             return
-        self._want_again(request)
         nak = nak_of(request, reply)
-        error = self._meaning(request, nak)
-        if error is not nak or self._errors >= _ERRORS_TOLERATED:
-            self.fail(error)
-        else:
-            self._errors += 1
+        lost = nak.code in _LOST_CODES or nak.server_errno == _EBADF
+        self.fail(SessionLost(str(nak), by_server=True) if lost else nak)
 
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
@@ -247,22 +230,12 @@ class ReadTransfer(Operation):
     def _on_short(self, request: Request, count: int) -> None:
         self._want_again(request, count)
         if count == 0:
-            self.fail(FileChanged(f"the file ends at {request.offset}, before its size of {self.size}"))
-
-    def _meaning(self, request: Request, nak: FtpNak) -> MavftpfsError:
-        """Return what a refused ReadFile within the size means (servers.md 1, 7, 12)."""
-        if nak.code == NakCode.EOF:
-            if self.port.traits.ack_carries_own_session:
-                return FileChanged(f"the file ends at or before {request.offset}, not at {self.size}")
-            # MAVSDK says EOF when another client has closed the file; a reopen tells which it is.
-            return SessionLost(f"end of file at {request.offset}, before {self.size}", by_server=True)
-        if nak.code in SESSION_CODES or nak.code in _MAYBE_SESSION_CODES or nak.server_errno == _EBADF:
-            return SessionLost(str(nak), by_server=True)
-        return nak
+            end, size = request.offset, self.size
+            self.fail(SessionLost(f"nothing came at {end}, before the size of {size}", by_server=True))
 
     def takes_back(self, request: Request, now: float) -> bool:
         """See Operation: the bytes of a chunk that was too long are asked for in shorter ones."""
-        if request.opcode != _READ or not self.chunks.on_lost(request.size, request.sent_at, now):
+        if not self.chunks.on_lost(request.size, request.sent_at, now):
             return False
         self._want_again(request)
         return True
@@ -284,7 +257,7 @@ class ReadToEof(Operation):
     Fails with DataUnproven (longer than `limit`, or a short block in the middle), SessionLost, FtpNak.
     """
 
-    rank = Priority.DEMAND
+    urgent = False
 
     def __init__(self, session: int, chunk: int, limit: int) -> None:
         if not 1 <= chunk <= MAX_DATA:

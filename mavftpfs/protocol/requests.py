@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 from math import inf
 from struct import Struct
 from typing import NamedTuple, Protocol, TypeAlias
@@ -30,10 +29,10 @@ class Manner(NamedTuple):
 
     family: opcodes with similar round trips. same_seq: repeat under the same seq. ordered: servers answer
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
-    offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions on,
-    wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38). In the
-    family "work" `patience` is the time that the slowest server needs. once: never repeated, and its loss is
-    not reported.
+    offset. free_sends: transmissions before the waits double. slowest: seconds that the slowest server works
+    at it, beyond the round trip in the family "work". slow_from: the transmission from which on so long is
+    waited, because a slow server carries out each one (servers.md 14.38). once: never repeated, and its loss
+    is not reported.
     """
 
     family: str
@@ -41,8 +40,8 @@ class Manner(NamedTuple):
     ordered: bool = False
     echoes_offset: bool = False
     free_sends: int = 1
-    patient_after: int = 1 << 30
-    patience: float = 0.0
+    slow_from: int = 1 << 30
+    slowest: float = 0.0
     once: bool = False
 
 
@@ -52,9 +51,9 @@ FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, 
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
 LAST_WRITE_MANNER = WRITE_MANNER._replace(once=True)
-_LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
+_LIST = Manner("list", same_seq=False, ordered=True, slow_from=4, slowest=2.5)
 _PATH = Manner("path", same_seq=True, free_sends=4)
-_SLOW = Manner("slow", same_seq=True, patient_after=2, patience=40.0)
+_SLOW = Manner("slow", same_seq=True, slow_from=2, slowest=40.0)
 
 MANNERS: dict[int, Manner] = dict.fromkeys(range(256), _PATH) | {
     Opcode.READ_FILE: READ_MANNER,
@@ -143,15 +142,6 @@ def nak_of(request: Request, reply: Payload) -> FtpNak:
     return FtpNak(request.opcode, code, errno, retransmitted=request.sends > 1)
 
 
-class Priority(IntEnum):
-    """Which operation goes first when the window has room for one request."""
-
-    METADATA = 0
-    DEMAND = 1
-    WRITE = 2
-    READAHEAD = 3
-
-
 class Port(Protocol):
     """What an operation may know of the engine it runs in."""
 
@@ -175,8 +165,8 @@ class Operation:
     `timer` is the time at which `on_timer` is to be called. An operation ends by `finish` or `fail`, once.
     """
 
-    rank = Priority.METADATA
-    """The order among operations; `priority` says it more exactly."""
+    urgent = True
+    """Whether it goes first when there is room. The transfers of bytes are not urgent."""
 
     bulk = -1
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
@@ -196,18 +186,8 @@ class Operation:
     """The engine, once this was started."""
 
     @property
-    def priority(self) -> Priority:
-        """The order among operations, now."""
-        return self.rank
-
-    @property
     def idle(self) -> bool:
         """Whether nothing is wanted of the server, so that silence is no failure."""
-        return False
-
-    @property
-    def bursting(self) -> bool:
-        """Whether a burst of this operation is running."""
         return False
 
     def waits(self, now: float) -> bool:

@@ -121,7 +121,7 @@ class Timers:
         sent_at = request.sent_at
         if now != self._at or sent_at != self._sent_at or request.manner is not self._manner:
             self._at, self._sent_at, self._manner = now, sent_at, request.manner
-            if request.manner.family == _WORK and request.manner.patience > _NO_WORK:
+            if request.manner.family == _WORK and request.manner.slowest > _NO_WORK:
                 return now - sent_at  # most of it was work
             timer = self.of[request.manner.family]
             timer.sample(now - sent_at)
@@ -141,10 +141,10 @@ class Timers:
         manner = request.manner
         timer = self.of[manner.family]
         plain, rto = max(timer.unfloored, timer.floor), timer.rto
-        patient = request.sends >= manner.patient_after
-        if patient and manner.family == _WORK:
+        slow = request.sends >= manner.slow_from
+        if slow and manner.family == _WORK:
             # The way and the work take their times one after the other.
-            work = manner.patience
+            work = manner.slowest
             if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
                 work = max(work * _USUAL_PACE, min(work, _NO_WORK))
             plain, rto = plain + work, rto + work
@@ -153,4 +153,4 @@ class Timers:
         free = manner.free_sends if timer.samples or not manner.same_seq else 1
         doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
         wait = max(rto, min(plain * (1 << doublings), LONGEST_BACK_OFF))
-        return max(wait, manner.patience) if patient and manner.family != _WORK else wait
+        return max(wait, manner.slowest) if slow and manner.family != _WORK else wait

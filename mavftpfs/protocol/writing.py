@@ -16,7 +16,6 @@ from mavftpfs.protocol.requests import (
     LAST_WRITE_MANNER,
     WRITE_MANNER,
     Operation,
-    Priority,
     Request,
     Run,
     nak_of,
@@ -47,14 +46,18 @@ _NO_FILE_ERRNOS = frozenset((0, 9))
 
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
-MAVSDK 1 may be a full card, too: then the write fails at the same place again after the file was reopened."""
+MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting further."""
 
 
 class ChunkSource(Protocol):
     """Where the bytes come from."""
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """Return (offset, 1..limit bytes), now in flight, or None if there is nothing for now."""
+        """Return (offset, 1..limit bytes), now in flight, or None if there is nothing for now.
+
+        Raises:
+            MavftpfsError: the bytes could not be read. The transfer fails with that.
+        """
         ...
 
     def on_acked(self, offset: int, count: int) -> None:
@@ -109,14 +112,14 @@ class WriteTransfer(Operation):
             it was answered.
 
     Attributes:
-        acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
+        acked_bytes: written so far.
         trailing: see `repeat_nothing`. paused: send nothing new; what is on its way is still waited for.
 
-    Fails with SessionLost (from the FtpNak that showed it), FtpNak or RequestTimeout; what was not ACKed was
-    then given back by on_unsent, ascending.
+    Fails with SessionLost (from the FtpNak that showed it), FtpNak, RequestTimeout, or as the source. What
+    was not ACKed was then given back by on_unsent, ascending.
     """
 
-    rank = Priority.WRITE
+    urgent = False
     paced = False  # what a slow card cannot take would be lost, and leave holes for a while
 
     bulk = _WRITE
@@ -133,7 +136,6 @@ class WriteTransfer(Operation):
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.acked_bytes = 0
-        self.failed_at: int | None = None
         self._source = source
         self._in_flight = in_flight
         self._on_starved = on_starved
@@ -190,18 +192,10 @@ class WriteTransfer(Operation):
             if len(data) > limit:  # it went out in longer ones before
                 self._rest.appendleft((offset + limit, data[limit:]))
                 data = data[:limit]
-        elif self._starved or self.done:
-            return []
-        elif (piece := self._source.next_chunk(limit)) is None:
-            self._starved = True
-            self._on_starved()
+        elif self._starved or self.done or (piece := self._new_piece(limit)) is None:
             return []
         else:
             offset, data = piece
-            if not 1 <= len(data) <= limit or not 0 <= offset <= MAX_OFFSET - len(data):
-                self._rest.append(piece)
-                self.fail(LocalProtocolError(f"{len(data)} bytes at {offset} do not fit WriteFile requests"))
-                return []
         requests = []
         for at in range(0, len(data), chunk):
             part = data[at : at + chunk]
@@ -210,12 +204,29 @@ class WriteTransfer(Operation):
             self._unanswered[request] = None
         return requests
 
+    def _new_piece(self, limit: int) -> tuple[int, bytes] | None:
+        """Return at most `limit` bytes of the source; None if it has none, or fails."""
+        try:
+            piece = self._source.next_chunk(limit)
+        except MavftpfsError as error:
+            self.fail(error)
+            return None
+        if piece is None:
+            self._starved = True
+            self._on_starved()
+            return None
+        offset, data = piece
+        if not 1 <= len(data) <= limit or not 0 <= offset <= MAX_OFFSET - len(data):
+            self._rest.append(piece)
+            self.fail(LocalProtocolError(f"{len(data)} bytes at {offset} do not fit WriteFile requests"))
+            return None
+        return piece
+
     # --- replies
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Tell the source what was written, or end with what a refusal means."""
         if reply.opcode == _NAK:
-            self.failed_at = request.offset
             self.fail(self._meaning(nak_of(request, reply)))
             return
         self.on_run([(request, reply.data)], now, placed=reply.offset == request.offset)
@@ -271,7 +282,6 @@ class WriteTransfer(Operation):
         if count == 0:
             self._barren += 1
         if self._barren > _BARREN_TOLERATED:
-            self.failed_at = request.offset
             self.fail(RemoteProtocolError(f"the vehicle ACKs writes at {request.offset} and writes nothing"))
 
     def _meaning(self, nak: FtpNak) -> MavftpfsError:

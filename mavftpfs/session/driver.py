@@ -37,7 +37,7 @@ for a retransmission, serial ports do not pause inside a frame."""
 REFILL_AT = 32
 """Replies after which room in the window is used at once: the server works meanwhile."""
 
-SILENCE_PATIENCE = 5.0
+LONGEST_DRAIN = 5.0
 """Seconds to wait for requests under way before falling silent: a long listing keeps nobody else out."""
 
 BACKLOG_LIMIT = 16 * 1024
@@ -156,7 +156,7 @@ class Driver:
         """Forget an operation (harmless when it is finished)."""
         if self._under_way.pop(operation, None) is not None:
             self._changed.unpark_all()
-            self.engine.drop(operation)
+            self.engine.remove(operation)
             self.kick()
 
     async def be_silent(self, seconds: float) -> bool:
@@ -167,7 +167,7 @@ class Driver:
         """
         self._silences += 1
         try:
-            with trio.move_on_after(SILENCE_PATIENCE):
+            with trio.move_on_after(LONGEST_DRAIN):
                 while self._under_way:
                     await self._changed.park()
             if self._under_way:

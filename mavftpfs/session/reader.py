@@ -77,7 +77,7 @@ class FileStream(SessionUser):
             self._transfer.drop(demand=demand)
             return
         self._wants.clear(demand=demand)
-        if self._wants.demand.empty and self.opened.done:
+        if self._wants.demand.empty and self.opened.ended:
             self.asked_at = None
 
     def close(self) -> None:
@@ -94,11 +94,11 @@ class FileStream(SessionUser):
     @property
     def idle(self) -> bool:
         """See SessionUser."""
-        return self.closed or (self.opened.done and self._wants.empty)
+        return self.closed or (self.opened.ended and self._wants.empty)
 
     def goes_on(self, session: OpenSession) -> bool:
         """See SessionUser."""
-        return session.path == self.path and not session.writing and self.opened.done
+        return session.path == self.path and not session.writing and self.opened.ended
 
     def on_queued(self) -> None:
         """See SessionUser."""
@@ -118,7 +118,7 @@ class FileStream(SessionUser):
         """What is wanted cannot be had now."""
         self.drop()
         self.asked_at = None
-        if not self.opened.done:
+        if not self.opened.ended:
             self.opened.end(error)
         elif not self.closed:
             self._sink.on_failed(error)
@@ -154,7 +154,7 @@ class FileStream(SessionUser):
             FileChanged: it is smaller than what was opened. A larger one only grew: it is served at its
                 opened size.
         """
-        server, session, first = self._server, self._server.session, not self.opened.done
+        server, session, first = self._server, self._server.session, not self.opened.ended
         if session is None or not self.goes_on(session):
             session = await turn.open(self.path)
         if session.size is None:
@@ -187,10 +187,10 @@ class FileStream(SessionUser):
         try:
             await driver.start(transfer, server.wake, self._on_batch)
             while not (transfer.done or transfer.idle or self.closed or server.session is None):
-                rival = turn.rival
-                if rival is not None and self.gives_way(rival, began, server.clock(), engine.rtt):
+                use = turn.rival_use
+                if use is not None and self.gives_way(use, began, server.clock(), engine.rtt):
                     break
-                if self._scheduler.is_excluded(self.path) or (rival is not None and not transfer.demanded):
+                if self._scheduler.is_excluded(self.path) or (use is not None and not transfer.demanded):
                     break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a

@@ -27,7 +27,7 @@ from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import OPENING, took_session
-from mavftpfs.session.serversession import OpenSession, ServerSession, State
+from mavftpfs.session.serversession import OpenSession, ServerSession
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import renamed
 
@@ -68,23 +68,23 @@ class Future:
     """The end of something that one task does and others wait for."""
 
     def __init__(self) -> None:
-        self._ended = trio.Event()
+        self._event = trio.Event()
         self._error: MavftpfsError | None = None
 
     @property
-    def done(self) -> bool:
+    def ended(self) -> bool:
         """Whether it ended, well or not."""
-        return self._ended.is_set()
+        return self._event.is_set()
 
     def end(self, error: MavftpfsError | None = None) -> None:
         """Let those that wait go on, with an error where it failed; the first time counts."""
-        if not self.done:
+        if not self.ended:
             self._error = error
-            self._ended.set()
+            self._event.set()
 
     async def wait(self) -> None:
         """Wait for the end, and raise the error if there is one."""
-        await self._ended.wait()
+        await self._event.wait()
         if self._error is not None:
             raise self._error.with_traceback(None)
 
@@ -152,13 +152,12 @@ class SessionUser:
         heavy = self.used(now) >= LIGHT_USE and not self.waited_long(now, rtt)
         return heavy, now if self.asked_at is None else self.asked_at
 
-    def gives_way(self, rival: float, began: float, now: float, rtt: float | None) -> bool:
-        """Return whether its turn, which began then, ends for a user that waits. rival: seconds that the
-        lightest of these used lately."""
+    def gives_way(self, rival_use: float, began: float, now: float, rtt: float | None) -> bool:
+        """Return whether its turn, which began then, ends for a user that waits. rival_use: see Turn."""
         slice_ = now - began
         if slice_ < RELIEF and self.waited_long(began, rtt):
             return False
-        if rival < LIGHT_USE and max(self.used(now), slice_) >= LIGHT_USE:
+        if rival_use < LIGHT_USE and max(self.used(now), slice_) >= LIGHT_USE:
             return True
         return slice_ >= min(MAX_TURN, max(MIN_TURN, TURN_TRIPS * (rtt or 0.0)))
 
@@ -167,15 +166,15 @@ class Turn:
     """The session, as long as it is one user's; before that, the user's place in the queue.
 
     Attributes:
-        user, task: whose it is. granted: the wait for it; it fails where the user cannot have it. ended: it
-            was given back. patience: how long the user waits.
+        user, task: whose it is. granted: ends when it is granted, or when the user cannot have it.
+        given_back: it is over. limit: bounds the wait.
     """
 
     def __init__(self, scheduler: Scheduler, user: SessionUser) -> None:
         self.user = user
         self.task = trio.lowlevel.current_task()
-        self.granted, self.ended = Future(), trio.Event()
-        self.patience = trio.CancelScope()
+        self.granted, self.given_back = Future(), trio.Event()
+        self.limit = trio.CancelScope()
         self._scheduler = scheduler
 
     async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
@@ -184,7 +183,7 @@ class Turn:
         return await self._scheduler.server.open(path, opcode)
 
     @property
-    def rival(self) -> float | None:
+    def rival_use(self) -> float | None:
         """How much the lightest user that waits used lately, in seconds; None if nobody waits."""
         now = self._scheduler.clock()
         return min((user.used(now) for user in self._scheduler.waiting(now)), default=None)
@@ -233,7 +232,7 @@ class Scheduler:
         self.holder: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
-        self._patience = 1.02 * op_deadline  # if no request is answered, that is news before
+        self._longest_wait = 1.02 * op_deadline  # if no request is answered, that is news before
         self._queue: dict[SessionUser, Turn] = {}
         self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
@@ -266,16 +265,17 @@ class Scheduler:
         self.server.wake()
 
     def renew(self, user: SessionUser) -> None:
-        """A caller begins to wait for it now: its patience begins anew. If it waits already, it keeps its
+        """A caller begins to wait for it now, and waits as long as any. If it waits already, it keeps its
         place."""
         if user.asked_at is None:
             user.asked_at = self.clock()
         if user in self._queue:
-            self._be_patient(self._queue[user])
+            self._limit(self._queue[user])
 
-    def _be_patient(self, turn: Turn) -> None:
+    def _limit(self, turn: Turn) -> None:
+        """From now on it waits as long as any. Without a caller it waits without limit."""
         if turn.user.awaited:
-            turn.patience.deadline = trio.current_time() + self._patience
+            turn.limit.deadline = trio.current_time() + self._longest_wait
 
     @asynccontextmanager
     async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
@@ -291,8 +291,8 @@ class Scheduler:
         turn = self._queue[user] = Turn(self, user)
         self.server.wake()
         try:
-            self._be_patient(turn)
-            with turn.patience:
+            self._limit(turn)
+            with turn.limit:
                 await turn.granted.wait()
             if self.holder is not turn:
                 raise SessionBusy(_OTHERS) if self.clock() < self.others_until else RequestTimeout(_KEPT)
@@ -303,7 +303,7 @@ class Scheduler:
                 del self._queue[user]
             if self.holder is turn:
                 self._hold(None)
-            turn.ended.set()
+            turn.given_back.set()
 
     def _hold(self, turn: Turn | None) -> None:
         self.holder = turn
@@ -317,7 +317,7 @@ class Scheduler:
         """Return the users that want more than readahead, and could use the session now."""
         return [user for user in self._queue if user.asked_at is not None and self._may_use(user, now)]
 
-    def first(self) -> SessionUser | None:
+    def next_user(self) -> SessionUser | None:
         """Return the user that is to have the session now. Readahead comes only if nothing waits, and that of
         the open file first."""
         now, rtt = self.clock(), self._driver.engine.rtt
@@ -462,7 +462,7 @@ class Scheduler:
             while True:
                 await trio.lowlevel.checkpoint()
                 await self._close_excluded()
-                user, session = self.first(), server.session
+                user, session = self.next_user(), server.session
                 if user is None:
                     await self._idle(self.clock())
                 elif session is not None and session.path != user.path:
@@ -476,11 +476,11 @@ class Scheduler:
         turn, began = self._queue.pop(user), self.clock()
         self._hold(turn)
         turn.granted.end()
-        await turn.ended.wait()
+        await turn.given_back.wait()
         self._used_at = self.clock()
         if self._driver.last_reply_at >= began:
             for user, other in self._queue.items():
-                self._be_patient(other)
+                self._limit(other)
                 user.on_queued()
 
     async def _idle(self, now: float) -> None:
@@ -494,9 +494,9 @@ class Scheduler:
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(server.session.path) else 0.0
-            if not await server.sleep(min(left, news_in)) and self.first() is None:
+            if not await server.sleep(min(left, news_in)) and self.next_user() is None:
                 await server.close_quietly()
-        elif server.state is State.MAYBE_OPEN:
+        elif server.maybe_open:
             # An open or a Terminate that was never answered: leave no orphan over there. Any news begins this
             # wait anew.
             if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)) and not server.vehicle.lost(

@@ -1,7 +1,8 @@
-"""The server's one session: its states, opening and closing, and what to do when it is taken. Layer: session.
+"""The server's one session: what is open there, and what to do when it is taken. Layer: session.
 
-The task that has the turn opens, uses and closes it. Between turns the scheduler's task (`serve`) closes it.
-The task that reads the link may abandon it.
+Two facts say what is open by our doing: `session` is the file that is open, `maybe_open` are files of which
+that is not known. There is never both. The task that has the turn opens, uses and closes a file. Between
+turns the scheduler's task (`serve`) closes it. The task that reads the link may abandon it.
 
 Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
 (ArduPilot, the same id). ArduPilot refuses all other requests with 4, too (docs/servers.md 1). Asking again
@@ -16,7 +17,6 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import partial
 from math import inf
 from typing import TypeVar
@@ -64,30 +64,6 @@ _BEYOND = 100_000
 """Offset of a listing that is beyond the end of any directory."""
 
 Asked = TypeVar("Asked", bound=Operation)
-
-
-class State(Enum):
-    """What is known of the server's session."""
-
-    CLOSED = "closed"
-    OPENING = "opening"
-    OPEN = "open"
-    CLOSING = "closing"
-    MAYBE_OPEN = "maybe open"
-    """A file may be open by our doing: a request was not answered, or the session is not believed any more.
-    """
-
-
-SESSION_NEXT: dict[State, frozenset[State]] = {
-    State.CLOSED: frozenset((State.OPENING,)),
-    # Opening closes first what may be open; a refusal of the open itself proves that nothing is open.
-    State.OPENING: frozenset((State.OPEN, State.CLOSED, State.MAYBE_OPEN)),
-    # Lost, or not believed any more after a silence, a restart, or an answer that nothing explains.
-    State.OPEN: frozenset((State.CLOSING, State.MAYBE_OPEN)),
-    State.CLOSING: frozenset((State.CLOSED, State.MAYBE_OPEN)),
-    State.MAYBE_OPEN: frozenset((State.OPENING, State.CLOSING)),
-}
-"""All transitions there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,10 +146,12 @@ class ServerSession:
     op_deadline: seconds to wait for a Terminate of whose failure a caller is told.
 
     Attributes:
-        state: see State. session: what is open in the state OPEN. transfer: what reads or writes it now.
-        maybe_open: files that may be open over there by our doing, by session id.
+        session: what is open; None if nothing is, or if it is not believed any more. transfer: what reads or
+        writes it now.
+        maybe_open: files that may be open over there by our doing, by session id: a request was not answered
+        yet, or never, or the session is not believed any more.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
-        changed: where tasks park until the state is another one.
+        changed: where tasks park until something more is closed.
     """
 
     def __init__(
@@ -189,7 +167,6 @@ class ServerSession:
         self.doubt = doubt
         self.clock = clock
         self.op_deadline = op_deadline
-        self.state = State.CLOSED
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
@@ -199,18 +176,16 @@ class ServerSession:
         self._news = trio.Event()
         self.changed = trio.lowlevel.ParkingLot()
 
-    def _enter(self, state: State, session: OpenSession | None = None) -> None:
-        if self.session is not None:  # it is open over there until Terminate is ACKed
+    def _leave(self) -> None:
+        """Count what is open as perhaps open."""
+        if self.session is not None:
             self.maybe_open[self.session.id] = self.session.path
-            self.engine.session = self.engine.home_session
-        assert state in SESSION_NEXT[self.state], f"{self.state} does not become {state}"
-        assert (session is not None) == (state is State.OPEN)
-        self.state, self.session = state, session
-        self.changed.unpark_all()
+            self.session, self.engine.session = None, self.engine.home_session
 
-    def _enter_closed(self) -> None:
-        """Go on to CLOSED, or to MAYBE_OPEN if something may be open by our doing."""
-        self._enter(State.MAYBE_OPEN if self.maybe_open else State.CLOSED)
+    def _forget(self, session: int) -> None:
+        """Note that no file is open by our doing under this id."""
+        self.maybe_open.pop(session, None)
+        self.changed.unpark_all()
 
     # --- waiting
 
@@ -236,19 +211,13 @@ class ServerSession:
                 file could not be closed is no news to its user.
         """
         await self.close_quietly()
-        self._enter(State.OPENING)
+        await self._close_what_may_be_ours()
         try:
-            if self.maybe_open:
-                await self._close_what_may_be_ours()
             session = await self._open_past_others(path, opcode)
-        except BaseException:
-            self._enter_closed()
-            raise
         finally:
             if opcode == Opcode.CREATE_FILE:
                 self.doubt.late.on_made(path, self.clock())
-        self.engine.session = session.id
-        self._enter(State.OPEN, session)
+        self.session, self.engine.session = session, session.id
         return session
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
@@ -302,24 +271,22 @@ class ServerSession:
         session = self.session
         if session is None:
             return True
-        self._enter(State.CLOSING)
+        self._leave()
         asked_at = self.clock()
         try:
             with trio.fail_after(self.op_deadline if limit is None else limit):
                 await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session.id))
-            self.maybe_open.pop(session.id, None)
-            return True
         except trio.TooSlowError:
             if limit is None:  # a shorter one is no proof that the vehicle is lost
                 self.vehicle.note_timeout()
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
-            self.maybe_open.pop(session.id, None)
+            self._forget(session.id)
             if nak.code not in _NOT_OPEN:
                 raise
             return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
-        finally:
-            self._enter_closed()
+        self._forget(session.id)
+        return True
 
     async def close_quietly(self) -> None:
         """Close where no caller is to be told of a failure."""
@@ -328,14 +295,8 @@ class ServerSession:
 
     async def close_maybe_open(self) -> None:
         """Close what may still be open by our doing; after a failure it may be open as before."""
-        if self.state is not State.MAYBE_OPEN:
-            return
-        self._enter(State.CLOSING)
-        try:
-            with suppress(MavftpfsError):
-                await self._close_what_may_be_ours()
-        finally:
-            self._enter_closed()
+        with suppress(MavftpfsError):
+            await self._close_what_may_be_ours()
 
     async def _close_what_may_be_ours(self) -> bool:
         """Close what may be open by our doing, but not what another client may own; return whether something
@@ -349,7 +310,7 @@ class ServerSession:
             if session != 0 or not self._others_heard():
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
-            self.maybe_open.pop(session, None)
+            self._forget(session)
         return closed
 
     def abandon(self) -> None:
@@ -357,8 +318,7 @@ class ServerSession:
         also done after a restart, which may be noticed only when a file was opened anew."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
-        if self.session is not None:
-            self._enter(State.MAYBE_OPEN)
+        self._leave()
         self.wake()
 
     def lose(self, lost: SessionLost) -> None:

@@ -61,7 +61,7 @@ look the same once."""
 _NO_TIMES = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS))
 """What servers say that do not know opcode 16; 8 may hide any other code on PX4."""
 
-CRC_PATIENCE = 120.0
+LONGEST_CRC = 120.0
 """Seconds a vehicle may need for a checksum (promise 2)."""
 
 CRC_TIME = 5.0
@@ -222,10 +222,10 @@ class Store:
         self._scheduler.assert_no_turn()
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
-        server_time, patience = CRC_TIME, CRC_PATIENCE
+        server_time, patience = CRC_TIME, LONGEST_CRC
         if size is not None:
             server_time = size / COPY_RATE
-            patience = min(CRC_PATIENCE, self._op_deadline + 2 * server_time)
+            patience = min(LONGEST_CRC, self._op_deadline + 2 * server_time)
         operation = await self._server.ask(
             partial(
                 Simple,

@@ -12,7 +12,6 @@ PX4 on NuttX checks each WriteFile against a scratch buffer that every path oper
 
 from __future__ import annotations
 
-import errno
 from contextlib import suppress
 from enum import Enum
 from math import inf
@@ -22,9 +21,8 @@ import trio
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
-from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
+from mavftpfs.session.scheduler import Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
-from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
@@ -37,18 +35,19 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.model import split, wire_path
 from mavftpfs.shared.sending import SendBuffer
 
-LONGEST_BACKOFF = 30.0
-"""Most seconds between two attempts after a failure of the link."""
+RETRY_AFTER = 5.0
+"""Seconds after a failure of the link before it is tried again in the background."""
 
 STARVE = 1.5
 """Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
 
 BRIEF_STARVE = 0.05
-"""The same where it can be interrupted and another user waits."""
+"""The same where it can be interrupted and another user waits: a program that writes fast gives more sooner.
+"""
 
-PATIENCE = 10.0
-"""Seconds after which an upload that cannot be interrupted gives the session to a user that waits when it
-has nothing to send: else a log that trickles would keep it for ever."""
+TRICKLE = 10.0
+"""Seconds after which the same is true of an upload that cannot be interrupted: else a log that is written
+now and then would keep the session for ever."""
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
@@ -65,14 +64,11 @@ class Stop(Enum):
     """Why an upload lets go of the session."""
 
     STARVED = "starved"
+    """Everything that the source has is ACKed."""
     YIELD = "yield"
-    DOUBT = "doubt"
+    """It goes on in a later turn."""
     ARMED = "armed"
-    ABORTED = "aborted"
-
-
-_LOOK_AGAIN = 1.0
-_ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
+    """The vehicle was armed: nothing is waited for."""
 
 
 class Upload(SessionUser):
@@ -94,14 +90,12 @@ class Upload(SessionUser):
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
         self._parked = False  # nothing is sent before the next `finish`: refused, or all would go again
-        self._ended = False  # given up by its owner
-        self._over = trio.Event()  # and its task has seen that
+        self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
+        self._over = trio.Event()  # set when its task ended
         self._retry_at = 0.0  # not to be touched before
         self._changed = trio.lowlevel.ParkingLot()
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
-        self._reboots = scheduler.server.vehicle.reboots  # when its file was opened last
-        self._refused_at: int | None = None  # where a write was refused last as if the session were lost
-        self._failures = 0  # of the link, and losses of the session without progress
+        self._losses = 0  # of the session, without progress
         self._furthest = 0  # in the file, when the session was lost the last time
 
     # --- the owner's side
@@ -115,10 +109,10 @@ class Upload(SessionUser):
 
     async def finish(self) -> None:
         """See cache.remote.Upload."""
-        if self._ended:
+        if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._parked, self._refused_at, self._failures, self._retry_at = False, None, 0, 0.0
+        self._parked, self._losses, self._retry_at = False, 0, 0.0
         first, finisher = not self.awaited, Future()
         self._finishers.append(finisher)
         if first:
@@ -131,10 +125,9 @@ class Upload(SessionUser):
 
     async def end(self) -> None:
         """See cache.remote.Upload."""
-        self._ended = True
+        self._scope.cancel()
         self._fail(LocalProtocolError("the upload was ended"))
         self._scheduler.remove(self)
-        self._changed.unpark_all()
         await self._over.wait()
 
     def status(self) -> dict[str, object]:
@@ -149,7 +142,7 @@ class Upload(SessionUser):
     @property
     def awaited(self) -> bool:
         """Whether a caller waits in `finish`."""
-        return not all(finisher.done for finisher in self._finishers)
+        return not all(finisher.ended for finisher in self._finishers)
 
     def on_armed_changed(self) -> None:
         """If it waits for a turn, its callers get Armed at once; in a turn it sees that itself. After
@@ -166,33 +159,36 @@ class Upload(SessionUser):
         """Take a turn whenever there is something to send, until `end`. After a failure it is tried again in
         the background."""
         try:
-            while not self._ended:
-                try:
-                    if self.awaited:
-                        self._vehicle.require(self._clock(), writing=True)
-                    if (pause := self._due_in()) > 0.0:
-                        with trio.move_on_after(pause):
-                            await self._changed.park()
-                    elif not self._has_work():
-                        self._complete(list(self._finishers))
-                    else:
-                        self.asked_at = self.asked_at or self._clock()
-                        async with self._scheduler.turn(self) as turn:
-                            await self._use(turn)
-                except MavftpfsError as error:
-                    self._fail(error)
+            with self._scope:
+                while True:
+                    try:
+                        await self._go_on()
+                    except MavftpfsError as error:
+                        self._fail(error)
         finally:
             self._over.set()
 
+    async def _go_on(self) -> None:
+        """Do the next thing: wait, let callers go, or take a turn."""
+        if self.awaited:
+            self._vehicle.require(self._clock(), writing=True)
+        if (pause := self._due_in()) > 0.0:
+            with trio.move_on_after(pause):
+                await self._changed.park()
+        elif not self._has_work():
+            self._complete(list(self._finishers))
+        else:
+            self.asked_at = self.asked_at or self._clock()
+            async with self._scheduler.turn(self) as turn:
+                await self._use(turn)
+
     def _due_in(self) -> float:
-        """Return in how many seconds it wants a turn, unless it is woken before. A vehicle that is lost is
-        tried only while a caller waits."""
-        now = self._clock()
+        """Return in how many seconds it wants a turn, unless it is woken before. While the vehicle is armed
+        it wants none, so that no reader makes way for it."""
         wanted = self.awaited or (not self._parked and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
-        silent = not self.awaited and self._vehicle.lost(now)
-        return max(self._retry_at - now, _LOOK_AGAIN if silent else 0.0)
+        return self._retry_at - self._clock()
 
     def _has_work(self) -> bool:
         """Whether there is something to send or to close. An empty file has to be made, too, once."""
@@ -203,9 +199,8 @@ class Upload(SessionUser):
         """Raise an error in all `finish`, and try again later; after a refusal only at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
-        self._failures += 1
         self._parked = isinstance(error, REFUSALS)
-        self._retry_at = self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5))
+        self._retry_at = self._clock() + RETRY_AFTER
 
     async def _use(self, turn: Turn) -> None:
         """Have a turn."""
@@ -220,65 +215,60 @@ class Upload(SessionUser):
                 self._end_transfer()
             if stop is Stop.STARVED:
                 self._complete(finishers)
-        except SessionLost as lost:  # begin again from what is proven, a bounded number of times
-            self._on_lost(lost)
         except MavftpfsError as error:
-            await self._clean_up(error)
-            raise
+            self._let_go(error)
         finally:
             self.on_turn(began, self._clock())
             self.asked_at = None
 
-    def _on_lost(self, lost: SessionLost) -> None:
-        """Begin again from what is proven.
+    def _let_go(self, error: MavftpfsError) -> None:
+        """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost
+        again and again without getting further.
 
         Raises:
-            MavftpfsError: it was lost again and again, without getting further.
+            MavftpfsError: what it failed with.
         """
-        self._server.lose(lost)
+        if not isinstance(error, SessionLost):
+            self._server.abandon()
+            self._source.roll_back()
+            raise error
+        self._server.lose(error)
         if self._source.reached > self._furthest:
-            self._furthest, self._failures = self._source.reached, 0
-        self._roll_back()
-        self._failures += 1
-        if self._failures > REOPENS:
-            raise lost.__cause__ if isinstance(lost.__cause__, MavftpfsError) else lost
-        self._retry_at = self._clock() + (self._failures - 1) * 0.5
+            self._furthest, self._losses = self._source.reached, 0
+        self._source.roll_back()
+        self._losses += 1
+        if self._losses > REOPENS:
+            raise error.__cause__ if isinstance(error.__cause__, MavftpfsError) else error
 
+    @property
+    def _keeps(self) -> bool:
+        """Whether OpenFileWO was seen to keep what a file has."""
+        return self._engine.traits.wo_truncates is False
+
+    @property
     def _resumable(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
-        truncates = self._engine.traits.wo_truncates
-        return truncates is False or (truncates is None and self._source.reached > 0)
+        return self._keeps or (self._engine.traits.wo_truncates is None and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
         """Let these callers go: everything that the source had when they began to wait is ACKed, and the file
         was closed. Where it cannot be written on, more bytes cost the whole file once more, so they wait for
-        the next `finish`.
-
-        Raises:
-            MavftpfsError: the source fails.
-        """
-        self._source.has_more()  # raises what the source failed with
+        the next `finish`."""
         for finisher in finishers:
             finisher.end()
-        self._failures = 0
-        self._parked = self._source.closed and not self._resumable()
+        self._losses = 0
+        self._parked = self._source.closed and not self._resumable
 
     # --- opening
 
     async def _open(self, turn: Turn) -> OpenSession:
         """Open the upload's file: to go on with it where that is possible, else to begin it."""
         source = self._source
-        if self._reboots != self._vehicle.reboots:  # what was proven may not be there any more
-            source.roll_back(everything=True)
-        self._reboots = self._vehicle.reboots
-        unknown = self._engine.traits.wo_truncates is None and source.reached
-        if source.closed and (unknown or self._engine.traits.wo_truncates is False):
+        if source.closed and self._resumable:
             session = await self._reopen(turn)
             if session is not None:
                 return session
-        source.roll_back(everything=True)
-        if self._ended:  # its owner was told that nothing was begun
-            raise LocalProtocolError("the upload was given up before its file was made")
+        source.start_over()
         self.resent |= self.begun
         self.begun = True  # what is there from now on may be ours
         try:
@@ -305,12 +295,9 @@ class Upload(SessionUser):
                 if traits.wo_truncates:
                     return None
                 session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
-        except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT:  # another client, or the vehicle, removed the file
-                return None
-            if traits.wo_truncates is not None:
-                raise
-            traits.wo_truncates = True
+        except FtpNak:  # the file is gone, or this server opens none like that
+            if traits.wo_truncates is None:
+                traits.wo_truncates = True
             return None
         if session.size is None or session.size >= reached:
             return session
@@ -327,37 +314,28 @@ class Upload(SessionUser):
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         server, traits, gate = self._server, self._engine.traits, self._server.path_gate
-        unblocked = False
+        blocked = False
         gate.shut = traits.paths_block_writes
         try:
             while True:
-                # If a light user waits already, a short queue is half filled: the Terminate finds a place in
-                # it, and is not behind as many writes.
-                rival = turn.rival
-                queue = traits.queue_limit
-                most = queue // 2 if queue and rival is not None and rival < LIGHT_USE else None
                 chunks = self._scheduler.write_chunks
-                transfer = WriteTransfer(
-                    session.id, self._source, chunks, in_flight=most, on_starved=server.wake
-                )
+                transfer = WriteTransfer(session.id, self._source, chunks, on_starved=server.wake)
                 self._transfer = server.transfer = transfer
+                stop = None
                 try:
                     await self._driver.start(transfer, server.wake, self._on_batch)
                     stop = await self._watch(turn, session, transfer)
                 finally:
                     if not transfer.trailing:  # else its last answers come while `_close` waits for its own
                         self._end_transfer()
-                if transfer.acked_bytes and unblocked:
-                    traits.paths_block_writes, unblocked = True, False
                 error = transfer.error
                 if error is None:
                     assert stop is not None
                     return stop
-                if unblocked or not is_blocked(error):
-                    self._check_refusal(transfer, error)
+                if not is_blocked(error) or (blocked and not transfer.acked_bytes):
                     raise error
-                unblocked = True
-                # From now on path operations take turns with this upload: first those under way end.
+                # From now on path operations take turns with uploads: first those under way end.
+                blocked = traits.paths_block_writes = True
                 await gate.let_in(0.0)
                 await self._unblock()
         finally:
@@ -371,103 +349,70 @@ class Upload(SessionUser):
 
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
         """Return the reason to let go; None if the transfer ended by itself."""
-        server, driver, gate, clock = self._server, self._driver, self._server.path_gate, self._server.clock
-        stop: Stop | None = None
+        server, gate, clock = self._server, self._server.path_gate, self._clock
         fed_at = clock()
         while not transfer.done:
             server.require_open(session)
             if not transfer.starved:
                 fed_at = clock()
-            rival = turn.rival
-            stop = self._reason_to_stop(session, transfer, fed_at, rival) or stop
-            if server.is_stalled(transfer):
-                # Another client may have taken the session (servers.md 14.9). Where closing would cost the
-                # whole file, only if another client was heard; else the server will tell.
-                closes = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
-                stop = Stop.DOUBT if closes else stop
+            stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
+            # After a silence the session may be gone (servers.md 14.9): the answer to Terminate tells. Where
+            # closing costs the whole file, it is closed only if another client was heard.
+            closes = self._keeps or self._vehicle.foreign_client(clock())
+            stalled = closes and server.is_stalled(transfer)
+            if stalled and stop is None:
+                stop = Stop.YIELD
+            transfer.paused = stop is not None or (gate.shut and gate.waiting > 0)
             if stop is not None:
-                transfer.paused = True
-                if transfer.idle or stop in _ABRUPT or self._let_trail(stop, transfer):
+                if transfer.idle or stalled or stop is Stop.ARMED or self._let_trail(transfer):
                     return stop
-            elif gate.shut and gate.waiting:
-                transfer.paused = True
-                if transfer.idle:
-                    await gate.let_in(max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0)))
-                    await self._unblock()
-                    transfer.paused = False
-            else:
+            elif transfer.paused and transfer.idle:
+                await gate.let_in(max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0)))
+                await self._unblock()
                 transfer.paused = False
-            driver.kick()
-            pressed = transfer.starved and rival is not None
-            await server.sleep(BRIEF_STARVE if pressed else _OFTEN)
+            self._driver.kick()
+            await server.sleep(BRIEF_STARVE if transfer.starved else _OFTEN)
         return None
 
     def _reason_to_stop(
-        self, session: OpenSession, transfer: WriteTransfer, fed_at: float, rival: float | None
+        self, turn: Turn, session: OpenSession, transfer: WriteTransfer, starved_for: float
     ) -> Stop | None:
-        """fed_at: when there was something to send the last time. rival: see Turn.rival."""
-        if self._ended:
-            return Stop.ABORTED
+        """starved_for: seconds for which there was nothing to send."""
         if not self._vehicle.may_write:
             return Stop.ARMED
         if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
-        now, resumable = self._clock(), self._resumable()
+        now, rival_use, resumable = self._clock(), turn.rival_use, self._resumable
         if transfer.starved:
-            if self.awaited:
-                return Stop.STARVED
-            patience = STARVE
-            if rival is not None and resumable:
-                patience = BRIEF_STARVE
-            elif rival is not None and now - session.opened_at >= PATIENCE:
-                patience = 0.0
-            return Stop.STARVED if now - fed_at >= patience else None
-        if rival is None:
-            over = self._engine.traits.wo_truncates is False and now - session.opened_at >= CHECKPOINT_EVERY
+            makes_room = resumable or now - session.opened_at >= TRICKLE
+            least = BRIEF_STARVE if rival_use is not None and makes_room else STARVE
+            return Stop.STARVED if self.awaited or starved_for >= least else None
+        if rival_use is None:
+            over = self._keeps and now - session.opened_at >= CHECKPOINT_EVERY
         else:
-            over = resumable and self.gives_way(rival, session.opened_at, now, self._engine.rtt)
+            over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
 
-    def _let_trail(self, stop: Stop, transfer: WriteTransfer) -> bool:
+    def _let_trail(self, transfer: WriteTransfer) -> bool:
         """Have the Terminate go out right behind the last requests if that is right; return whether it does.
 
         That is a round trip less for the user that waits. Servers carry requests out in order, and what gets
         lost is sent when the file is open again. But where path operations cause refusals (NuttX) the answers
         are waited for, because only the running upload can put that right.
         """
-        if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
-            return False
-        if self._engine.traits.paths_block_writes or self._scheduler.is_excluded(self.path):
+        if not self._keeps or self._engine.traits.paths_block_writes:
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
         return transfer.trailing
 
-    def _end_transfer(self) -> MavftpfsError | None:
-        """The session is closed, or lost: what was not ACKed goes back to the source. Return what failed of
-        the last requests, which were on their way when it was closed."""
-        transfer = self._transfer
-        if transfer is None:
-            return None
-        self._transfer = self._server.transfer = None
-        if transfer.trailing and not transfer.idle:
-            self._engine.stats.retransmissions += 1  # it goes again, and the first may come later than that
-        transfer.finish()
-        self._driver.cancel(transfer)
-        return transfer.error
-
-    def _check_refusal(self, transfer: WriteTransfer, error: MavftpfsError) -> None:
-        """A refusal that means a lost session may mean a full card, too: raise it where it is the second one
-        at the same place.
-
-        Raises:
-            FtpNak.
-        """
-        nak = error.__cause__
-        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL and transfer.failed_at is not None:
-            if transfer.failed_at == self._refused_at:
-                raise nak
-            self._refused_at = transfer.failed_at
+    def _end_transfer(self) -> None:
+        """The session is closed, or lost: what was not ACKed goes back to the source."""
+        transfer, self._transfer = self._transfer, None
+        if transfer is not None:
+            self._server.transfer = None
+            transfer.finish()
+            self._driver.cancel(transfer)
 
     async def _unblock(self) -> None:
         """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.
@@ -490,40 +435,19 @@ class Upload(SessionUser):
         is news that takes the bytes back (`_open`) and has the file compared (`Doubt`).
         """
         transfer = self._transfer  # if any, its last requests are on their way
-        if stop is Stop.ABORTED:
-            await self._server.close_quietly()
-            return
         try:
             ours = await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
-        last = self._end_transfer()
-        if last is not None and transfer is not None:
-            self._engine.traits.paths_block_writes |= is_blocked(last)
-            self._check_refusal(transfer, last)
-        if not ours or isinstance(last, SessionLost):
-            raise SessionLost("the vehicle had closed the session before", by_server=True) from last
+        self._end_transfer()
+        failed = None if transfer is None else transfer.error
+        if not ours or isinstance(failed, SessionLost):
+            raise SessionLost("the vehicle had closed the session before", by_server=True) from failed
         self._source.check_point()
-        if isinstance(last, REFUSALS) and not is_blocked(last):
-            raise last
-
-    async def _clean_up(self, error: MavftpfsError) -> None:
-        """Close what can be closed, and roll back what is not proven."""
-        written, session = False, self._server.session  # None where it failed before it got it
-        if isinstance(error, REFUSALS) and session is not None and session.writing:
-            with suppress(MavftpfsError):  # another failure is no news
-                written = await self._server.close(TERMINATE_LIMIT)
-        else:
-            self._server.abandon()
-        if written:
-            self._source.check_point()
-        else:
-            self._roll_back()
-
-    def _roll_back(self) -> None:
-        self._source.roll_back(
-            everything=self._engine.traits.wo_truncates is not False or not self._source.closed
-        )
+        if failed is not None and is_blocked(failed):
+            self._engine.traits.paths_block_writes = True
+        elif isinstance(failed, REFUSALS):
+            raise failed
 
 
 def is_blocked(error: MavftpfsError) -> bool:

@@ -45,7 +45,7 @@ ABSENCE = 2.5
 """Seconds of silence in which a vehicle may have restarted, or have been exchanged for another: no autopilot
 starts faster. (A cable that is moved reopens the link, which is told.)"""
 
-PATIENCE = 20
+MOST_UNANSWERED = 20
 """Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
 tell their id only once. From then on it is asked as before, but believed meanwhile."""
 
@@ -88,8 +88,8 @@ class Identity:
         self._known: AutopilotVersion | None = None  # its id, once it was told
         # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
         self._strange = False
-        # It told its id once, and then left PATIENCE questions unanswered. Without that memory each silence
-        # would hold all requests back for so long.
+        # It told its id once, and then left MOST_UNANSWERED questions unanswered. Without that memory each
+        # silence would hold all requests back for so long.
         self._mute = False
         # It answers from another network address. If it does not tell its id there, it is a stranger: else
         # any sender that keeps silent about its id could take the vehicle's place (promise 1).
@@ -154,7 +154,7 @@ class Identity:
     def unanswered(self) -> None:
         """It was heard, and did not tell its id though it was asked."""
         self._unanswered += 1
-        if self._unanswered < PATIENCE or self.standing is not Standing.DOUBTED:
+        if self._unanswered < MOST_UNANSWERED or self.standing is not Standing.DOUBTED:
             return
         if self._moved and self._known is not None and not self._mute:
             self._is_stranger()

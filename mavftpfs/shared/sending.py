@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.extents import ExtentSet
 
 AHEAD = 64 * 1024
@@ -47,7 +46,6 @@ class SendBuffer:
         self._read = read
         self._handed_out = 0  # one past the highest byte
         self.reached = 0
-        self._failed: MavftpfsError | None = None
         self._ahead = (0, b"")
 
     @property
@@ -67,21 +65,14 @@ class SendBuffer:
             self._ahead = (0, b"")
 
     def has_more(self) -> bool:
-        """Return whether there is something to send now.
-
-        Raises:
-            MavftpfsError: the bytes could not be read. The next call tries again.
-        """
-        failed, self._failed = self._failed, None
-        if failed is not None:
-            raise failed
+        """Return whether there is something to send now."""
         return self._next(FULL) is not None
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """Return (offset, at most `limit` bytes), which count as on their way; None: nothing for now.
 
-        Bytes that cannot be read count as nothing here, because the engine serves all files. `has_more`
-        raises the error.
+        Raises:
+            MavftpfsError: the bytes could not be read. The next call tries again.
         """
         found = self._next(limit)
         if found is None:
@@ -91,11 +82,7 @@ class SendBuffer:
         if start < at or at + len(ahead) < stop:
             first = self.todo.first()
             assert first is not None
-            try:
-                at, ahead = start, self._read(start, max(stop, min(first[1], start + AHEAD)))
-            except MavftpfsError as error:
-                self._failed = error
-                return None
+            at, ahead = start, self._read(start, max(stop, min(first[1], start + AHEAD)))
             self._ahead = (at, ahead)
         self.todo.discard(start, stop)
         self._handed_out = max(self._handed_out, stop)
@@ -119,15 +106,17 @@ class SendBuffer:
             self.proven.add(start, stop)
         self.acked = ExtentSet()
 
-    def roll_back(self, *, everything: bool) -> None:
-        """The session was lost. What was ACKed since the checkpoint is sent again; or everything, if
-        reopening emptied the file."""
+    def roll_back(self) -> None:
+        """The session was lost: what was ACKed since the last Terminate is sent again."""
         self.acked = ExtentSet()
-        if everything:
-            self.closed = False
-            self.proven = ExtentSet()
         self.reached = self.proven.end
         self.todo = ExtentSet(self.proven.missing(0, self.size))
+
+    def start_over(self) -> None:
+        """The file is made anew: all of it is sent."""
+        self.closed, self.reached = False, 0
+        self.acked, self.proven = ExtentSet(), ExtentSet()
+        self.todo = ExtentSet([(0, self.size)])
 
     def _next(self, limit: int) -> tuple[int, int] | None:
         """Return the next bytes to hand out."""

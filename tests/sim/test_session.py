@@ -197,7 +197,7 @@ ROUNDS = 10_000
 async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     here = Rig("px4", {b"/big": content(20_000), b"/changing": b"old"}, LinkSettings(rate=5760.0, delay=0.02))
     rounds = 0
-    choose = Scheduler.first
+    choose = Scheduler.next_user
 
     def counted(queue: Scheduler) -> object:
         nonlocal rounds
@@ -205,7 +205,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(monkeypatch: pytes
         assert rounds < ROUNDS, "it goes round without a moment in between"
         return choose(queue)
 
-    monkeypatch.setattr(Scheduler, "first", counted)
+    monkeypatch.setattr(Scheduler, "next_user", counted)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
         async with scheduler.excluded(b"/changing"):

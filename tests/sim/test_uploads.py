@@ -13,6 +13,7 @@ from mavftpfs.cache.delivery import START_AT
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
 from mavftpfs.session.connection import Connection
+from mavftpfs.session.serversession import REOPENS
 from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
@@ -100,12 +101,9 @@ async def test_what_interrupts_it_is_bridged(profile: str, probed: bool, interru
             await INTERRUPTIONS[interruption](here, connection)
         assert source.all_proven
         if interruption == "cut":
-            assert True not in source.rollbacks
+            assert source.beginnings == 1
             resumable = probed and not PROFILES[profile].write_only_truncates
             assert source.checkpoints == 1 + resumable  # what is in doubt is terminated, not believed
-        if interruption == "reboot":
-            assert True in source.rollbacks
-            assert connection.store.traits.wo_truncates is None
     assert here.data(b"/d/new") == data
 
 
@@ -162,7 +160,7 @@ async def test_a_full_card_is_told(profile: str) -> None:
             await upload.finish()
         assert refusal.value.opcode == Opcode.WRITE_FILE
         assert errno_for(refusal.value) in (5, 28)
-        assert here.count(Opcode.CREATE_FILE) <= 2
+        assert here.count(Opcode.CREATE_FILE) <= REOPENS + 2
         assert not source.all_proven
         assert source.proven.end <= 5_000 + (238 if silent else 0) + 239
         here.card.capacity = None
@@ -348,7 +346,7 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool) -
             here.link.restore()
         assert source.all_proven
         assert source.checkpoints == 2
-        assert source.rollbacks == [True]
+        assert source.beginnings == 2
     assert here.data(b"/d/new") == data
 
 
@@ -396,7 +394,7 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, p
         upload.wake()
         await upload.finish()
         assert connection.store.traits.wo_truncates is empties
-        assert source.rollbacks == ([True] if empties else [])
+        assert (source.rollbacks, source.beginnings) == (0, 1 + empties)
         assert here.count(Opcode.CREATE_FILE) == empties
         assert here.count(Opcode.WRITE_FILE) <= (5 if empties else 1)
         assert source.all_proven
@@ -439,7 +437,23 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
         source.add(b"more")
         upload.wake()
         await upload.finish()
-        assert source.rollbacks[0] is True
+        assert source.beginnings == 2
+    assert here.card.data(b"/d/new") == bytes(source.content)
+
+
+@pytest.mark.parametrize("code", [NakCode.FILE_NOT_FOUND, NakCode.UNKNOWN_COMMAND])
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+async def test_a_file_that_cannot_be_opened_again_is_sent_again(probed: bool, code: NakCode) -> None:
+    """It is gone, or the server opens no file for writing without emptying it. Where that is not known, it is
+    not asked a second time."""
+    async with uploading(content(3000), known=probed) as (here, source, upload):
+        await upload.finish()
+        here.faults.refuse(Opcode.OPEN_FILE_WO, code)
+        source.add(b"more")
+        upload.wake()
+        await upload.finish()
+        assert (source.all_proven, source.beginnings) == (True, 2)
+        assert here.connection.store.traits.wo_truncates is not probed
     assert here.card.data(b"/d/new") == bytes(source.content)
 
 
@@ -448,7 +462,7 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) ->
     async with uploading(content(3000), known=probed) as (here, source, upload):
         here.faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, here.connection))
         await upload.finish()
-        assert source.rollbacks == [True]
+        assert (source.rollbacks, source.beginnings) == (1, 2)
         assert source.checkpoints == 1
         assert source.all_proven
 
@@ -466,7 +480,7 @@ async def test_a_terminate_done_twice_is_done() -> None:
             here.faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(list_soon))
             await upload.finish()
         assert Opcode.TERMINATE_SESSION in here.faults.refused
-        assert source.rollbacks == []
+        assert source.rollbacks == 0
         assert source.all_proven
 
 
@@ -480,7 +494,7 @@ async def test_only_what_was_not_proven_goes_again() -> None:
             nursery.start_soon(upload.finish)
             await trio.sleep(1.5)
             steal(here, here.connection)
-        assert source.rollbacks == [False]
+        assert (source.rollbacks, source.beginnings) == (1, 1)
         assert source.all_proven
         assert here.count(Opcode.CREATE_FILE) == 0
     assert here.card.data(b"/d/new") == bytes(source.content)
@@ -488,21 +502,24 @@ async def test_only_what_was_not_proven_goes_again() -> None:
 
 @pytest.mark.parametrize("pause", [0.02, 1.0], ids=["while it is opened", "while it is sent"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, pause: float) -> None:
+async def test_an_upload_that_is_given_up_asks_for_nothing_and_its_file_is_closed_soon(profile: str, pause: float) -> None:
     here = Rig(profile, {b"/d": None}, PLAIN)
     async with here.connected() as connection:
         source = MemorySource(content(60_000))
         upload = await start(connection, profile, source)
         await trio.sleep(pause)
+        began = trio.current_time()
         await upload.end()
         await upload.end()
+        assert trio.current_time() == began
         assert source.in_flight.empty
-        assert here.server.open_sessions == 0
         left = source.todo.total
-        await trio.sleep(5)
+        await trio.sleep(6)
+        # It gives its sessions numbers of its own, and this one's was not heard.
+        unknown = profile == "spec" and pause < 1.0
+        assert here.server.open_sessions == unknown
         assert source.todo.total == left
         assert upload not in connection.scheduler.users
-    assert here.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("leaves", [False, True])

@@ -107,7 +107,7 @@ class MemorySource(SendBuffer):
         self.content = bytearray(content)
         super().__init__(self.read, len(content))
         self.checkpoints = 0
-        self.rollbacks: list[bool] = []
+        self.rollbacks = self.beginnings = 0
 
     def read(self, start: int, stop: int) -> bytes:
         return bytes(self.content[start:stop])
@@ -140,11 +140,15 @@ class MemorySource(SendBuffer):
         self.checkpoints += 1
         super().check_point()
 
-    def roll_back(self, *, everything: bool) -> None:
+    def roll_back(self) -> None:
         assert self.in_flight.empty, "a rollback with bytes in flight"
-        if self.closed or not self.acked.empty:
-            self.rollbacks.append(everything)
-        super().roll_back(everything=everything)
+        self.rollbacks += not self.acked.empty
+        super().roll_back()
+
+    def start_over(self) -> None:
+        assert self.in_flight.empty, "begun anew with bytes in flight"
+        self.beginnings += 1
+        super().start_over()
 
     def _require_in_flight(self, offset: int, count: int) -> None:
         assert self.in_flight.covers(offset, offset + count), "news of bytes that are not in flight"

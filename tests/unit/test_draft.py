@@ -196,9 +196,11 @@ class DraftMachine(RuleBasedStateMachine):
         if self.draft.sending is None:
             return
         self.flight.clear()
-        self.draft.sending.roll_back(everything=everything)
         if everything:
+            self.draft.sending.start_over()
             self.remote.clear()
+        else:
+            self.draft.sending.roll_back()
 
     @rule()
     def terminate(self) -> None:

@@ -71,7 +71,7 @@ def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
     asked = sent(engine, 0.0)
     asked += again(engine, 1.0)
     engine.on_deadline(2.0)  # lost, and not sent again before it is forgotten
-    engine.drop(transfer)
+    engine.remove(transfer)
     for request in asked:
         engine.receive(chunk(request, CONTENT), 3.0)
     assert engine.stats.unknown

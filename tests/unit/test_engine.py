@@ -109,7 +109,7 @@ def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
     transfer, _ = reading(engine, 239 * 20_000, BurstTransfer)
     (burst,) = sent(engine, 0.0)
     engine.receive(packet(burst, 0, bytes(239)), 0.0)
-    engine.drop(transfer)
+    engine.remove(transfer)
     op, request = asked(engine)
     for index in range(1, 20_000):
         engine.receive(packet(burst, index, bytes(239)), 0.0)
@@ -404,7 +404,7 @@ def test_metadata_does_not_wait_for_what_a_wider_window_sent() -> None:
     engine = make()
     transfer, _ = reading(engine)
     assert len(sent(engine, 0.0)) == 8
-    engine.drop(transfer)
+    engine.remove(transfer)
     engine.flow.on_silence()
     assert engine.flow.window < 8
     engine.start(mkdir(), 0.1)
@@ -415,8 +415,8 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     engine = make(limit=4)
     transfer, sink = reading(engine)
     out = sent(engine, 0.0)
-    engine.drop(transfer)
-    engine.drop(transfer)
+    engine.remove(transfer)
+    engine.remove(transfer)
     other, _ = reading(engine)
     assert sent(engine, 0.0) == []
     engine.receive(chunk(out[0], bytes(SIZE)), 0.1)
@@ -424,7 +424,7 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     assert len(sent(engine, 0.1)) == 1
     engine.on_deadline(1.2)
     assert len(sent(engine, 1.2)) >= 1
-    engine.drop(other)
+    engine.remove(other)
     engine.on_deadline(50.0)
     assert engine.in_flight == 0
     assert engine.take_finished() == []
@@ -438,7 +438,7 @@ def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
     engine = make()
     transfer, _ = reading(engine, kind=BurstTransfer)
     (burst,) = sent(engine, 0.0)
-    engine.drop(transfer)
+    engine.remove(transfer)
     engine.start(mkdir(), 0.0)
     (request,) = sent(engine, 0.0)
     for index in range(20):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion
-from mavftpfs.session.vehicle import ABSENCE, PATIENCE, Identity, Standing, is_another
+from mavftpfs.session.vehicle import ABSENCE, MOST_UNANSWERED, Identity, Standing, is_another
 
 pytestmark = pytest.mark.holds("fault another vehicle")
 
@@ -110,7 +110,7 @@ def test_a_vehicle_that_is_heard_but_tells_no_id_is_believed_in_the_end(silences
     identity = Watched()
     identity.told(version(1))
     identity.doubt()
-    for beat in range(PATIENCE):
+    for beat in range(MOST_UNANSWERED):
         assert standing(identity) is not Standing.TRUSTED
         if silences:
             identity.heard(beat * 2 * ABSENCE)
@@ -123,7 +123,7 @@ def mute() -> Watched:
     identity = Watched()
     identity.told(version(1))
     identity.doubt()
-    for _ in range(PATIENCE):
+    for _ in range(MOST_UNANSWERED):
         identity.unanswered()
     return identity
 
@@ -134,6 +134,6 @@ def test_another_id_is_a_strangers_however_silent_it_falls_and_is_asked_for_agai
         doubts = identity.doubts
         assert not identity.told(version(2))
         assert identity.doubts == doubts + 1
-        for _ in range(2 * PATIENCE):
+        for _ in range(2 * MOST_UNANSWERED):
             identity.unanswered()
         assert standing(identity) is Standing.STRANGER

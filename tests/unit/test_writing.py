@@ -133,7 +133,6 @@ def test_a_lost_session_gives_everything_back(codes: tuple[int, ...]) -> None:
     assert isinstance(transfer.error, SessionLost)
     assert transfer.error.by_server
     assert isinstance(transfer.error.__cause__, FtpNak)
-    assert transfer.failed_at == 478
     assert source.in_flight.empty
     assert list(source.todo) == [(239, len(CONTENT))]
     engine.receive(ack(requests[1]), 0.2)  # too late: nobody takes it for this file any more
@@ -148,7 +147,6 @@ def test_other_refusals_are_the_callers(codes: tuple[int, ...]) -> None:
     engine.receive(nak(requests[0], *codes), 0.1)
     assert isinstance(transfer.error, FtpNak)
     assert (transfer.error.opcode, transfer.error.code) == (Opcode.WRITE_FILE, codes[0])
-    assert transfer.failed_at == 0
     assert source.todo.covers(0, len(CONTENT))
 
 
@@ -255,7 +253,7 @@ def test_what_is_acked_is_on_the_card(
     if cut_short is None:
         assert source.acked.total == len(content)
     transfer.finish()
-    link.engine.drop(transfer)
+    link.engine.remove(transfer)
     assert source.in_flight.empty
     assert source.acked.total + source.todo.total == len(content)
     close(link, opened.session)
