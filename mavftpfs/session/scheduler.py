@@ -59,7 +59,9 @@ IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
 
-_MAYBE_OPEN_RETRY = 5.0
+MAYBE_OPEN_CLOSE = 5.0
+"""Seconds after the last use, or the last try, after which what may be open is closed."""
+
 _KEPT = "the vehicle's only session is kept by another transfer"
 _OTHERS = "another client of the vehicle may have a file open, which is not ended for ours"
 
@@ -491,20 +493,21 @@ class Scheduler:
             for user in self._queue:
                 user.on_queued()
             news_in = max(0.0, self.others_until - now)
+        if await server.sleep(min(self._closes_in(now), news_in)) or self.next_user() is not None:
+            return
+        self._used_at = self.clock()
         if server.session is not None:
-            # Counted from the last use, not from the last news: there may always be news.
-            left = max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(server.session.path) else 0.0
-            if not await server.sleep(min(left, news_in)) and self.next_user() is None:
-                await server.close_quietly()
-        elif server.maybe_open:
-            # An open or a Terminate that was never answered: leave no orphan over there. Any news begins this
-            # wait anew.
-            if not await server.sleep(min(_MAYBE_OPEN_RETRY, news_in)) and not server.vehicle.lost(
-                self.clock()
-            ):
-                await server.close_maybe_open()
-        else:
-            await server.sleep(news_in)
+            await server.close_quietly()
+        elif not server.vehicle.lost(self._used_at):
+            await server.close_maybe_open()
+
+    def _closes_in(self, now: float) -> float:
+        """Return in how many seconds what is open, or may be, is closed. That is counted from the last use,
+        not from the last news: there may always be news, and an orphan of ours keeps other clients out."""
+        session = self.server.session
+        if session is not None:
+            return max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(session.path) else 0.0
+        return max(0.0, self._used_at + MAYBE_OPEN_CLOSE - now) if self.server.maybe_open else inf
 
     def _is_kept(self, path: bytes) -> bool:
         """Return whether a file stays open a moment longer: not in flight, if nobody has it open here."""

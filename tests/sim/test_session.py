@@ -380,6 +380,25 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
 
 
 @pytest.mark.holds("promise 6")
+async def test_what_may_be_open_by_our_doing_does_not_keep_another_client_out() -> None:
+    """ArduPilot refuses each of its requests. Each refusal keeps our session alive, and is news for us."""
+    here = Rig("ardupilot", {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        await read_file(connection, path("ardupilot", "f"))
+        await trio.sleep(5.0)
+        here.faults.at(Opcode.OPEN_FILE_RO, here.link.cut)
+        with trio.move_on_after(0.5) as impatience:
+            await connection.store.stat_size(path("ardupilot", "f"))
+        assert impatience.cancelled_caught
+        here.link.restore()
+        assert here.server.open_sessions == 1
+        for _ in range(10):
+            here.another_asks(Opcode.LIST_DIRECTORY, b"/")
+            await trio.sleep(1.0)
+        assert here.server.open_sessions == 0
+
+
+@pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ONE_SESSION)
 @pytest.mark.parametrize("closes", [True, False])
 async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(closes: bool, profile: str) -> None:

@@ -502,7 +502,7 @@ async def test_only_what_was_not_proven_goes_again() -> None:
 
 @pytest.mark.parametrize("pause", [0.02, 1.0], ids=["while it is opened", "while it is sent"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_an_upload_that_is_given_up_asks_for_nothing_and_its_file_is_closed_soon(profile: str, pause: float) -> None:
+async def test_an_upload_that_is_given_up_is_closed_soon(profile: str, pause: float) -> None:
     here = Rig(profile, {b"/d": None}, PLAIN)
     async with here.connected() as connection:
         source = MemorySource(content(60_000))
