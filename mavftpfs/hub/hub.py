@@ -1,5 +1,6 @@
 """The hub: sockets around the router. Layer: hub.
 
+It begins with one client, the program that started it: until that one is let in, port and door are its own.
 It ends with its last client. But it stays while a vehicle is armed and an endpoint is heard: the link of a
 ground station outlives the mount.
 """
@@ -16,15 +17,17 @@ from typing import Any
 
 import trio
 
+from mavftpfs.hub.inlet import Inlet
 from mavftpfs.hub.outbox import Line, Outbox, Waiting
 from mavftpfs.hub.routing import BEATS, Kind, Router
 from mavftpfs.hub.senders import PORT, Place
 from mavftpfs.link.addresses import NetAddress, readable_address
 from mavftpfs.link.base import Link
-from mavftpfs.link.frames import Frame, Splitter
+from mavftpfs.link.frames import Frame
 from mavftpfs.link.hublink import (
     PROTOCOL,
     Facts,
+    as_address,
     make_tag,
     pack_facts,
     pack_frames,
@@ -53,15 +56,18 @@ _POLL = 0.003
 _LOOK = 1.0
 _RETRY = 2.0
 _MESSAGES = 64
+_LARGEST = 65536
+_COMPONENTS = 249
+"""Our component ids are 1 to 249: each is a program's own, and none is a router's."""
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
 _USB = "/dev/ttyACM"
-_MOST_SPLITTERS = 64
 
 
 @dataclass(slots=True)
 class _Client:
-    """A program of ours. forward: the endpoints that it asked for."""
+    """A program of ours. number: the link id of its signatures. forward: the endpoints that it asked for.
+    is_in: it was told that it is let in, which is the first that it hears."""
 
     side: int
     sock: socket.socket
@@ -69,7 +75,18 @@ class _Client:
     number: int
     name: str
     forward: tuple[str, ...]
+    is_in: bool = False
     dropped: int = 0
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Send messages. It loses those for which its socket is full, as on a port of its own."""
+        for message in messages if self.is_in else ():
+            try:
+                self.sock.send(message)
+            except BlockingIOError:
+                self.dropped += 1
+            except OSError:
+                return  # its own task notices
 
 
 @dataclass(slots=True)
@@ -83,6 +100,13 @@ class _Endpoint:
     scope: trio.CancelScope = field(default_factory=trio.CancelScope)
     link: Link | None = None
     problem: str = ""
+
+    def send(self, address: NetAddress | None, frames: Sequence[bytes]) -> None:
+        """Send frames to one of its addresses."""
+        if self.link is not None:
+            if address is not None:
+                self.link.answer(address)
+            self.link.send_nowait(frames)
 
 
 class Hub:
@@ -101,11 +125,10 @@ class Hub:
         self._door = door
         self._port: Link | None = None
         self._clients: dict[int, _Client] = {}
-        self._joining: list[tuple[str, ...]] = []
         self._endpoints: dict[str, _Endpoint] = {}
         self._sides = 0
+        self._one_by_one = trio.Lock()
         self._ended = trio.Event()
-        self._came = trio.Event()
         self._work = trio.Event()
         serial = spec.kind is LinkKind.SERIAL
         # The baud rate of a USB port means nothing; its symbolic links are under /dev/serial.
@@ -115,23 +138,20 @@ class Hub:
         self._said_doubles: set[Address] = set()
 
     async def run(self, first: socket.socket, on_ready: Callable[[], None]) -> None:
-        """Serve until the hub is not needed any more. first: the connection of the program that started it.
-
-        Until that program has joined, port and door are its own.
-        """
+        """Serve until the hub is not needed any more. first: the connection of the program that started
+        it."""
         async with AsyncExitStack() as stack:
             # Patient: what was handed over may have no connection at the moment.
             opening = open_link(self.spec, self._inherited, patient=True)
             port = self._port = await stack.enter_async_context(opening)
-            fixed = self.spec.kind is not LinkKind.UDP_IN
-            self.router.add(PORT, Kind.PORT, fixed=fixed)
+            self.router.add(PORT, Kind.PORT, fixed=self.spec.kind is not LinkKind.UDP_IN)
             async with trio.open_nursery() as nursery:
-                nursery.start_soon(self._serve, first, nursery)
                 on_ready()
-                await self._came.wait()
-                if not self._ended.is_set():
+                client = await self._let_in(first, nursery)
+                if client is not None:
                     stack.callback(self._door.remove)
                     self._door.is_hubs()
+                    nursery.start_soon(self._serve, client)
                     nursery.start_soon(self._accept, nursery)
                     nursery.start_soon(self._read, PORT, port)
                     nursery.start_soon(self._write)
@@ -143,121 +163,126 @@ class Hub:
 
     async def _accept(self, nursery: trio.Nursery) -> None:
         while True:
-            nursery.start_soon(self._serve, await self._door.accept(), nursery)
+            nursery.start_soon(self._receive, await self._door.accept(), nursery)
 
-    async def _serve(self, sock: socket.socket, nursery: trio.Nursery) -> None:
-        """Answer one connection: a client that stays, or a question."""
-        client: _Client | None = None
+    async def _receive(self, sock: socket.socket, nursery: trio.Nursery) -> None:
+        client = await self._let_in(sock, nursery)
+        if client is not None:
+            await self._serve(client)
+
+    async def _let_in(self, sock: socket.socket, nursery: trio.Nursery) -> _Client | None:
+        """Reply to the first message of a connection. Return the client if it is let in; else the connection
+        is closed."""
         set_buffers(sock)
+        client: _Client | None = None
         try:
-            hello: Facts | None = None
+            hello: Facts = {}
             with trio.move_on_after(HELLO_PATIENCE):
                 await trio.lowlevel.wait_readable(sock)
-                hello = unpack_facts(sock.recv(65536))
-            if hello is None:
-                return
-            client = await self._answered(sock, hello, nursery)
-            if client is not None:
-                await self._read_client(client)
+                hello = unpack_facts(sock.recv(_LARGEST)) or {}
+            if "join" in hello:
+                client = await self._joined(sock, hello, nursery)
+            elif "status" in hello or "stop" in hello:
+                sock.send(pack_facts(self.status()))
+                if "stop" in hello:
+                    self._ended.set()
         except OSError:
             pass  # it is gone
         finally:
-            trio.lowlevel.notify_closing(sock)
-            sock.close()
-            if client is not None:
-                self._leave(client)
-            elif not self._came.is_set():
-                self._ended.set()  # the client that started the hub does not stay
-                self._came.set()
+            if client is None:
+                trio.lowlevel.notify_closing(sock)
+                sock.close()
+        return client
 
-    async def _answered(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
-        """Reply to the first message of a connection; return the client if it is let in."""
-        if "join" in hello:
-            try:
-                client = await self._joined(sock, hello, nursery)
-            except (MavftpfsError, KeyError, TypeError, ValueError) as exc:
-                sock.send(pack_facts({"refused": str(exc)}))
-            else:
-                self._came.set()
+    async def _joined(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
+        """Let a program in, or tell it why not."""
+        try:
+            async with self._one_by_one:  # an endpoint that two want is opened once, or each is told
+                client = self._admitted(sock, hello)
                 try:
+                    await self._open_endpoints(client.forward, nursery, patient=bool(hello.get("again")))
                     sock.send(pack_facts({"own": client.own, "number": client.number}))
-                except OSError:
-                    self._leave(client)  # it was gone before it was let in
+                except BaseException:
+                    self._forget(client)
                     raise
-                return client
-        elif "status" in hello:
-            sock.send(pack_facts(self.status()))
-        elif "stop" in hello:
-            sock.send(pack_facts(self.status()))
-            self._ended.set()
-        return None
+        except (MavftpfsError, KeyError, TypeError, ValueError) as exc:
+            sock.send(pack_facts({"refused": str(exc)}))
+            return None
+        client.is_in = True
+        self.router.add(client.side, Kind.CLIENT, fixed=True)
+        if hello.get("beats"):
+            self.router.focus(client.side, BEATS)
+        log.info("%s joined as %d/%d", client.name or "a client", *client.own)
+        return client
 
-    async def _joined(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client:
-        """Let a client in.
+    def _admitted(self, sock: socket.socket, hello: Facts) -> _Client:
+        """Return a new client, which counts from now on.
 
         Raises:
-            MavftpfsError: it is of another version, wants another port, or an endpoint that cannot be opened.
+            MavftpfsError: it is of another version, wants another port, or one too many.
+            KeyError, TypeError, ValueError: its request makes no sense.
         """
         if hello.get("protocol") != PROTOCOL:
             raise LinkClosed(
                 "another version of mavftpfs has the port; end its mounts, or: mavftpfs hub --stop --force"
             )
-        spec = parse_source(hello["join"])
+        spec = parse_source(str(hello["join"]))
         if not same_link(spec, self.spec):
             raise LinkClosed(
                 f"{self.spec.description} is shared already, so {spec.description} cannot be opened"
             )
-        forward = tuple(map(str, hello.get("forward", ())))
-        self._joining.append(forward)
-        try:
-            await self._open_endpoints(forward, nursery, patient=bool(hello.get("again")))
-        finally:
-            self._joining.remove(forward)
-        own, number = self._granted(Address(*hello["own"]), hello.get("number"))
+        own, number = self._granted(Address(*map(int, hello["own"])), hello.get("number"))
         self._sides += 1
-        side = self._sides
-        self.router.add(side, Kind.CLIENT, fixed=True)
-        if hello.get("beats"):
-            self.router.focus(side, BEATS)
-        client = _Client(side, sock, own, number, str(hello.get("name", "")), forward)
-        self._clients[side] = client
-        log.info("%s joined as %d/%d", client.name or "a client", *own)
+        forward = tuple(map(str, hello.get("forward", ())))
+        client = _Client(self._sides, sock, own, number, str(hello.get("name", "")), forward)
+        self._clients[client.side] = client
         return client
 
     def _granted(self, wanted: Address, number: int | None) -> tuple[Address, int]:
         """Return the address that a client gets, and the link id of its signatures: those that it asks for,
-        unless another client has them.
+        unless another program has them.
 
         Raises:
-            LinkClosed: all link ids are in use.
+            LinkClosed: all addresses are in use.
         """
         owns = {client.own for client in self._clients.values()}
-        for _ in range(255):
-            if wanted not in owns and wanted not in self.router.senders:
-                break
-            wanted = Address(wanted.system, wanted.component % 249 + 1)
+        turns = range(wanted.component, wanted.component + _COMPONENTS)
+        choice = [wanted, *(Address(wanted.system, turn % _COMPONENTS + 1) for turn in turns)]
+        own = next((one for one in choice if one not in owns and one not in self.router.senders), None)
+        if own is None:
+            raise LinkClosed(f"{len(owns)} programs share this port already, and no more can")
         numbers = {client.number for client in self._clients.values()}
         if number is None or number in numbers:
-            number = next((free for free in range(256) if free not in numbers), None)
-        if number is None:
-            raise LinkClosed(f"{len(numbers)} programs share this port already, and no more can")
-        return wanted, number
+            number = min(set(range(len(numbers) + 1)) - numbers)
+        return own, number
 
-    def _leave(self, client: _Client) -> None:
-        self._clients.pop(client.side, None)
-        self.router.remove(client.side)
-        log.info("%s left", client.name or "a client")
+    def _forget(self, client: _Client) -> None:
+        del self._clients[client.side]
+        if client.is_in:
+            self.router.remove(client.side)
         self._end_if_done()
 
+    async def _serve(self, client: _Client) -> None:
+        """Pass on what comes from a client until it leaves."""
+        try:
+            await self._read_client(client)
+        except OSError:
+            pass  # it was killed
+        finally:
+            trio.lowlevel.notify_closing(client.sock)
+            client.sock.close()
+            self._forget(client)
+            log.info("%s left", client.name or "a client")
+
     async def _read_client(self, client: _Client) -> None:
-        splitter = Splitter(stream=False)
+        inlet = Inlet(client.side, stream=False)
         while True:
             await trio.lowlevel.wait_readable(client.sock)
             frames: list[tuple[Place, Frame]] = []
             ended = False
             for _ in range(_MESSAGES):
                 try:
-                    message = client.sock.recv(65536)
+                    message = client.sock.recv(_LARGEST)
                 except BlockingIOError:
                     break
                 if not message:
@@ -267,17 +292,17 @@ class Hub:
                 if facts is not None:
                     self._on_wish(client, facts)
                 else:
-                    place = Place(client.side, None)
-                    frames += [(place, frame) for frame in splitter.feed(unpack_frames(message)[1])]
+                    frames += inlet.feed(unpack_frames(message)[1], None)
             self._pass_on(frames, forwarded=False)
             if ended:
                 return
 
     def _on_wish(self, client: _Client, facts: Facts) -> None:
-        if isinstance(facts.get("focus"), int):
+        if type(facts.get("focus")) is int:
             self.router.focus(client.side, facts["focus"])
-        if isinstance(facts.get("answer"), list):
-            self.router.answer(client.side, tuple(facts["answer"]))
+        address = as_address(facts.get("answer"))
+        if address is not None:
+            self.router.answer(client.side, address)
 
     # -- endpoints
 
@@ -333,40 +358,27 @@ class Hub:
 
     async def _read(self, side: int, link: Link) -> None:
         """Pass on what comes from the port or an endpoint."""
-        splitters: dict[NetAddress | None, Splitter] = {}
-        stream, forwarded = link.is_stream, side != PORT
-        if stream:
-            splitters[None] = Splitter(stream=True)
+        inlet = Inlet(side, stream=link.is_stream)
         while True:
-            quiet = QUIET if stream and splitters[None].waiting else float("inf")
             pieces: list[bytes] | None = None
-            with trio.move_on_after(quiet):
+            with trio.move_on_after(QUIET if inlet.waiting else float("inf")):
                 pieces = await link.receive()
             frames: list[tuple[Place, Frame]] = []
             if pieces is None:
-                frames = [(Place(side, link.sender(-1)), frame) for frame in splitters[None].give_up()]
+                frames = inlet.give_up(link.sender(-1))
             elif not pieces:
-                self._on_reopened(side, splitters)
+                inlet.reset()
+                self._tell_reopened(side)
             for index, piece in enumerate(pieces or ()):
-                address = link.sender(index)
-                key = None if stream else address
-                splitter = splitters.get(key)
-                if splitter is None:
-                    if len(splitters) >= _MOST_SPLITTERS:
-                        splitters.clear()
-                    splitter = splitters[key] = Splitter(stream=False)
-                place = Place(side, address)
-                frames += [(place, frame) for frame in splitter.feed(piece)]
+                frames += inlet.feed(piece, link.sender(index))
             if any(frame.crc_fits for _, frame in frames):
                 link.keep_peer()
-            self._pass_on(frames, forwarded=forwarded)
+            self._pass_on(frames, forwarded=side != PORT)
 
-    def _on_reopened(self, side: int, splitters: dict[NetAddress | None, Splitter]) -> None:
-        for splitter in splitters.values():
-            splitter.reset()
+    def _tell_reopened(self, side: int) -> None:
         if side == PORT:
             for client in self._clients.values():
-                self._send_to_client(client, [pack_facts({"reopened": True})])
+                client.send([pack_facts({"reopened": True})])
 
     def _pass_on(self, frames: Sequence[tuple[Place, Frame]], *, forwarded: bool) -> None:
         """Route frames that came together, and send each destination its share at once."""
@@ -389,23 +401,11 @@ class Hub:
     def _deliver(self, target: Place, origin: NetAddress | None, frames: Sequence[bytes]) -> None:
         client = self._clients.get(target.side)
         if client is not None:
-            self._send_to_client(client, pack_frames(frames, make_tag(origin)))
+            client.send(pack_frames(frames, make_tag(origin)))
             return
         for endpoint in self._endpoints.values():
-            if endpoint.side == target.side and endpoint.link is not None:
-                if target.address is not None:
-                    endpoint.link.answer(target.address)
-                endpoint.link.send_nowait(frames)
-
-    def _send_to_client(self, client: _Client, messages: Sequence[bytes]) -> None:
-        """Send messages to a client. It loses those for which its socket is full, as on a port of its own."""
-        for message in messages:
-            try:
-                client.sock.send(message)
-            except BlockingIOError:
-                client.dropped += 1
-            except OSError:
-                return  # its own task notices
+            if endpoint.side == target.side:
+                endpoint.send(target.address, frames)
 
     # -- out over the port
 
@@ -457,13 +457,12 @@ class Hub:
             await trio.sleep(_LOOK)
 
     def _end_if_done(self) -> None:
-        asked = [*self._joining, *(client.forward for client in self._clients.values())]
-        wanted = {text for forward in asked for text in forward}
+        wanted = {text for client in self._clients.values() for text in client.forward}
         if self._clients:
             for endpoint in [known for text, known in self._endpoints.items() if text not in wanted]:
                 if not self._is_active(endpoint):
                     self._drop_endpoint(endpoint)
-        elif self._came.is_set() and not self._is_needed():
+        elif not self._is_needed():
             self._ended.set()
 
     def _is_active(self, endpoint: _Endpoint) -> bool:

@@ -55,18 +55,27 @@ def unpack_facts(message: bytes) -> Facts | None:
         return None
     try:
         facts = json.loads(message)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return facts if isinstance(facts, dict) else None
 
 
+def as_address(value: object) -> NetAddress | None:
+    """Return the network address that a fact is, None if it is none: host, port, and more for IPv6."""
+    match value:
+        case [str(), int(port), *rest] if port in range(1 << 16) and all(type(one) is int for one in rest):
+            return tuple(value)
+    return None
+
+
+@lru_cache(maxsize=256)  # bounded: frames may come from any number of addresses
 def make_tag(address: NetAddress | None) -> bytes:
     """Return the tag of an address."""
     tag = b"" if address is None else json.dumps(address).encode()
     return tag if len(tag) <= _MAX_TAG else b""
 
 
-@lru_cache(maxsize=256)  # bounded: frames may come from any number of addresses
+@lru_cache(maxsize=256)
 def _address_of(tag: bytes) -> NetAddress | None:
     """Return the address of a tag."""
     return tuple(json.loads(tag)) if tag else None

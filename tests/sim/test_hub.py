@@ -17,6 +17,7 @@ import trio.testing
 
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.hub.hub import Hub
+from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import (
     PROTOCOL,
     HubLink,
@@ -120,12 +121,15 @@ async def test_an_endpoint_that_cannot_be_opened_yet_is_tried_again(
 
 
 class SlowNames(trio.abc.HostnameResolver):
-    """A name server that takes three seconds for one name."""
+    """A name server that takes three seconds for a name that is known, and for one that is not."""
 
     async def getaddrinfo(self, host: Any, port: Any, *args: Any, **kwargs: Any) -> Any:
         if host == b"slow.example":
             await trio.sleep(3)
             host = HOST
+        elif host == b"nowhere.example":
+            await trio.sleep(3)
+            raise socket.gaierror(socket.EAI_NONAME, "unknown")
         return socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
 
     async def getnameinfo(self, sockaddr: Any, flags: int) -> Any:
@@ -142,6 +146,23 @@ async def test_endpoints_stay_while_the_client_that_wants_them_waits_for_another
         assert {facts["endpoint"] for facts in (await here.status())["endpoints"]} == set(places)
         await client.aclose()
         await trio.sleep(5)
+        assert (await here.status())["endpoints"] == []
+
+
+async def test_of_two_programs_that_want_an_endpoint_that_cannot_be_both_are_told(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    trio.socket.set_custom_hostname_resolver(SlowNames())
+
+    async def is_refused() -> None:
+        with pytest.raises(Refused, match="unknown"):
+            await here.joined(endpoint)
+
+    endpoint = f"udpout:nowhere.example:{free_udp_port()}"
+    async with running(tmp_path) as here:
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(is_refused)
+            nursery.start_soon(is_refused)
         assert (await here.status())["endpoints"] == []
 
 
@@ -168,15 +189,46 @@ async def test_a_hub_may_be_asked_and_stopped_by_another_version_but_not_joined(
         await here.ended.wait()
 
 
-async def test_more_programs_than_link_ids_are_refused(
+async def test_no_more_programs_are_let_in_than_there_are_addresses(
     tmp_path: Path, autojump_clock: trio.testing.MockClock
 ) -> None:
     async with running(tmp_path) as here, AsyncExitStack() as stack:
-        for _ in range(255):
+        for _ in range(248):
             stack.push_async_callback((await here.joined()).aclose)
-        with pytest.raises(Refused, match="256 programs"):
+        with pytest.raises(Refused, match="249 programs"):
             await here.joined()
-        assert len((await here.status())["clients"]) == 256
+        clients = (await here.status())["clients"]
+        assert len({tuple(client["address"]) for client in clients}) == 249
+
+
+HELLO = {"protocol": PROTOCOL, "own": US, "number": None, "forward": [], "join": "udpin:127.0.0.1:1"}
+WRONG: list[dict[str, Any]] = [
+    *({"join": 5}, {"join": None}, {"join": "udpin"}, {"forward": 5}, {"forward": [None]}),
+    *({"own": 5}, {"own": [1]}, {"own": ["a", "b"]}, {"own": [[], {}]}, {"number": [1]}, {"protocol": {}}),
+]
+GARBAGE = [
+    *(b"", b"\0", b"{", b"{}", b"\xff\xfe", b'{"\xff": 1}', b"F", b"F\xff", b"[]", b"0"),
+    b'{"join": ' + b"[" * 60_000,
+    *(pack_facts(HELLO | wrong) for wrong in WRONG),
+]
+NONSENSE: list[Any] = ["x", -1, True, [], 5, {}, None, "host", [5, 5], ["x", 70_000], ["x", "y"], ["x"]]
+
+
+async def test_a_program_that_talks_nonsense_disturbs_nobody(
+    tmp_path: Path, autojump_clock: trio.testing.MockClock
+) -> None:
+    async with running(tmp_path) as here:
+        for message in GARBAGE:
+            with here.knock() as sock:
+                sock.send(message)
+                await trio.sleep(0.1)
+        client = await here.joined()
+        for fact in NONSENSE:
+            client.tell({"answer": fact, "focus": fact})
+            client.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
+            await trio.sleep(0.1)
+        assert len((await here.status())["clients"]) == 2
+        await client.aclose()
 
 
 async def test_a_port_is_shared_while_its_vehicle_restarts(
@@ -217,6 +269,17 @@ async def test_frames_from_made_up_addresses_take_no_memory() -> None:
         tracemalloc.stop()
         theirs.close()
         await link.aclose()
+
+
+async def test_that_the_port_was_reopened_is_told_between_what_came_before_and_after() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    set_buffers(ours)
+    link = HubLink(ours, parse_source(f"udpin:{HOST}:14550"), {"own": US, "number": 0})
+    with theirs:
+        for message in (*pack_frames([b"1"]), pack_facts({"reopened": True}), *pack_frames([b"2"])):
+            theirs.send(message)
+        assert [await link.receive() for _ in range(3)] == [[b"1"], [], [b"2"]]
+    await link.aclose()
 
 
 async def test_a_port_without_a_number_cannot_be_shared() -> None:

@@ -64,6 +64,7 @@ PURE_MODULES = {
     "cache.draft",
     "client.flights",
     "client.options",
+    "hub.inlet",
     "hub.outbox",
     "hub.routing",
     "hub.senders",
