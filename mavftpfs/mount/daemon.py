@@ -122,8 +122,9 @@ def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
 
 
 def ending_signals() -> list[signal.Signals]:
-    """Return the signals that end us: not those that our caller made us ignore (nohup)."""
-    return [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
+    """Return the signals that end us. A shell that starts us by nohup, or a script by `&`, has us ignore
+    some."""
+    return [n for n in _ENDING if n == signal.SIGTERM or signal.getsignal(n) != signal.SIG_IGN]
 
 
 @contextmanager

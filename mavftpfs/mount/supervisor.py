@@ -147,9 +147,10 @@ class Supervisor(Life):
     async def _keep_members(self, nursery: trio.Nursery) -> None:
         """Start a mount for each vehicle that is heard and has none."""
         while True:
-            for member in () if self.state is State.LEAVING else self._roster.due(trio.current_time()):
-                member.start()
-                nursery.start_soon(self._keep_mounted, member)
+            if self.state is State.MOUNTED:
+                for member in self._roster.due(trio.current_time()):
+                    member.start()
+                    nursery.start_soon(self._keep_mounted, member)
             await trio.sleep(PERIOD)
 
     async def _keep_mounted(self, member: Member) -> None:
@@ -182,9 +183,9 @@ class Supervisor(Life):
             code = await process.wait()
         del self._processes[member.name]
         member.ended(code, said[-1] if said else f"its mount ended with {code}", trio.current_time())
-        if code != 0:
+        if member.state is MemberState.FAILED:
             log.warning("the mount of vehicle %s ended: %s", member.name, member.problem)
-            await trio.to_thread.run_sync(partial(unmount, place, lazy=True))  # what a killed one left
+            await trio.to_thread.run_sync(_take_away, place)
 
     def _place(self, member: Member) -> str:
         return os.path.join(self.request.mountpoint, member.name)
@@ -215,31 +216,29 @@ class Supervisor(Life):
             if self.state is not State.MOUNTED:
                 return
             self.enter(State.LEAVING)
-            before = set(self._processes)
+            outcomes = await self._end_members(lazy=lazy)
+            problems = "; ".join(filter(None, outcomes.values()))
             try:
-                await self._end_members(lazy=lazy)
+                if problems:
+                    raise MountFailed(problems)
                 await trio.to_thread.run_sync(partial(unmount, self.request.mountpoint, lazy=lazy))
             except MountFailed as exc:
                 self.enter(State.MOUNTED)
-                gone = ", ".join(sorted(before - set(self._processes)))
+                gone = ", ".join(name for name, problem in outcomes.items() if not problem)
                 raise MountFailed(f"{exc}; unmounted: {gone}" if gone else str(exc)) from exc
         self._loop.stop()  # after a lazy unmount the kernel ends it only with its last user
 
-    async def _end_members(self, *, lazy: bool) -> None:
-        """Have all vehicles' mounts deliver and end, at the same time.
-
-        Raises:
-            MountFailed: some do not (never if lazy).
-        """
-        problems: list[str] = []
+    async def _end_members(self, *, lazy: bool) -> dict[str, str]:
+        """Have all vehicles' mounts deliver and end, at the same time; return for each name why it did not,
+        or "". If lazy, all do."""
+        outcomes = {member.name: "" for member in self._roster if member.name in self._processes}
         async with trio.open_nursery() as nursery:
             for member in self._roster:
-                if member.name in self._processes:
-                    nursery.start_soon(self._end_member, member, lazy, problems)
-        if problems:
-            raise MountFailed("; ".join(problems))
+                if member.name in outcomes:
+                    nursery.start_soon(self._end_member, member, lazy, outcomes)
+        return outcomes
 
-    async def _end_member(self, member: Member, lazy: bool, problems: list[str]) -> None:
+    async def _end_member(self, member: Member, lazy: bool, outcomes: dict[str, str]) -> None:
         process, place = self._processes[member.name], self._place(member)
         request = {"command": "umount", "lazy": lazy}
         try:
@@ -248,7 +247,7 @@ class Supervisor(Life):
             reply = await trio.to_thread.run_sync(action)
         except control.ControlError as exc:
             if not lazy and not isinstance(exc, control.NobodyThere):
-                problems.append(str(exc))
+                outcomes[member.name] = str(exc)
                 return
             process.send_signal(signal.SIGTERM)  # it is still starting, or cannot unmount
         else:
@@ -271,6 +270,14 @@ def _explained(error: MountFailed) -> MountFailed:
         "to mount below a mount of yours, fusermount3 needs the line user_allow_other in /etc/fuse.conf: "
         "echo user_allow_other | sudo tee -a /etc/fuse.conf; or mount each vehicle by -o target_system="
     )
+
+
+def _take_away(place: str) -> None:
+    """Unmount what a killed mount left."""
+    try:
+        unmount(place, lazy=True)
+    except MountFailed as exc:
+        log.warning("%s", exc)
 
 
 async def _collect(process: trio.Process, said: list[str]) -> None:
