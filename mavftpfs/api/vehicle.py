@@ -10,7 +10,6 @@ import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.client import download, names, upload
 from mavftpfs.client.connect import attached, open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetcher, known_time
-from mavftpfs.client.files import File, Files, Session, Target, mount_status, session_of, walk
+from mavftpfs.client.files import File, Files, Session, Target, session_of, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
@@ -85,9 +84,6 @@ def entry(path: bytes, stat: Stat) -> Entry:
     return Entry(os.fsdecode(name), os.fsdecode(path), stat.size, mtime, stat.kind)
 
 
-Status = Callable[[], Awaitable[Mapping[str, Any]]]
-
-
 class Drone:
     """A vehicle's files. Made by `connect`; every call may be made by several tasks at once.
 
@@ -99,11 +95,10 @@ class Drone:
             own.
     """
 
-    def __init__(self, source: str, session: Session, status: Status, nursery: trio.Nursery) -> None:
+    def __init__(self, source: str, session: Session, nursery: trio.Nursery) -> None:
         self.source = source
         self.mountpoint = session.mountpoint
         self._session = session
-        self._status = status
         self._nursery = nursery
         self._opened: set[Opened] = set()
 
@@ -196,7 +191,7 @@ class Drone:
     async def status(self) -> dict[str, Any]:
         """Return what `mavftpfs status --json` tells of vehicle, link and transfers."""
         with translated():
-            return dict(await self._status())
+            return dict(await self._session.status())
 
     async def refresh(self) -> None:
         """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
@@ -475,8 +470,8 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         if target.mount is not None and not use_mount:
             raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
         up = _session(target, use_mount=use_mount)
-        async with up as (session, status), plain_nursery() as nursery:
-            drone = Drone(source, session, status, nursery)
+        async with up as session, plain_nursery() as nursery:
+            drone = Drone(source, session, nursery)
             try:
                 yield drone
             finally:
@@ -485,18 +480,13 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
 
 
 @asynccontextmanager
-async def _session(target: Target, *, use_mount: bool) -> AsyncIterator[tuple[Session, Status]]:
+async def _session(target: Target, *, use_mount: bool) -> AsyncIterator[Session]:
     session = await target.mounted() if use_mount else None
     if session is not None:
-        assert session.mountpoint is not None
-        yield session, partial(mount_status, session.mountpoint)
+        yield session
         return
     assert target.spec is not None
     with open_sinks(target.options, debug=False, tell=log.info) as sinks:
         up = attached(target.spec, target.options, sinks=sinks, writing=True)
         async with up as vehicle:
-
-            async def status() -> Mapping[str, Any]:
-                return vehicle.status()
-
-            yield session_of(vehicle, target.options), status
+            yield session_of(vehicle, target.options)

@@ -9,7 +9,7 @@ from typing import Protocol
 import trio
 
 from mavftpfs.client.connect import with_tree
-from mavftpfs.client.files import Session, mount_status, session_of
+from mavftpfs.client.files import Session, session_of
 from mavftpfs.client.options import Options
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_COMP_ID_AUTOPILOT1, Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
@@ -143,10 +143,9 @@ class MountContact:
 
     async def listen(self, hearing: Hearing) -> None:
         """See Contact."""
-        assert self.session.mountpoint is not None
         try:
             while True:
-                status = await mount_status(self.session.mountpoint)
+                status = await self.session.status()
                 vehicle = status["vehicle"]
                 if self.system is not None and vehicle["restarts"] > self._restarts:
                     hearing.restarted(self.system)

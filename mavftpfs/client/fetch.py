@@ -270,7 +270,7 @@ class Fetcher:
             try:
                 return await self._fetch(wanted)
             except (VehicleLost, RequestTimeout) as exc:
-                if not self.session.silent():
+                if not await self.session.lost():
                     raise
                 self.progress.wait()
                 if not await self.session.returned():

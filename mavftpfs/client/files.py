@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn, Protocol
 
 import trio
 
@@ -23,15 +23,16 @@ from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
 from mavftpfs.client.mountpoint import OUR_TYPE, enclosing_mount, mounts
 from mavftpfs.client.options import Options
-from mavftpfs.client.status import has_link, is_wanted, told_by, vehicle_below
+from mavftpfs.client.status import Facts, has_link, is_wanted, told_by, vehicle_below
 from mavftpfs.link.uri import LinkSpec
-from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
 from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
+_TICK = 0.2
+"""Seconds between two questions whether a lost vehicle is heard again."""
 
 
 class File(Protocol):
@@ -190,35 +191,43 @@ async def written(file: File) -> AsyncIterator[Writing]:
     await writing.deliver()
 
 
-Acknowledged = Mapping[str, int]
-"""Files of which the vehicle lacks bytes, and how many bytes of each it acknowledged."""
-
-
-async def _none() -> Acknowledged:
-    return {}
-
-
-async def _no_return() -> bool:
-    return False
-
-
 @dataclass(frozen=True, slots=True)
 class Session:
     """A vehicle's files for the length of one command.
 
-    root: where `/` of `files` lies on the vehicle. acknowledged: asks for the files that are not on the
-    vehicle yet. counts: how many files were verified in which way, as `status` has it.
-    mountpoint: of the mount whose files these are, None for a connection of our own. silent: whether the
-    vehicle is not heard; returned: waits for it, and returns whether it is heard again in time.
+    status: asks for what `status --json` tells of vehicle, link and transfers. root: where `/` of `files`
+    lies on the vehicle. mountpoint: of the mount whose files these are, None for a connection of our own.
+    patience: seconds for which a lost vehicle is waited for.
     """
 
     files: Files
-    root: bytes = b"/"
-    acknowledged: Callable[[], Awaitable[Acknowledged]] = _none
+    status: Callable[[], Awaitable[Facts]]
+    root: bytes = ROOT
     mountpoint: str | None = None
-    silent: Callable[[], bool] = lambda: False
-    returned: Callable[[], Awaitable[bool]] = _no_return
-    counts: Callable[[], Awaitable[Mapping[str, Any]]] = _none
+    patience: float = 0.0
+
+    async def lost(self) -> bool:
+        """Return whether the vehicle is lost.
+
+        Raises:
+            LinkClosed: the mount is gone.
+        """
+        return (await self.status())["link"]["state"] in ("lost", "replaced")
+
+    async def returned(self) -> bool:
+        """Wait for a lost vehicle; return whether it is heard again in time. Raises: as `lost`."""
+        with trio.move_on_after(self.patience):
+            while await self.lost():  # noqa: ASYNC110 (a mount is asked)
+                await trio.sleep(_TICK)
+            return True
+        return False
+
+    async def acknowledged(self, path: bytes) -> int | None:
+        """Return the bytes that the vehicle has of a file that is being sent; None if it is not. Raises: as
+        `lost`."""
+        name, transfers = self.on_vehicle(path).decode(errors="replace"), (await self.status())["transfers"]
+        sent = {facts["path"]: facts["done"] for facts in transfers if facts["direction"] == "write"}
+        return sent.get(name)
 
     def on_vehicle(self, path: bytes) -> bytes:
         """Return the vehicle's own name of a path."""
@@ -292,11 +301,11 @@ async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     it."""
     for status in await mounts_on(spec):
         if is_wanted(status, options):
-            return session_on(status, options.root, read_only=options.read_only)
+            return session_on(status, options.root, options)
     return None
 
 
-async def mounts_on(spec: LinkSpec) -> list[Mapping[str, Any]]:
+async def mounts_on(spec: LinkSpec) -> list[Facts]:
     """Return the status of each mount that has this link now and may be read by us."""
     found = []
     for mountpoint in [path for path, mount in mounts().items() if mount.type == OUR_TYPE]:
@@ -322,7 +331,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     if options.target_system not in (0, system) or options.target_component not in (0, component):
         raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")
     root = normalise(os.fsencode(status["root"]) + b"/" + subtree)
-    session = session_on(status, root, read_only=options.read_only)
+    session = session_on(status, root, options)
     if subtree != ROOT:
         place = name_text(os.fsencode(mountpoint) + subtree)
         try:
@@ -334,22 +343,14 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     return session
 
 
-def session_on(status: Mapping[str, Any], root: bytes, *, read_only: bool = False) -> Session:
+def session_on(status: Facts, root: bytes, options: Options) -> Session:
     """Return the files below `root` of a vehicle, by the mount with this status."""
-    mountpoint = status["mountpoint"]
-
-    async def acknowledged() -> Acknowledged:
-        found = (await mount_status(mountpoint))["transfers"]
-        return {facts["path"]: facts["done"] for facts in found if facts["direction"] == "write"}
-
-    async def counts() -> Mapping[str, Any]:
-        return dict((await mount_status(mountpoint))["cache"])
-
-    files = MountedFiles(mountpoint, os.fsencode(status["root"]), root, read_only=read_only)
-    return Session(files, root, acknowledged, mountpoint, counts=counts)
+    mountpoint, mounted = status["mountpoint"], os.fsencode(status["root"])
+    files = MountedFiles(mountpoint, mounted, root, read_only=options.read_only)
+    return Session(files, partial(mount_status, mountpoint), root, mountpoint, options.connect_timeout)
 
 
-async def mount_status(mountpoint: str, *, several: bool = False) -> Mapping[str, Any]:
+async def mount_status(mountpoint: str, *, several: bool = False) -> Facts:
     """Return the status that a mount tells to users that may read its files. several: it may be a mount of
     several vehicles.
 
@@ -366,9 +367,6 @@ async def mount_status(mountpoint: str, *, several: bool = False) -> Mapping[str
     if "members" in status and not several:
         raise errors.LinkClosed(f"the mount on {mountpoint} is one of several vehicles now")
     return status
-
-
-_TICK = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,25 +407,10 @@ class Target:
 def session_of(vehicle: Attached, options: Options) -> Session:
     """Return the files of a connection of our own."""
 
-    async def acknowledged() -> Acknowledged:
-        found: Any = vehicle.tree.status().get("transfers", [])
-        return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}
+    async def status() -> Facts:
+        return vehicle.status()
 
-    async def counts() -> Mapping[str, Any]:
-        return vehicle.tree.status()
-
-    def silent() -> bool:
-        connection = vehicle.connection
-        return connection.vehicle.silence(connection.clock()) > SILENCE_LIMIT
-
-    async def returned() -> bool:
-        for _ in range(round(options.connect_timeout / _TICK)):
-            if not silent():
-                return True
-            await trio.sleep(_TICK)
-        return not silent()
-
-    return Session(vehicle.tree, options.root, acknowledged, None, silent, returned, counts)
+    return Session(vehicle.tree, status, options.root, None, options.connect_timeout)
 
 
 @asynccontextmanager

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager, suppress
 import trio
 
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.client.files import Session, mount_status
+from mavftpfs.client.files import Session
 from mavftpfs.shared.errors import LinkError
 from mavftpfs.shared.speed import Speed
 
@@ -87,17 +87,12 @@ LOOK_PERIOD = 0.5
 
 @asynccontextmanager
 async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[None]:
-    """Tell progress during the body whether the vehicle is lost, for us or for the mount that is used."""
-
-    async def lost() -> bool:
-        if session.mountpoint is None:
-            return session.silent()
-        return (await mount_status(session.mountpoint))["link"]["state"] in ("lost", "replaced")
+    """Tell progress during the body whether the vehicle is lost."""
 
     async def watch() -> None:
         while True:
             with suppress(LinkError):  # if the mount is gone, the body gets the error
-                progress.lost = await lost()
+                progress.lost = await session.lost()
             await trio.sleep(LOOK_PERIOD)
 
     async with plain_nursery() as nursery:

@@ -157,11 +157,11 @@ async def put_alone(
 
 
 async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: Progress, tell: Tell) -> None:
-    before = await session.counts()
+    before = (await session.status())["cache"]
     size = await put_file(session, local, remote, progress)
     after: Mapping[str, Any] = {}
     with suppress(LinkError):  # the mount is gone, but the file is on the vehicle
-        after = await session.counts()
+        after = (await session.status())["cache"]
     tell(remote, size, how_verified(before, after))
 
 
@@ -259,14 +259,13 @@ async def _copy(source: BinaryIO, file: File) -> int:
 @asynccontextmanager
 async def watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
     """Tell progress what the vehicle has acknowledged of a file while the body sends it."""
-    name = session.on_vehicle(path).decode(errors="replace")
 
     async def watch() -> None:
         while True:
             await trio.sleep(ASK_PERIOD)
             acknowledged = None
             with suppress(LinkError):  # if the mount is gone, the body gets the error
-                acknowledged = (await session.acknowledged()).get(name)
+                acknowledged = await session.acknowledged(path)
             if acknowledged is not None:
                 progress.at(min(acknowledged, progress.size))
                 if acknowledged >= progress.size:

@@ -17,6 +17,7 @@ import pytest
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.client import control
 from mavftpfs.client.files import session_on
+from mavftpfs.client.options import Options
 from mavftpfs.shared.errors import MavftpfsError
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, unmount, wait_until
@@ -319,7 +320,7 @@ async def test_what_a_client_takes_back_from_a_mount_never_comes(field: Field) -
     vehicle = field.sim(card)
     mount = field.mount(vehicle.source, "op_deadline=2")
     mount.allowed_log = ("is not delivered",)
-    session = session_on(mount.status(), b"/")
+    session = session_on(mount.status(), b"/", Options())
     old = await session.files.open(b"/old", write=True, truncate=True)
     new = await session.files.create(b"/new", exclusive=True)
     for file in (old, new):

@@ -6,15 +6,26 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, cast
 
 import trio
 
 from mavftpfs.cache.tree import Stat
+from mavftpfs.client.files import Files, Session
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, split
 
 MTIME = 1_700_000_000
+
+
+def session_of(tree: Any, root: bytes = ROOT, *, mountpoint: str | None = None) -> Session:
+    """Return a session on a tree, of a vehicle that is heard and does nothing else."""
+    return Session(cast(Files, tree), quiet, root, mountpoint)
+
+
+async def quiet() -> dict[str, Any]:
+    return {"link": {"state": "fine"}, "transfers": [], "cache": {}}
 
 
 @dataclass

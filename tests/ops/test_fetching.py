@@ -6,7 +6,7 @@ import fcntl
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import trio
@@ -37,7 +37,8 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
-from tests.ops.faketree import MTIME, FakeFile, FakeTree
+from mavftpfs.shared.model import ROOT
+from tests.ops.faketree import MTIME, FakeFile, FakeTree, session_of
 
 BIG = bytes(range(251)) * 2000
 
@@ -70,7 +71,7 @@ class SpoiltTree(FakeTree):
 
 
 def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto", resume: bool = True) -> Fetcher:
-    return Fetcher(Session(cast(Files, tree), root), Progress(), verify, resume)
+    return Fetcher(session_of(tree, root), Progress(), verify, resume)
 
 
 def names_in(folder: Path) -> list[str]:
@@ -113,8 +114,11 @@ async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: P
 # -- going on -------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("mountpoint", [None, "/mnt/drone"])
 @pytest.mark.parametrize("returns", [True, False])
-async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, returns: bool) -> None:
+async def test_a_vehicle_that_is_lost_is_waited_for(
+    tmp_path: Path, returns: bool, mountpoint: str | None
+) -> None:
     tree = SpoiltTree({b"/big": BIG})
     reads, waited = 0, 0
 
@@ -124,15 +128,14 @@ async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, returns: boo
         if name == "read" and reads in (3, 9):
             raise RequestTimeout("no data came")
 
-    async def returned() -> bool:
+    async def status() -> dict[str, Any]:
         nonlocal waited
-        waited += 1
-        assert fetcher.progress.state == "waiting for the vehicle"
-        return returns
+        waiting = fetcher.progress.state == "waiting for the vehicle"
+        waited += waiting
+        return {"link": {"state": "fine" if waiting and returns else "lost"}}
 
     tree.on_call = lose
-    session = Session(cast(Files, tree), silent=lambda: True, returned=returned)
-    fetcher = Fetcher(session, Progress())
+    fetcher = Fetcher(Session(cast(Files, tree), status, ROOT, mountpoint, 1.0), Progress())
     if returns:
         fetched = await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
         assert (tmp_path / "big").read_bytes() == BIG

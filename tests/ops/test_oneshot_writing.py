@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import trio
@@ -32,7 +32,7 @@ from mavftpfs.shared.errors import (
     exit_code_for,
 )
 from mavftpfs.shared.model import EntryKind, split
-from tests.ops.faketree import FakeFile, FakeTree
+from tests.ops.faketree import FakeFile, FakeTree, quiet, session_of
 
 BIG = bytes(range(251)) * 2000
 
@@ -60,10 +60,6 @@ class Card(FakeTree):
         if not self.renames:
             raise CrossDevice("this server cannot rename")
         await super().rename(old, new, noreplace=noreplace)
-
-
-def session_of(tree: Card) -> Session:
-    return Session(cast(Files, tree))
 
 
 @pytest.fixture
@@ -264,7 +260,7 @@ async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
 ) -> None:
     tree = Card({b"/x": b"old"})
     tree.renames = renames
-    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    session = session_of(tree, mountpoint="/mnt/drone")
     await put_paths(session, [(local / "a", collect(local / "a", recursive=False))], b"/x", Progress(), print)
     assert tree.files == {b"/x": BIG}
     opened = [path for name, path in tree.calls if name == "open"]
@@ -279,7 +275,7 @@ async def test_by_a_mount_an_error_names_the_file_and_not_what_is_written_beside
             raise ReadOnly(f"{os.fsdecode(path)}: Read-only file system (the vehicle is armed)")
 
     tree.on_call = refuse
-    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    session = session_of(tree, mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(NotDelivered) as caught:
         await put_paths(session, [batch], b"/x", Progress(), print)
@@ -311,7 +307,7 @@ async def test_by_a_mount_what_is_there_is_said_of_the_file_and_not_of_what_is_w
 
     monkeypatch.setattr(FakeFile, "give_up", give_up)
     tree.on_call = fail
-    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    session = session_of(tree, mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(NotDelivered) as caught:
         await put_paths(session, [batch], b"/x", Progress(), print)
@@ -324,10 +320,16 @@ async def test_a_mount_that_does_not_tell_how_far_it_is_ends_no_put(
 ) -> None:
     tree = Card(delays={"fsync": 5.0})
 
-    async def acknowledged() -> dict[str, int]:
-        raise LinkClosed("the mount does not answer")
+    asked = 0
 
-    session = Session(cast(Files, tree), acknowledged=acknowledged, mountpoint="/mnt/drone")
+    async def status() -> dict[str, Any]:
+        nonlocal asked
+        asked += 1
+        if asked > 1:  # it was asked before anything was sent
+            raise LinkClosed("the mount does not answer")
+        return await quiet()
+
+    session = Session(cast(Files, tree), status, mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))
     await put_paths(session, [batch], b"/x", Progress(), print)
     assert tree.files == {b"/x": BIG}
@@ -341,7 +343,7 @@ async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> Non
             raise KeyboardInterrupt
 
     tree.on_call = interrupt
-    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    session = session_of(tree, mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(BaseException, match=r".*") as caught:
         await put_paths(session, [batch], b"/x", Progress(), print)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import pytest
 import trio
@@ -17,6 +15,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.status import Facts, snapshot
 from mavftpfs.parameters.packed import pack_upload
 from mavftpfs.parameters.text import Line, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -665,7 +664,11 @@ async def test_300_values_over_57600_baud() -> None:
     link = LinkSettings(delay=0.01, rate=rate, queue=4096)
     parameters = many(count=1329, drifting=0)
     async with vehicle("ardupilot5", link=link, parameters=parameters) as (here, tree):
-        session = Session(tree, acknowledged=partial(acknowledged, tree))
+
+        async def status() -> Facts:
+            return snapshot(here.connection.status(), tree.status(), None)
+
+        session = Session(tree, status)
         await tree.stat(ALL)
         await trio.sleep(20)
         began, bar, seen, states = trio.current_time(), Progress(trio.current_time), set[int](), set[str]()
@@ -690,8 +693,3 @@ async def test_300_values_over_57600_baud() -> None:
         assert took < 2 * (2 * table + upload) / rate
         assert len(seen) > 2
         assert states == {"", "checking"}, "that it is read back shows"
-
-
-async def acknowledged(tree: Tree) -> dict[str, int]:
-    found: Any = tree.status()["transfers"]
-    return {one["path"]: one["size"] - one["bytes_left"] for one in found}

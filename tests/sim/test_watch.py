@@ -25,6 +25,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.ops.faketree import session_of
 from tests.support.memory import MemoryLink
 from tests.support.rigs import Rig, wall
 from tests.support.transfers import content
@@ -525,7 +526,7 @@ class ArmsWhileEntered:
     async def enter(self, stack: AsyncExitStack) -> Session:
         await trio.sleep(0.1)
         self._hearing.heard(1, armed=True)
-        return Session(MemoryTree())  # type: ignore[arg-type]
+        return session_of(MemoryTree())
 
 
 @pytest.mark.holds("promise 9")

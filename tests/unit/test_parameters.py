@@ -9,11 +9,9 @@ import math
 import struct
 from dataclasses import replace
 from itertools import accumulate
-from typing import cast
 
 import pytest
 
-from mavftpfs.client.files import Files, Session
 from mavftpfs.client.parameters import read_with_defaults
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, pack_upload, unpack
@@ -30,7 +28,7 @@ from mavftpfs.parameters.values import (
 )
 from mavftpfs.protocol.writing import Pieces
 from mavftpfs.shared.errors import RemoteProtocolError
-from tests.ops.faketree import FakeTree
+from tests.ops.faketree import FakeTree, session_of
 from tests.support.recordings import data_of, load_recording
 
 # --- values
@@ -97,7 +95,7 @@ async def test_the_default_of_each_name_is_found() -> None:
     one = Parameter("A-B.1", Kind.INT8, 2)
     tree = FakeTree({b"/@PARAM/param.pck": b"".join(pack_upload([one]))})
     tree.files[b"/@PARAM/changed.parm"] = render_changed([replace(one, default=3)]).encode()
-    assert await read_with_defaults(Session(cast(Files, tree))) == [replace(one, default=3)]
+    assert await read_with_defaults(session_of(tree)) == [replace(one, default=3)]
 
 
 # --- packed files
