@@ -51,7 +51,9 @@ def mount(args: argparse.Namespace) -> int:
     if inside is not None:
         raise MountFailed(f"{place} lies in the mount on {inside[0]}; mount on a directory of this computer")
     work = partial(_serve, args, options, spec, place)
-    if args.foreground or args.debug or args.member:
+    if args.member:
+        return work(_report_failure)
+    if args.foreground or args.debug:
         return work(_report_in_foreground)
     return daemon.in_background(work)
 
@@ -131,11 +133,15 @@ def say(line: str) -> None:
     print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
+def _report_failure(code: int, message: str) -> None:
+    if code != 0 and message:
+        say(message)
+
+
 def _report_in_foreground(code: int, message: str) -> None:
     if code == 0:
-        logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")
-    elif message:
-        say(message)
+        logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")  # a message is in the log, too
+    _report_failure(code, message)
 
 
 def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:

@@ -88,5 +88,4 @@ def rescue(spool: SpoolDirectory, source: str) -> str:
             f"{len(found)} file(s) of an earlier mount did not reach the vehicle; they are in {directory}; "
             + put_back_by(source, directory)
         )
-    log.warning("%s", message)
     return message

@@ -153,7 +153,9 @@ class Life(ABC):
         self._scope.cancel()
 
     def tell_mounted(self, notice: str) -> None:
-        """Tell the command that waits for the mount that it is up."""
+        """Tell the command that waits for the mount that it is up; notice: what its user should know."""
+        if notice:
+            log.warning("%s", notice)
         report, self._report = self._report, None
         if report is not None:
             report(ExitCode.OK, notice)

@@ -110,6 +110,19 @@ async def test_a_failure_is_told_to_the_waiting_command_or_else_to_the_log(
     assert [record.getMessage() for record in caplog.records] == ["unmounted: the port is gone"]
 
 
+async def test_what_a_user_should_know_is_in_the_log_too(caplog: pytest.LogCaptureFixture) -> None:
+    """In the foreground the log is all that is read."""
+
+    async def noticed(mount: Mount) -> None:
+        mount.enter(State.MOUNTED)
+        mount.tell_mounted("2/1 is heard, too")
+
+    mount = Mount(noticed)
+    await mount.run()
+    assert mount.reported == [(0, "2/1 is heard, too")]
+    assert [record.getMessage() for record in caplog.records] == ["2/1 is heard, too"]
+
+
 @pytest.mark.holds("promise 3")
 async def test_a_link_that_fails_hides_not_that_bytes_were_left() -> None:
     async def left(mount: Mount) -> None:
