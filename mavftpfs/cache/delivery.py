@@ -137,11 +137,10 @@ class Deliverer:
                 return
             node.start_after = float("inf")  # a program that changed sent bytes will do so again
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
-        if not due or not draft.whole or draft.unacked < START_AT or not may_pass(node):
-            return
+        if not due or draft.base_limit or draft.unacked < START_AT or not may_pass(node):
+            return  # of a file that only changes every byte is sent again: that waits for the close
         if context.unfinished.is_unknown(node.path):
-            node.start_after = float("inf")
-            return
+            return  # the next delivery finds out first
         try:
             async with context.paths.steady(node, lasting=True):
                 with trio.CancelScope() as node.delivery:

@@ -97,7 +97,7 @@ class Throttle:
         draft = node.draft
         if draft is None or node.removed or draft.unacked <= LEAST:
             return False  # a file without a name is not delivered
-        if node.start_after == float("inf") or not draft.whole:
+        if node.start_after == float("inf") or draft.base_limit:
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
         return draft.unacked > self._limit.bytes() // max(streams, 1)
