@@ -9,7 +9,7 @@ from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.protocol.payload import crc32
-from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
+from mavftpfs.shared.errors import FileChanged, LocalProtocolError
 
 STEP = 128 * 1024
 """Bytes fetched at once."""
@@ -21,21 +21,15 @@ async def open_node(context: Context, node: Node) -> VersionHandle:
     Raises:
         FileChanged: the vehicle does not have it any more. Else as Files.open.
     """
-    while True:
-        async with context.paths.steady(node) as path:
-            node.require_reachable()
-            try:
-                handle = await context.files.open(path)
-            except (NotFound, FtpNak):
-                if node.path == path:
-                    raise  # else the file got a reserved name meanwhile
-                continue
-            try:
-                node.require_reachable()  # else it was now seen that others replaced the file
-            except FileChanged:
-                handle.close()
-                raise
-            return handle
+    async with context.paths.steady(node) as path:
+        node.require_reachable()
+        handle = await context.files.open(path)
+    try:
+        node.require_reachable()  # opening it may have shown that others replaced it
+    except FileChanged:
+        handle.close()
+        raise
+    return handle
 
 
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:

@@ -317,10 +317,9 @@ class Deliverer:
         in_place = traits.rename_works is False  # then it is sent under its own name
         begun_at = context.clock()
         try:
-            # Last time the whole file was sent before its name proved to be taken: look first.
-            if in_place or isinstance(node.error, AlreadyExists):
+            if in_place:
                 await self._require_expected(node, draft)
-            if not in_place:
+            else:
                 path = context.own.beside(node.path, Kind.NEW)
                 context.own.in_use.add(path)
             sending = draft.begin(in_place=in_place, progress=self._throttle.on_acked)
@@ -352,7 +351,6 @@ class Deliverer:
         else:
             crc32 = await compare()
             await look()
-        self._require_deliverable(draft)
         return crc32
 
     async def _require_expected(self, node: Node, draft: Draft) -> None:

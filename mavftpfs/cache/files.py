@@ -121,9 +121,8 @@ class Files:
         keep_cache, direct_io = same and version.in_kernel, False
         for other in self.open_versions:
             direct_io |= other.path == path and other is not version
-        version.in_kernel = (
-            not direct_io
-        )  # the kernel may fetch pages for programs that read an older version
+        # Else the kernel may fetch pages for programs that read an older version.
+        version.in_kernel = not direct_io
         version.handles += 1
         self.open_versions[version] = None
         return VersionHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
