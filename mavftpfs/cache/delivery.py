@@ -379,6 +379,7 @@ class Deliverer:
         try:
             compares_later = crc32 is not None or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
+                await self._names.forget_old(path)
                 await self._names.rename(attempt.path, path, compares_later=compares_later)
             else:
                 await self._names.replace(attempt.path, path, compares_later=compares_later)

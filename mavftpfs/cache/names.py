@@ -259,7 +259,7 @@ class Names:
         Raises:
             As VehicleStore: then the name has to stay.
         """
-        await self._forget_old(path)
+        await self.forget_old(path)
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
         ended = self._context.unfinished.end(path)
@@ -275,6 +275,17 @@ class Names:
                     if ended is not None:
                         self._context.unfinished.put(path, ended)
                     raise
+
+    async def forget_old(self, path: bytes) -> None:
+        """Remove the old file that is kept for a name, if there is one: the name is about to change again."""
+        own, unfinished = self._context.own, self._context.unfinished
+        record = unfinished.get(path)
+        if record is None or not record.placed:
+            return
+        unfinished.end(path)
+        if record.aside in own.in_use:
+            own.in_use.discard(record.aside)
+            await self.remove_if_there(record.aside)
 
     # --- giving a verified file its name
 
@@ -305,7 +316,7 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        await self._forget_old(target)
+        await self.forget_old(target)
         own = self._context.own
         aside = own.beside(target, Kind.OLD)
         own.in_use.add(aside)
@@ -358,17 +369,6 @@ class Names:
         context.unfinished.put(target, Replacement(aside, placed=True, until=context.clock() + KEEP_OLD))
         context.retry_later()
         return stays
-
-    async def _forget_old(self, path: bytes) -> None:
-        """Remove the old file that is kept for a name, if there is one: the name is about to change again."""
-        own, unfinished = self._context.own, self._context.unfinished
-        record = unfinished.get(path)
-        if record is None or not record.placed:
-            return
-        unfinished.end(path)
-        if record.aside in own.in_use:
-            own.in_use.discard(record.aside)
-            await self.remove_if_there(record.aside)
 
     def _note_unfinished(self, path: bytes, aside: bytes, *, placed: bool | None) -> None:
         """Note that the file of a name may lie aside: go on showing the name, and have its directory

@@ -244,6 +244,27 @@ async def test_what_is_written_after_an_interruption_goes_there(
         assert here.litter() == []
 
 
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
+async def test_an_old_file_that_is_kept_for_a_while_is_not_put_in_a_later_one_s_place(profile: str) -> None:
+    """In doubt it is kept for ten seconds. Meanwhile others remove the file, and a new one is made."""
+    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        here.connection.scheduler.doubt.raise_it("for the test")
+        await write_file(tree, FILE, b"replaced")
+        here.take(FILE)
+        tree.forget_caches()
+        file = await tree.create(FILE, exclusive=True)
+        await file.write(0, b"a new one")
+        await interrupt(here, file, carried_out=False, nth=1)
+        speak(here)
+        await file.release()
+        assert here.data(FILE) == b"a new one"
+        await trio.sleep(20)
+        tree.forget_caches()
+        await tree.list(b"/d")
+        assert here.litter() == []
+
+
 async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree: Tree) -> None:
     asked: list[float] = []
     here.faults.at(Opcode.CREATE_FILE, lambda: asked.append(trio.current_time()), times=10_000, drop=True)
