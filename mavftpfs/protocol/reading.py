@@ -195,8 +195,12 @@ class ReadTransfer(Operation):
             self.on_run([(request, reply.data)], now)
             return
         nak = nak_of(request, reply)
-        lost = nak.code in _LOST_CODES or nak.server_errno == _EBADF
-        self.fail(SessionLost(str(nak), by_server=True) if lost else nak)
+        if nak.code in _LOST_CODES or nak.server_errno == _EBADF:
+            # Where each client has a session id of its own, an EOF is that of our file.
+            at_end = nak.code == NakCode.EOF and self.port.traits.ack_carries_own_session
+            self.fail(SessionLost(str(nak), by_server=not at_end))
+        else:
+            self.fail(nak)
 
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
@@ -231,7 +235,7 @@ class ReadTransfer(Operation):
         self._want_again(request, count)
         if count == 0:
             end, size = request.offset, self.size
-            self.fail(SessionLost(f"nothing came at {end}, before the size of {size}", by_server=True))
+            self.fail(SessionLost(f"the file has no bytes at {end}, before its size of {size}"))
 
     def takes_back(self, request: Request, now: float) -> bool:
         """See Operation: the bytes of a chunk that was too long are asked for in shorter ones."""

@@ -97,8 +97,8 @@ _SECOND = {
 class Outcome(Enum):
     """What a listing tells about a request."""
 
-    DONE = "done"
-    UNDONE = "undone"
+    HAPPENED = "happened"
+    DID_NOT = "did not"
     CONFLICT = "conflict"
     UNKNOWN = "unknown"
 
@@ -375,9 +375,9 @@ class Store:
                 self._under_way -= 1
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(verify)
-                if outcome is Outcome.DONE:
+                if outcome is Outcome.HAPPENED:
                     return
-                if outcome is Outcome.UNDONE:
+                if outcome is Outcome.DID_NOT:
                     raise error
                 raise OutcomeUnknown(str(error)) from error
             twice = last or self._may_be_second(error)
@@ -385,9 +385,9 @@ class Store:
             if not twice and error.code != NakCode.FILE_EXISTS:
                 raise error
             outcome = await self._after_refusal(error, verify)
-            if outcome is Outcome.DONE and twice:
+            if outcome is Outcome.HAPPENED and twice:
                 return
-            if outcome is not Outcome.UNDONE or last:
+            if outcome is not Outcome.DID_NOT or last:
                 raise error
 
     async def _confirm(self, verify: Verdict) -> None:
@@ -400,7 +400,7 @@ class Store:
             outcome = await verify()
         except MavftpfsError as error:
             raise OutcomeUnknown(f"whether it was done cannot be seen: {error}") from error
-        if outcome in (Outcome.UNDONE, Outcome.CONFLICT):
+        if outcome in (Outcome.DID_NOT, Outcome.CONFLICT):
             raise NotSupported("the server says that it renamed, and its listing says that it did not")
 
     def _may_be_second(self, nak: FtpNak) -> bool:
@@ -457,28 +457,28 @@ class Store:
         parent, name = split(path)
         names, complete = await self._names(parent)
         if name in names:
-            return Outcome.UNDONE
-        return Outcome.DONE if complete else Outcome.UNKNOWN
+            return Outcome.DID_NOT
+        return Outcome.HAPPENED if complete else Outcome.UNKNOWN
 
     async def _is_new_directory(self, path: bytes) -> Outcome:
         """A directory that is there and empty may be the one we made; with entries it is somebody else's."""
         parent, name = split(path)
         names, complete = await self._names(parent)
         if name not in names:
-            return Outcome.UNDONE if complete else Outcome.UNKNOWN
+            return Outcome.DID_NOT if complete else Outcome.UNKNOWN
         if names[name].kind is not EntryKind.DIRECTORY:
             return Outcome.CONFLICT
         listing = await self.list_directory(path)
-        return Outcome.CONFLICT if listing.entries else Outcome.DONE
+        return Outcome.CONFLICT if listing.entries else Outcome.HAPPENED
 
     async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
         (parent, old_name), (target, new_name) = split(old), split(new)
         names, complete = await self._names(parent)
         others, new_complete = (names, complete) if target == parent else await self._names(target)
         if old_name in names:
-            return Outcome.CONFLICT if new_name in others else Outcome.UNDONE
+            return Outcome.CONFLICT if new_name in others else Outcome.DID_NOT
         if new_name in others and complete:
-            return Outcome.DONE
+            return Outcome.HAPPENED
         return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
 
 

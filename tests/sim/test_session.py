@@ -14,7 +14,7 @@ import trio
 from mavftpfs.client.connect import _list_root
 from mavftpfs.client.options import Options
 from mavftpfs.protocol.operations import OpenRequest
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN, OtherClients
 from mavftpfs.session.scheduler import Scheduler, SessionUser
@@ -475,6 +475,26 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
         here.link.restore()
         assert await sink.wait_for(0, len(DATA)) == DATA
         assert here.count(Opcode.OPEN_FILE_RO) == 2
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_file_with_fewer_bytes_than_its_size_is_an_error_and_no_doubt(profile: str) -> None:
+    """As those below `/sys` on Linux. PX4 ACKs the read of nothing, ArduPilot says that the file ends."""
+    here = Rig(profile, {b"/d/f": b"nineteen bytes only"}, LINK)
+
+    def lie(asked: Payload, reply: Payload) -> list[Payload]:
+        if reply.req_opcode == Opcode.OPEN_FILE_RO:
+            reply = reply._replace(data=(4096).to_bytes(4, "little"))
+        if profile == "px4" and (reply.opcode, reply.req_opcode) == (Opcode.NAK, Opcode.READ_FILE):
+            reply = reply._replace(opcode=int(Opcode.ACK), size=0, data=b"", offset=asked.offset)
+        return [reply]
+
+    here.server.change = lie
+    async with here.connected() as connection:
+        with pytest.raises(SessionLost):
+            await read_file(connection, path(profile, "f"))
+        assert here.count(Opcode.OPEN_FILE_RO) == REOPENS + 1
+        assert not connection.store.in_doubt()
 
 
 @pytest.mark.holds("fault idle close")

@@ -251,6 +251,22 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
     assert here.data(b"/d/new") == data
 
 
+async def test_in_flight_no_reader_makes_way_for_an_upload() -> None:
+    """It has bytes to send, and may not: a turn of it would cost the reader its open file."""
+    here = Rig("px4", {b"/d/f": content(200_000)}, PLAIN)
+    async with here.connected() as connection:
+        upload = await start(connection, "px4", MemorySource(content(60_000)))
+        upload.wake()
+        await trio.sleep(1.5)
+        here.vehicle.arm()
+        here.link.kick()
+        await trio.sleep(1.0)
+        here.faults.requests.clear()
+        await read_file(connection, path("px4", "f"))
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
+        await upload.end()
+
+
 @pytest.mark.holds("promise 9")
 async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
     """What is in flight is not answered, so the reader that is to go first still waits."""

@@ -179,12 +179,15 @@ def test_an_over_long_reply_is_clipped() -> None:
 
 
 @pytest.mark.holds("fault growing file")
-def test_after_an_empty_ack_the_file_is_to_be_opened_again() -> None:
-    """It became shorter, perhaps: its new size tells."""
-    reader = Reader()
+@pytest.mark.parametrize("eof", [False, True])
+def test_where_the_file_ends_early_it_is_to_be_opened_again(eof: bool) -> None:
+    """It became shorter, perhaps: its new size tells. Of other files that says nothing."""
+    reader = Reader(traits=Traits(ack_carries_own_session=True))
     reader.transfer.want(0, 1000, True)
-    reader.engine.receive(ack(reader.sent()[0]), 0.1)
+    request = reader.sent()[0]
+    reader.engine.receive(nak(request, NakCode.EOF) if eof else ack(request), 0.1)
     assert isinstance(reader.transfer.error, SessionLost)
+    assert not reader.transfer.error.by_server
     assert reader.transfer.wants.demand == ExtentSet([(0, 1000)])
     assert reader.engine.take_finished() == [reader.transfer]
 
