@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -526,24 +525,24 @@ async def test_armed_means_an_error_at_once_and_delivery_after(here: Rig) -> Non
     await file.write(0, NEW)
     await here.arm()
     before, asked = trio.current_time(), len(here.faults.requests)
-    asks: list[Callable[[], Awaitable[object]]] = [
-        file.flush,
-        file.fsync,
-        lambda: file.write(0, b"x"),
-        lambda: file.truncate(1),
-        lambda: tree.create(b"/d/x", exclusive=False),
-        lambda: tree.open(FILE, write=True),
-        lambda: tree.open(FILE, write=True, truncate=True),
-        lambda: tree.truncate(FILE, 0),
-        lambda: tree.mkdir(b"/d/y"),
-        lambda: tree.rmdir(b"/d"),
-        lambda: tree.unlink(FILE),
-        lambda: tree.rename(FILE, b"/d/z"),
-        file.release,
+    asks = [
+        file.flush(),
+        file.fsync(),
+        file.write(0, b"x"),
+        file.truncate(1),
+        tree.create(b"/d/x", exclusive=False),
+        tree.open(FILE, write=True),
+        tree.open(FILE, write=True, truncate=True),
+        tree.truncate(FILE, 0),
+        tree.mkdir(b"/d/y"),
+        tree.rmdir(b"/d"),
+        tree.unlink(FILE),
+        tree.rename(FILE, b"/d/z"),
+        file.release(),
     ]
     for ask in asks:
         with pytest.raises(Armed):
-            await ask()
+            await ask
     assert trio.current_time() - before < 1
     assert len(here.faults.requests) == asked
     await here.disarm()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-
 import pytest
 import trio
 
@@ -100,17 +98,17 @@ async def test_they_are_one_elsewhere(profile: str) -> None:
     async with rig(profile, {A: b"ours"}) as here:
         here.put_directory(b"/d/test")
         tree = await listed(here)
-        acts: list[Callable[[], Awaitable[object]]] = [
-            lambda: tree.create(b"/d/A", exclusive=True),
-            lambda: tree.mkdir(b"/d/TEST"),
-            lambda: tree.rename(A, b"/d/TEST"),
-            lambda: tree.rename(A, b"/d/A"),
+        acts = [
+            tree.create(b"/d/A", exclusive=True),
+            tree.mkdir(b"/d/TEST"),
+            tree.rename(A, b"/d/TEST"),
+            tree.rename(A, b"/d/A"),
         ]
         if not profile.startswith("ardupilot"):  # where a directory looks like nothing; the rename is refused
-            acts.append(lambda: tree.create(b"/d/TEST", exclusive=False))
+            acts.append(tree.create(b"/d/TEST", exclusive=False))
         for act in acts:
             with pytest.raises((AlreadyExists, FtpNak)):
-                await act()
+                await act
         assert (here.files(), here.directories()) == ({A: b"ours"}, [D, b"/d/test"])
 
 
@@ -284,21 +282,21 @@ async def test_230_bytes_are_refused_before_anything_is_changed(profile: str) ->
         path, new = long_path(here, 230), long_path(here, 230, b"y")
         here.put(path, OLD)
         tree = here.mount()
-        acts: list[Callable[[], Awaitable[object]]] = [
-            lambda: write_file(tree, path, NEW),
-            lambda: tree.create(new, exclusive=True),
-            lambda: append(tree, path, b"more"),
-            lambda: tree.truncate(path, 10),
-            lambda: tree.truncate(path, 0),
-            lambda: tree.rename(path, A),
-            lambda: tree.rename(A, new),
-            lambda: tree.unlink(path),
-            lambda: tree.mkdir(new),
-            lambda: read_file(tree, path),
+        acts = [
+            write_file(tree, path, NEW),
+            tree.create(new, exclusive=True),
+            append(tree, path, b"more"),
+            tree.truncate(path, 10),
+            tree.truncate(path, 0),
+            tree.rename(path, A),
+            tree.rename(A, new),
+            tree.unlink(path),
+            tree.mkdir(new),
+            read_file(tree, path),
         ]
         for act in acts:
             with pytest.raises(PathTooLong):
-                await act()
+                await act
         assert tree.undelivered() == []
         assert not CHANGING & set(here.faults.requests)
         assert here.files() == {path: OLD, A: NEW}
@@ -340,21 +338,21 @@ async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str) -> 
         began, asked = trio.current_time(), tree.status()["listings_asked"]
         await tree.list(b"/")
         await show(tree)
-        acts: list[Callable[[], Awaitable[object]]] = [
-            lambda: tree.list(UNKNOWN),
-            lambda: tree.stat(UNKNOWN + b"/a"),
-            lambda: tree.open(A),
-            lambda: tree.open(b"/@PARAM/param.pck"),
-            lambda: tree.crc32(A),
-            lambda: tree.mkdir(B),
-            lambda: tree.rmdir(UNKNOWN),
-            lambda: tree.unlink(A),
-            lambda: tree.rename(A, B),
-            lambda: tree.truncate(A, 1),
+        acts = [
+            tree.list(UNKNOWN),
+            tree.stat(UNKNOWN + b"/a"),
+            tree.open(A),
+            tree.open(b"/@PARAM/param.pck"),
+            tree.crc32(A),
+            tree.mkdir(B),
+            tree.rmdir(UNKNOWN),
+            tree.unlink(A),
+            tree.rename(A, B),
+            tree.truncate(A, 1),
         ]
         for act in acts:
             with pytest.raises(VehicleLost):
-                await act()
+                await act
         assert trio.current_time() == began
         assert tree.status()["listings_asked"] == asked
         here.link.restore()
