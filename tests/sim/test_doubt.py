@@ -7,14 +7,12 @@ not what the card has, because an older copy came late, another client was there
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from functools import partial
 
 import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, Doubt, LateCopies
@@ -22,7 +20,7 @@ from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support import rigs
-from tests.support.latecomers import Latecomer
+from tests.support.latecomers import Latecomer, come_again
 from tests.support.rigs import KINDS, RENAMING, Rig, rig, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
@@ -261,24 +259,6 @@ FORGOTTEN = 400
 
 SWIFTEST = 2.5
 """No vehicle restarts twice in so many seconds."""
-
-
-def come_again(here: Rig, late: float, chosen: Callable[[bytes], bool]) -> None:
-    """Have requests come once more so many seconds later, where they are chosen."""
-    handle = here.server.handle
-    here.faults.orphans = True
-
-    async def again(wire: bytes, source: Address) -> None:
-        await trio.sleep(late)
-        handle(wire, source, trio.current_time())
-        here.link.kick()
-
-    def on_request(wire: bytes, source: Address, now: float) -> None:
-        if chosen(wire):
-            here.nursery.start_soon(again, wire, source)
-        handle(wire, source, now)
-
-    here.server.handle = on_request  # type: ignore[method-assign]
 
 
 @pytest.mark.holds("rule 14.12")

@@ -1,6 +1,12 @@
-"""Requests that the network delivers once more, at an exact place among those that came after them."""
+"""Requests that the network delivers once more: at an exact place among those that came after them, or at an
+exact time.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+
+import trio
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
@@ -48,3 +54,21 @@ class Latecomer:
                 self._here.link.kick()
         if wire[_OPCODE] == self._what and not (self._first and self._kept is not None):
             self._kept = (wire, now)
+
+
+def come_again(here: Rig, seconds: float, chosen: Callable[[bytes], bool]) -> None:
+    """Have requests executed once more so long after they came, where they are chosen."""
+    handle = here.server.handle
+    here.faults.orphans = True
+
+    async def again(wire: bytes, source: Address) -> None:
+        await trio.sleep(seconds)
+        handle(wire, source, trio.current_time())
+        here.link.kick()
+
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        if chosen(wire):
+            here.nursery.start_soon(again, wire, source)
+        handle(wire, source, now)
+
+    here.server.handle = on_request  # type: ignore[method-assign]
