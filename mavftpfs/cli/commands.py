@@ -10,6 +10,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,7 +47,7 @@ def mount(args: argparse.Namespace) -> int:
     try:
         mountpoint.check_mountpoint(place)
     except DeadMount as exc:
-        raise DeadMount("; ".join(filter(None, (str(exc), left_by_killed_mounts_line())))) from exc
+        raise DeadMount(_with_what_is_left(str(exc))) from exc
     inside = None if args.member else mountpoint.enclosing_mount(os.path.dirname(place))
     if inside is not None:
         raise MountFailed(f"{place} lies in the mount on {inside[0]}; mount on a directory of this computer")
@@ -173,21 +174,22 @@ def _control_path(place: str) -> Path | None:
 
 def umount(args: argparse.Namespace) -> int:
     """Make a mount's process deliver and unmount. A mount whose process is gone is only removed."""
-    place = canonical(args.mountpoint)
+    return _umount(canonical(args.mountpoint), lazy=args.lazy)
+
+
+def _umount(place: str, *, lazy: bool) -> int:
     try:
         socket = find_socket(place)
         progress = _Delivery(socket)
-        request = {"command": "umount", "lazy": args.lazy}
+        request = {"command": "umount", "lazy": lazy}
         try:
             reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE, meanwhile=progress.show)
         finally:
             progress.end()
     except control.NobodyThere as exc:
         if not is_ours(place):
-            raise MountFailed(f"no vehicle is mounted on {place}") from exc
-        codes = [_umount_below(path, args) for path in mountpoint.ours_below(place)]
-        mountpoint.unmount(place, lazy=args.lazy)
-        return max([*codes, _after_a_killed_mount()])
+            raise MountFailed(_with_what_is_left(f"no vehicle is mounted on {place}")) from exc
+        return _umount_unasked(place, lazy=lazy)
     except KeyboardInterrupt:
         say("the mount goes on delivering, and then ends; see: mavftpfs status")
         return ExitCode.INTERRUPTED
@@ -197,9 +199,21 @@ def umount(args: argparse.Namespace) -> int:
     return int(reply["exit_code"])
 
 
-def _umount_below(path: str, args: argparse.Namespace) -> int:
-    """Unmount a vehicle of several, whose supervisor is gone."""
-    return umount(argparse.Namespace(mountpoint=path, lazy=args.lazy))
+def _umount_unasked(place: str, *, lazy: bool) -> int:
+    """Unmount where the mount's process was killed, or lost its socket (systemd removes a user's at logout).
+    The mounts of several vehicles may be there still."""
+    codes = [_umount(path, lazy=lazy) for path in mountpoint.ours_below(place)]
+    held = 0
+    with suppress(control.NobodyThere):  # we may not ask
+        held = status_of(place).get("held", {}).get("files", 0)
+    mountpoint.unmount(place, lazy=lazy)
+    if held:
+        say(
+            f"{report.count_files(held)} not on the vehicle yet: the mount delivers by itself now, and its "
+            "log says what becomes of it (it cannot be asked: its socket was removed)"
+        )
+        return ExitCode.UNDELIVERED
+    return max([*codes, _after_a_killed_mount()])
 
 
 class _Delivery:
@@ -264,6 +278,11 @@ def _after_a_killed_mount() -> int:
         return ExitCode.OK
     say(line)
     return ExitCode.UNDELIVERED
+
+
+def _with_what_is_left(line: str) -> str:
+    """Return a line, and behind it what killed mounts held."""
+    return "; ".join(filter(None, (line, left_by_killed_mounts_line())))
 
 
 def left_by_killed_mounts_line() -> str:

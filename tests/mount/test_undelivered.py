@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from mavftpfs.client.control import find_socket, own_directories
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.mount.test_writing_ends import QUICK, holding
@@ -60,6 +61,21 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
         assert child.returncode == ExitCode.INTERRUPTED
     assert errors == "mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status\n"
     assert f"{mount.path}: being unmounted, PX4 1/1, disarmed, LOST" in run("status")[0]
+    mount.process = None
+    vehicle.resume()
+    assert process.wait() == 0
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+
+
+def test_umount_of_a_mount_that_lost_its_socket_says_what_is_held(
+    field: Field, data: Path, state: Path
+) -> None:
+    """systemd removes a user's runtime directory at logout; a mount in the background goes on."""
+    mount, vehicle, card = holding(field, data)
+    process = mount.alive()
+    find_socket(str(mount.path), own_directories()).unlink()
+    said = run("umount", mount.path, code=ExitCode.UNDELIVERED)[1]
+    assert said.startswith("mavftpfs: 1 file not on the vehicle yet: the mount delivers by itself now")
     mount.process = None
     vehicle.resume()
     assert process.wait() == 0
