@@ -11,6 +11,7 @@ from pathlib import Path
 import trio
 
 from mavftpfs.hub.hub import Hub
+from mavftpfs.link.base import background
 from mavftpfs.link.rendezvous import Door
 from mavftpfs.link.uri import parse_source
 
@@ -27,17 +28,17 @@ def serve(source: str, inherited: Sequence[int], on_ready: Callable[[], None]) -
     first = socket.socket(fileno=client)
     listening = socket.socket(fileno=door)
     hub = Hub(parse_source(source), port, Door(listening, Path(listening.getsockname())))
-    trio.run(_until_signalled, partial(hub.run, first, on_ready), strict_exception_groups=False)
+    trio.run(_until_signalled, partial(hub.run, first, on_ready))
 
 
 async def _until_signalled(work: Callable[[], Awaitable[None]]) -> None:
+    scope = trio.CancelScope()
     with trio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:
-        async with trio.open_nursery() as nursery:
 
-            async def watch() -> None:
-                async for _ in signals:
-                    nursery.cancel_scope.cancel()
+        async def watch() -> None:
+            async for _ in signals:
+                scope.cancel()
 
-            nursery.start_soon(watch)
-            await work()
-            nursery.cancel_scope.cancel()
+        async with background(watch, trio.lowlevel.checkpoint):
+            with scope:
+                await work()

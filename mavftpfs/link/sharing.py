@@ -47,6 +47,7 @@ _NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a po
 _PAUSE = 0.1
 _LONG_PAUSE = 1.0
 _START_PATIENCE = 60.0
+_NAME = "mavftpfs: "
 _PACKAGES = str(Path(__file__).parents[2])
 """Where this program was imported from: the hub is to be the same program, whatever its working directory."""
 
@@ -354,5 +355,6 @@ async def _run_until_ready(command: list[str], inherited: list[int]) -> None:
         )
         raise LinkClosed(f"the hub cannot be started: {problem}") from exc
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise LinkClosed(said[-1].removeprefix("mavftpfs: ") if said else "the hub did not start")
+        said = done.stderr.decode(errors="replace").splitlines()
+        lines = [line.removeprefix(_NAME) for line in said if line.startswith(_NAME)]
+        raise LinkClosed(lines[-1] if lines else "the hub did not start")
