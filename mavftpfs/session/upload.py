@@ -216,12 +216,12 @@ class Upload(SessionUser):
             if stop is Stop.STARVED:
                 self._complete(finishers)
         except MavftpfsError as error:
-            self._let_go(error)
+            self._on_failure(error)
         finally:
             self.on_turn(began, self._clock())
             self.asked_at = None
 
-    def _let_go(self, error: MavftpfsError) -> None:
+    def _on_failure(self, error: MavftpfsError) -> None:
         """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost
         again and again without getting further.
 
