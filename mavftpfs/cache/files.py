@@ -35,7 +35,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import NEVER, PIECE, BlockCache, Version
+from mavftpfs.cache.versions import NEVER, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -450,8 +450,8 @@ class VersionHandle(OpenFile):
             version.require_not_replaced()
             doubts = version.doubts
             pieces: list[bytes | memoryview] = []
-            for start in range(offset, stop, PIECE):
-                piece = await self._read_piece(start, min(start + PIECE, stop))
+            for start in range(offset, stop, files.cache.piece):
+                piece = await self._read_piece(start, min(start + files.cache.piece, stop))
                 if piece is None:  # some of it was dropped meanwhile, or the file got another name
                     break
                 pieces.append(piece)

@@ -100,7 +100,7 @@ class Namespace:
     async def release(self, node: Node) -> None:
         """Remove an unlinked file from the vehicle, because its last handle was closed. If that fails, it is
         removed after the next listing of its directory."""
-        node.drop_draft()
+        node.forget_draft()
         if not node.hidden:
             return
         async with self._context.paths.steady(node) as path:  # a directory above it may be about to move

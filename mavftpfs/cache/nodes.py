@@ -146,7 +146,7 @@ class Node:
         self.proven_at = now
         return self.draft
 
-    def drop_draft(self) -> None:
+    def forget_draft(self) -> None:
         """Forget the draft: the vehicle has all of it, or no program wants it."""
         self.close_base()
         if self.draft is not None:
@@ -190,7 +190,7 @@ class Nodes:
     def maybe_forget(self, node: Node) -> None:
         """Forget a node if no program has it open and nothing of it is undelivered."""
         if not (node.handles or node.undelivered or node.lock.locked() or node.attempt):
-            node.drop_draft()
+            node.forget_draft()
             self.detach(node)
 
     def detach(self, node: Node) -> None:
@@ -203,7 +203,7 @@ class Nodes:
         node.lose_name()
         self.detach(node)
         if not node.handles:
-            node.drop_draft()
+            node.forget_draft()
 
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or a change may have happened in

@@ -94,7 +94,9 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
-        self.reads = trio.Semaphore(max(1, budget // 2 // (PIECE + BLOCK_SIZE)))
+        # A small cache has shorter pieces, or one slow read would keep all others waiting.
+        self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
+        self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
         """Each read that waits for a piece has it: its piece is not evicted, and all such pieces take at most
         half of the budget. It is a lock, see `pathlocks`: a task that holds a path alone must not wait for
         it."""
@@ -347,10 +349,9 @@ class Version:
         self.on_opened(at)
 
     def close_reader(self) -> None:
-        """Drop readahead and the remote reader."""
+        """Close the remote reader. What is wanted of it does not come any more."""
         reader, self.reader = self.reader, None
         if reader is not None:
-            reader.drop(demand=False)
             reader.close()
 
     def replace(self, why: str) -> None:

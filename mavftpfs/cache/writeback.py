@@ -194,7 +194,7 @@ class Writeback:
         except BaseException:
             file.close()
             if not had and not node.writers:
-                await self._forget_draft(node)
+                await self._undo_truncate(node)
             raise
 
     async def withdraw(self, path: bytes) -> bool | None:
@@ -202,15 +202,15 @@ class Writeback:
         node = self._context.nodes.get(path)
         return None if node is None else await self._deliverer.withdraw(node)
 
-    async def _forget_draft(self, node: Node) -> None:
-        """Drop the draft of a call that failed: its bytes are not wanted any more. If the vehicle may have
+    async def _undo_truncate(self, node: Node) -> None:
+        """Forget the draft of a call that failed: its bytes are not wanted any more. If the vehicle may have
         some of them, the draft is kept, and delivered later."""
         async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
             if node.writers or draft is None or self._context.nodes.is_changing(node.path):
                 return
-            node.drop_draft()
+            node.forget_draft()
         self._context.nodes.maybe_forget(node)
 
     # --- the mount's life
@@ -248,7 +248,7 @@ class Writeback:
                 log.error("%r could not be saved: %s", node.path, error)
                 failed = error
             else:
-                node.drop_draft()
+                node.forget_draft()
         if failed is not None and not kept:
             raise failed
         return kept

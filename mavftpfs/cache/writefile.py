@@ -239,7 +239,7 @@ class WriteFile(ReadFile):
         node = self._node
         wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
         if self._made and not wanted and node.undelivered and node.draft is not None and not node.draft.size:
-            node.drop_draft()  # no program learnt of the new file
+            node.forget_draft()  # no program learnt of the new file
         self._context.nodes.maybe_forget(node)
 
     # --- inside

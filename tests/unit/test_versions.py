@@ -128,7 +128,7 @@ async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -
 
 
 async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(12 * BLOCK_SIZE), b"/f", 100)
+    blocks = Version(make_cache(), b"/f", 100)
     readings = [await start_read(nursery, blocks, 0, 50), await start_read(nursery, blocks, 0, 100)]
     deliver(blocks, 0, content(50))
     blocks.on_failed(VehicleLost("gone"))
@@ -159,7 +159,7 @@ async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> 
 
 
 async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: trio.Nursery) -> None:
-    cache = make_cache(12 * BLOCK_SIZE)
+    cache = make_cache(8 * BLOCK_SIZE)
     blocks = Version(cache, b"/f", 20 * BLOCK_SIZE)
     readings = [await start_read(nursery, blocks, i * BLOCK_SIZE, (i + 1) * BLOCK_SIZE) for i in range(4)]
     assert [len(reading.wanted) for reading in readings] == [1, 1, 0, 0]
