@@ -220,24 +220,21 @@ class RawFile(_Ending, io.RawIOBase):
             raise io.UnsupportedOperation(f"not {what}")
 
 
-class _Reader(_Ending, io.BufferedReader):
-    def __del__(self) -> None:
-        """As RawFile's, which follows: Python's would wait."""
-
-
-class _Writer(_Ending, io.BufferedWriter):
+class _Buffer(_Ending):
     def __del__(self) -> None:
         """As RawFile's, which follows: Python's would deliver, and wait."""
 
 
-class _Random(_Ending, io.BufferedRandom):
-    def __del__(self) -> None:
-        """As RawFile's, which follows: Python's would deliver, and wait."""
+class _Reader(_Buffer, io.BufferedReader): ...
 
 
-class _Text(_Ending, io.TextIOWrapper):
-    def __del__(self) -> None:
-        """As RawFile's, which follows: Python's would deliver, and wait."""
+class _Writer(_Buffer, io.BufferedWriter): ...
+
+
+class _Random(_Buffer, io.BufferedRandom): ...
+
+
+class _Text(_Buffer, io.TextIOWrapper): ...
 
 
 def python_file(opened: Opened, portal: Portal, mode: Mode, *, owner: object = None) -> IO[Any]:

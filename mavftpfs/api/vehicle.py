@@ -9,7 +9,7 @@ import os
 import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from mavftpfs.api.pythonfile import Mode, python_file
 from mavftpfs.api.triofile import AsyncFile
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client import download, names, upload
-from mavftpfs.client.connect import attached, open_sinks, plain_nursery
+from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetcher, known_time
-from mavftpfs.client.files import File, Files, Session, Target, session_of, walk
+from mavftpfs.client.files import File, Files, Session, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
@@ -469,24 +469,13 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))
         if target.mount is not None and not use_mount:
             raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
-        up = _session(target, use_mount=use_mount)
-        async with up as session, plain_nursery() as nursery:
-            drone = Drone(source, session, nursery)
-            try:
-                yield drone
-            finally:
-                with trio.CancelScope(shield=True):
-                    await drone.close_files()
-
-
-@asynccontextmanager
-async def _session(target: Target, *, use_mount: bool) -> AsyncIterator[Session]:
-    session = await target.mounted() if use_mount else None
-    if session is not None:
-        yield session
-        return
-    assert target.spec is not None
-    with open_sinks(target.options, debug=False, tell=log.info) as sinks:
-        up = attached(target.spec, target.options, sinks=sinks, writing=True)
-        async with up as vehicle:
-            yield session_of(vehicle, target.options)
+        with open_sinks(target.options, debug=False, tell=log.info) as sinks:
+            target = replace(target, sinks=sinks)
+            up = target.session(writing=True, list_root=True, use_mount=use_mount)
+            async with up as session, plain_nursery() as nursery:
+                drone = Drone(source, session, nursery)
+                try:
+                    yield drone
+                finally:
+                    with trio.CancelScope(shield=True):
+                        await drone.close_files()

@@ -31,7 +31,7 @@ from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, AutopilotVersion
 from mavftpfs.link.peers import describe_peer
 from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
@@ -426,10 +426,17 @@ def read_key(path: str) -> bytes:
 DISK_PART = 16
 """The directory may have about so many times cache_size: 1 GB by default."""
 
-IDENTITY_PATIENCE = 5.0
-"""Seconds to wait for AUTOPILOT_VERSION before files are opened: what is read without it is not kept."""
+VERSION_PATIENCE = 5.0
+"""Seconds for a vehicle to send AUTOPILOT_VERSION, which has its unique id."""
+_VERSION_POLL = 0.02
 
-_IDENTITY_POLL = 0.02
+
+async def told_version(connection: Connection) -> AutopilotVersion | None:
+    """Return what a vehicle tells of itself, None if it does not. It is asked at each connection."""
+    with trio.move_on_after(VERSION_PATIENCE):
+        while connection.vehicle.version is None:  # noqa: ASYNC110 (for once)
+            await trio.sleep(_VERSION_POLL)
+    return connection.vehicle.version
 
 
 async def kept_in(place: str, options: CacheOptions, connection: Connection) -> MakeKept:
@@ -442,11 +449,7 @@ async def kept_in(place: str, options: CacheOptions, connection: Connection) -> 
         directory = KeptDisk(Path(place), DISK_PART * options.cache_size)
     except OSError as exc:
         raise UsageError(f"cache_dir={place}: {exc.strerror}") from exc
-
-    with trio.move_on_after(IDENTITY_PATIENCE):
-        while connection.vehicle.version is None:  # noqa: ASYNC110 (asked for once per mount)
-            await trio.sleep(_IDENTITY_POLL)
-
+    await told_version(connection)
     return partial(
         KeptCache,
         directory,

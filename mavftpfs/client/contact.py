@@ -8,7 +8,7 @@ from typing import Protocol
 
 import trio
 
-from mavftpfs.client.connect import with_tree
+from mavftpfs.client.connect import told_version, with_tree
 from mavftpfs.client.files import Session, session_of
 from mavftpfs.client.options import Options
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_COMP_ID_AUTOPILOT1, Address, Heartbeat
@@ -19,11 +19,8 @@ from mavftpfs.shared.errors import LinkError
 
 TICK = 1.0
 """Seconds between two looks at what was heard. Arming of the vehicle whose files we have is told at once."""
-_POLL = 0.1
 MOUNT_TICK = 0.25
 """Seconds between two questions to a mount: it is to be left within a second of arming."""
-IDENTITY_PATIENCE = 5.0
-"""Seconds for a vehicle to tell its unique id."""
 
 
 class Hearing(Protocol):
@@ -118,11 +115,8 @@ class LinkContact:
 
     async def identity(self) -> str | None:
         """See Contact."""
-        vehicle = self.connection.vehicle
-        with trio.move_on_after(IDENTITY_PATIENCE):
-            while vehicle.version is None:  # noqa: ASYNC110 (asked for once in a connection)
-                await trio.sleep(_POLL)
-        return None if vehicle.version is None else vehicle.version.board
+        version = await told_version(self.connection)
+        return None if version is None else version.board
 
     async def enter(self, stack: AsyncExitStack) -> Session:
         """See Contact."""

@@ -386,20 +386,23 @@ class Target:
         return await find_mount(self.spec, self.options)
 
     @asynccontextmanager
-    async def session(self, *, writing: bool = False) -> AsyncIterator[Session]:
+    async def session(
+        self, *, writing: bool = False, list_root: bool = False, use_mount: bool = True
+    ) -> AsyncIterator[Session]:
         """Give the vehicle's files for the length of the body.
+
+        list_root: wait for an FTP answer first; else what the body asks for first takes its place.
 
         Raises:
             LinkClosed, VehicleLost, NoFtp: no answer within connect_timeout, with the reason.
         """
-        mounted = await self.mounted()
+        mounted = await self.mounted() if use_mount else None
         if mounted is not None:
             yield mounted
             return
         assert self.spec is not None
         deadline = trio.current_time() + self.options.connect_timeout
-        # What the verb asks for first takes the place of the first listing that a mount makes.
-        up = attached(self.spec, self.options, sinks=self.sinks, list_root=False, writing=writing)
+        up = attached(self.spec, self.options, sinks=self.sinks, list_root=list_root, writing=writing)
         async with up as vehicle, _answered_by(deadline, vehicle, self.options):
             yield session_of(vehicle, self.options)
 

@@ -28,7 +28,7 @@ from mavftpfs.client.options import Options
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.shared.errors import MavftpfsError, NotFound, UsageError
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
 
 Facts = Mapping[str, Any]
 
@@ -168,7 +168,8 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
     """Return the mountpoint of the vehicle that the options ask for, below a mount of several vehicles.
 
     Raises:
-        UsageError: the options do not say which one. NotFound: it is not there.
+        UsageError: the options do not say which one. NotFound: `subtree` names one that is not there.
+        LinkClosed: it is not mounted now.
     """
     place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
     first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
@@ -182,10 +183,10 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
         shown = ", ".join(names) or "none yet"
         raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
     if wanted not in names:
-        raise NotFound(f"no vehicle {wanted} is mounted below {place}")
+        raise LinkClosed(f"no vehicle {wanted} is mounted below {place}")
     if names[wanted]["state"] != "mounted":
         why = names[wanted]["problem"] or names[wanted]["state"]
-        raise NotFound(f"vehicle {wanted} is not mounted below {place}: {why}")
+        raise LinkClosed(f"vehicle {wanted} is not mounted below {place}: {why}")
     return os.path.join(place, wanted)
 
 

@@ -1,0 +1,43 @@
+"""client.status: which vehicle of several is meant, and whether its mount is up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mavftpfs.client.options import Options
+from mavftpfs.client.status import vehicle_below
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+
+ONE = {"name": "1", "state": "mounted", "problem": None}
+TWO = {"name": "2", "state": "starting", "problem": None}
+THREE = {"name": "3", "state": "failed", "problem": "no MAVLink FTP"}
+
+
+def below(members: list[dict[str, Any]], subtree: bytes = b"/", **options: Any) -> str:
+    return vehicle_below({"mountpoint": "/mnt", "members": members}, subtree, Options(**options))
+
+
+def test_a_vehicle_is_named_or_the_only_one() -> None:
+    assert below([ONE]) == "/mnt/1"
+    assert below([ONE, TWO], target_system=1) == "/mnt/1"
+    assert below([{**ONE, "name": "1-100"}], target_system=1, target_component=100) == "/mnt/1-100"
+
+
+@pytest.mark.parametrize(
+    ("subtree", "system", "kind", "said"),
+    [
+        (b"/", 0, UsageError, r"several vehicles \(1, 2, 3\)"),
+        (b"/9/log", 0, NotFound, "no vehicle is mounted on /mnt/9"),
+        (b"/", 9, LinkClosed, "no vehicle 9 is mounted"),
+        (b"/", 2, LinkClosed, "vehicle 2 is not mounted below /mnt: starting"),
+        (b"/", 3, LinkClosed, "vehicle 3 is not mounted below /mnt: no MAVLink FTP"),
+    ],
+)
+def test_one_that_is_not_mounted_is_said_to_be_so(
+    subtree: bytes, system: int, kind: type[MavftpfsError], said: str
+) -> None:
+    """A watch waits after LinkClosed."""
+    with pytest.raises(kind, match=said):
+        below([ONE, TWO, THREE], subtree, target_system=system)
