@@ -19,6 +19,7 @@ A frame without a right CRC teaches nothing: it is KNOWN where its sender is, an
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from enum import Enum
 from typing import NamedTuple
@@ -33,6 +34,7 @@ MEMORY = 60.0
 """Seconds of silence after which a sender is forgotten, once a new one comes on its side."""
 MOST_SENDERS = 512
 """Of one side. If more are heard within 5 s, because a program makes them up, only the first ones count."""
+_SWEEP = 1.0
 
 
 class Place(NamedTuple):
@@ -56,6 +58,8 @@ class Senders:
 
     def __init__(self) -> None:
         self._heard: dict[Address, dict[Place, float]] = {}
+        self._counts: Counter[int] = Counter()
+        self._swept: dict[int, float] = {}
         self._seconds: dict[Address, tuple[NetAddress, float]] = {}
 
     def __contains__(self, sender: Address) -> bool:
@@ -77,10 +81,12 @@ class Senders:
                     return Belief.REFUSED
                 self._seconds.setdefault(sender, (place.address or (), now))
                 return Belief.SECOND
-            self._forget(sender)  # it moved
+            for heard in list(known):  # it moved
+                self._forget(sender, heard)
         if not self._has_room(place.side, now):
             return Belief.REFUSED
         self._heard.setdefault(sender, {})[place] = now
+        self._counts[place.side] += 1
         return Belief.NEW
 
     def doubles(self) -> dict[Address, NetAddress]:
@@ -117,6 +123,8 @@ class Senders:
         """Forget what was heard from a side."""
         for sender, place, _ in list(self._at(side)):
             self._forget(sender, place)
+        del self._counts[side]
+        self._swept.pop(side, None)
 
     def _at(self, side: int) -> Iterator[tuple[Address, Place, float]]:
         """Yield each sender of a side, its place there, and when it was heard last."""
@@ -126,18 +134,20 @@ class Senders:
                     yield sender, place, at
 
     def _has_room(self, side: int, now: float) -> bool:
-        """Forget senders of a side that fell silent; return whether one more may be noted."""
-        there = list(self._at(side))
-        patience = MEMORY if len(there) < MOST_SENDERS else PATIENCE
-        silent = [(sender, place) for sender, place, at in there if now - at > patience]
-        for sender, place in silent:
-            self._forget(sender, place)
-        return len(there) - len(silent) < MOST_SENDERS
+        """Return whether one more sender of a side may be noted. Forget those that fell silent, but look for
+        them once a second at most: a program may make up thousands."""
+        if now - self._swept.get(side, float("-inf")) >= _SWEEP:
+            self._swept[side] = now
+            patience = MEMORY if self._counts[side] < MOST_SENDERS else PATIENCE
+            for sender, place, at in list(self._at(side)):
+                if now - at > patience:
+                    self._forget(sender, place)
+        return self._counts[side] < MOST_SENDERS
 
-    def _forget(self, sender: Address, place: Place | None = None) -> None:
-        """Forget that a sender is at a place, or all its places."""
-        left = self._heard[sender]
-        left.pop(place, None) if place is not None else left.clear()
-        if not left:
+    def _forget(self, sender: Address, place: Place) -> None:
+        """Forget that a sender is at a place."""
+        del self._heard[sender][place]
+        self._counts[place.side] -= 1
+        if not self._heard[sender]:
             del self._heard[sender]
             self._seconds.pop(sender, None)
