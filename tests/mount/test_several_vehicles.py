@@ -258,7 +258,7 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
         command("sync", mounts.path / str(system), local, "--from", "/log")
         assert same(fleet.cards[system], local)
         assert "0.bin" in command("ls", fleet.source, "/log", "-o", f"target_system={system}")[0]
-    assert "no vehicle 9" in command("ls", mounts.path, "/", "-o", "target_system=9", code=1)[1]
+    assert "no vehicle 9" in command("ls", mounts.path, "/", "-o", "target_system=9", code=2)[1]
     assert "9" in command("ls", mounts.path / "9", code=1)[1]
     for source in (mounts.path, fleet.source):
         found = json.loads(command("scan", "--json", source)[0])
