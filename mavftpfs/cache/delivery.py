@@ -98,30 +98,34 @@ class Deliverer:
                 async with node.lock:
                     if node.claims:  # the name or the content goes first: the lock is fair
                         continue
-                    async with self._context.paths.steady(node, lasting=True):
-                        draft = node.draft
-                        if draft is None or not node.undelivered:
-                            await self.abandon(node)
-                            return
-                        with trio.CancelScope() as node.delivery:  # if a claim cancels it, the loop goes on
-                            await self._deliver(node, draft)
-                            return
+                    # If a claim cancels it, also while it waits for its path, the loop goes on.
+                    with trio.CancelScope() as node.delivery:
+                        await self._deliver(node)
+                        return
         finally:
             if node.undelivered:  # also if the caller was cancelled
                 self._context.retry_later()
 
-    async def _deliver(self, node: Node, draft: Draft) -> None:
-        context = self._context
+    async def _deliver(self, node: Node) -> None:
         try:
-            context.require_disarmed()
+            async with self._context.paths.steady(node, lasting=True):
+                draft = node.draft
+                if draft is None or not node.undelivered:
+                    await self.abandon(node)
+                else:
+                    await self._deliver_draft(node, draft)
+        finally:
+            node.delivery = None
+            self._throttle.waiting.unpark_all()
+
+    async def _deliver_draft(self, node: Node, draft: Draft) -> None:
+        try:
+            self._context.require_disarmed()
             await self._try(node, draft)
             node.error, node.start_after = None, float("-inf")
         except MavftpfsError as error:
             self._note_failure(node, draft, error)
             raise
-        finally:
-            node.delivery = None
-            self._throttle.waiting.unpark_all()
 
     async def push(self, node: Node) -> None:
         """Begin to send a draft that changed, or go on, while the program writes. The caller has the node's
@@ -142,8 +146,8 @@ class Deliverer:
         if context.unfinished.is_unknown(node.path):
             return  # the next delivery finds out first
         try:
-            async with context.paths.steady(node, lasting=True):
-                with trio.CancelScope() as node.delivery:
+            with trio.CancelScope() as node.delivery:
+                async with context.paths.steady(node, lasting=True):
                     attempt = await self._attempt(node, draft)
                     attempt.sending.growing = True
                     attempt.upload.wake()

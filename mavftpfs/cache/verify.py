@@ -127,8 +127,8 @@ class Verifier:
         """Compare byte by byte.
 
         Raises:
-            VerificationFailed: the card has other bytes. SessionBusy: another client was active each time.
-            Else as RemoteStore.open_reader.
+            VerificationFailed: the card has other bytes. SessionBusy: each time another client was active, or
+            the server ended the session. Else as RemoteStore.open_reader.
         """
         context = self._context
         for _ in range(READ_TRIES):
@@ -138,11 +138,13 @@ class Verifier:
             version.size = reader.size
             try:
                 same = version.size == draft.size
-                for at in range(0, draft.size if same else 0, PIECE):
+                at = 0
+                while same and at < draft.size and not version.ignores_data:
                     stop = min(at + PIECE, draft.size)
                     reader.want(at, stop, demand=True)
                     await version.wait_for(at, stop)
-                    same = same and version.get(at, stop) == draft.local_bytes(at, stop)
+                    same = version.get(at, stop) == draft.local_bytes(at, stop)
+                    at = stop
             except FileChanged:
                 same = False
             finally:
@@ -150,7 +152,7 @@ class Verifier:
             if not version.ignores_data:
                 break
         else:
-            raise SessionBusy(f"another FTP client was active whenever {path!r} was read back")
+            raise SessionBusy(f"whenever {path!r} was read back, what was read became doubtful")
         if not same:
             raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
         self.counts["verified_by_reading"] += 1

@@ -579,6 +579,21 @@ async def test_where_no_checksum_is_told_the_file_is_read_back() -> None:
         assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
 
 
+@pytest.mark.holds("promise 4")
+async def test_a_doubt_in_the_middle_of_reading_back_has_it_read_back_again() -> None:
+    """It waited 30 s for bytes that were ignored, and failed."""
+    data = content(300_000)
+    async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
+        tree, doubt = here.mount(), here.connection.scheduler.doubt
+        here.faults.ignore(Opcode.CALC_FILE_CRC32)
+        here.connection.store.traits.rename_works = True
+        doubt.raise_it("an answer that came twice")
+        here.faults.at(Opcode.READ_FILE, lambda: doubt.raise_it("another FTP client is active"), nth=400)
+        await write_file(tree, b"/d/new", data)
+        assert here.data(b"/d/new") == data
+        assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
+
+
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "littlefs", "mavsdk"])
 async def test_doubt_costs_a_new_file_one_comparison(profile: str) -> None:
     """The link doubles 2 % of its packets, at once. Forty small files took a second each."""

@@ -548,6 +548,29 @@ async def test_emptying_waits_for_no_rename(profile: str, nth: int) -> None:
         assert here.files() == {FILE: LATER, OTHER: b"it"}
 
 
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_emptying_calls_off_a_delivery_that_waits_for_its_path(profile: str) -> None:
+    """A rename has the path, and no answer. All of the file was sent before it was emptied."""
+    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=50.0)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        here.faults.at(Opcode.RENAME, lambda: None, times=1000, drop=True)
+        async with trio.open_nursery() as renaming:
+            renaming.start_soon(tree.rename, FILE, NEW)
+            await trio.sleep(1.0)
+            await file.write(0, LATER)
+            async with trio.open_nursery() as waiting:
+                waiting.start_soon(file.fsync)
+                await trio.sleep(1.0)
+                here.faults.call_off()
+                await file.truncate(0)
+                assert here.count(Opcode.WRITE_FILE) == 0
+        await file.write(0, b"it")
+        await file.release()
+        await settle(here, tree)
+        assert here.files() == {NEW: b"it"}
+
+
 @pytest.mark.parametrize("nth", [1, 2, 3])
 @pytest.mark.parametrize(("old", "new"), [(b"", b""), (OLD, b""), (OLD, OLD)])
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
