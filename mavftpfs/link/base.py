@@ -172,7 +172,7 @@ class Outbox:
     def advance(self, sent: int) -> None:
         """Drop the first `sent` bytes of the oldest item."""
         item = self._items.popleft()
-        self.size -= min(sent, len(item))
+        self.size -= sent
         if sent < len(item):
             self._items.appendleft(item[sent:])
 

@@ -19,8 +19,8 @@ def port_name(spec: LinkSpec) -> str:
     if spec.kind is LinkKind.SERIAL:
         text = f"serial {os.path.realpath(spec.device)}"
     else:
-        listens = spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-        text = f"{os.stat(_NETWORK).st_ino} {spec.kind.value} {'' if listens else spec.host} {spec.port}"
+        host = "" if spec.kind.listens else spec.host
+        text = f"{os.stat(_NETWORK).st_ino} {spec.kind.value} {host} {spec.port}"
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
@@ -32,8 +32,7 @@ def same_link(one: LinkSpec, other: LinkSpec) -> bool:
         return os.path.realpath(one.device) == os.path.realpath(other.device)
     if one.port != other.port:
         return False
-    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    return one.host == other.host or (listens and bool({one.host, other.host} & _ANYWHERE))
+    return one.host == other.host or (one.kind.listens and bool({one.host, other.host} & _ANYWHERE))
 
 
 def leads_back(endpoint: LinkSpec, source: LinkSpec) -> bool:

@@ -58,7 +58,7 @@ class SharedLink:
     def __init__(self, spec: LinkSpec, wish: Wish) -> None:
         self.stats = LinkStats()
         self.seat: Seat | None = None
-        self.is_stream = spec.kind not in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
+        self.is_stream = not spec.kind.is_udp
         self.is_serial = spec.kind is LinkKind.SERIAL
         self.description = spec.description
         self._spec = spec

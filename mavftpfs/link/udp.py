@@ -18,7 +18,7 @@ from dataclasses import replace
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import SocketLink, background, look_up, pack
-from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
+from mavftpfs.link.uri import LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_DATAGRAMS = 256
@@ -51,11 +51,6 @@ class UdpLink(SocketLink):
         # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
         self._segments = sys.platform == "linux"
-
-    @property
-    def local_address(self) -> NetAddress:
-        """The bound address; its second item is the port."""
-        return self._sock.getsockname()  # type: ignore[no-any-return]
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
@@ -165,19 +160,18 @@ async def open_udp(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterat
         LinkClosed: unknown host, or the port is taken.
     """
     family, address = await _resolve(spec)
-    listens = spec.kind is LinkKind.UDP_IN
     sock = socket.socket(fileno=inherited[0]) if inherited else socket.socket(family, socket.SOCK_DGRAM)
     try:
         _configure(sock)
         if not inherited:
             anywhere = ("::" if family == socket.AF_INET6 else "0.0.0.0", 0)
-            _bind(sock, spec, address if listens else anywhere)
+            _bind(sock, spec, address if spec.kind.listens else anywhere)
     except BaseException:
         sock.close()
         raise
-    if listens:
+    if spec.kind.listens:
         spec = replace(spec, port=sock.getsockname()[1])
-    link = UdpLink(sock, spec.description, None if listens else address)
+    link = UdpLink(sock, spec.description, None if spec.kind.listens else address)
     async with background(link.run_writer, link.aclose):
         yield link
 

@@ -33,6 +33,16 @@ class LinkKind(Enum):
     TCP_IN = "tcpin"
     SERIAL = "serial"
 
+    @property
+    def listens(self) -> bool:
+        """Whether the other end comes to us."""
+        return self in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+
+    @property
+    def is_udp(self) -> bool:
+        """Whether it carries datagrams; all others are streams."""
+        return self in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
+
 
 @dataclass(frozen=True, slots=True)
 class LinkSpec:
@@ -103,7 +113,7 @@ def parse_endpoint(text: str) -> LinkSpec:
     if spec.subtree != ROOT:
         raise UsageError(f"{text!r} is to carry frames, so no directory belongs to it; leave out '#...'")
     rest = text.partition(":")[2].removeprefix("//")
-    if spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN) and rest.startswith(":"):
+    if spec.kind.listens and rest.startswith(":"):
         return replace(spec, host=LOOPBACK)
     return spec
 
@@ -138,9 +148,8 @@ def _parse_serial(text: str, source: str, separator: str, subtree: bytes) -> Lin
 
 
 def _parse_host_port(text: str, source: str, kind: LinkKind) -> tuple[str, int]:
-    default = DEFAULT_UDP_PORT if kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT) else DEFAULT_TCP_PORT
-    listens = kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    example = f"{kind.value}:{'0.0.0.0' if listens else '192.168.1.10'}:{default}"
+    default = DEFAULT_UDP_PORT if kind.is_udp else DEFAULT_TCP_PORT
+    example = f"{kind.value}:{'0.0.0.0' if kind.listens else '192.168.1.10'}:{default}"
     if text.startswith("["):
         host, mark, port_text = text[1:].partition("]")
         if not mark or (port_text and not port_text.startswith(":")):
@@ -156,13 +165,13 @@ def _parse_host_port(text: str, source: str, kind: LinkKind) -> tuple[str, int]:
             )
     if host.isdigit() and not port_text:
         raise UsageError(f"SOURCE {source!r}: a host comes before the port; write for example {example}")
-    if not host and not listens:
+    if not host and not kind.listens:
         raise UsageError(f"SOURCE {source!r} names no host; write for example {example}")
     if not port_text:
         shown = f"[{host}]" if ":" in host else host or "0.0.0.0"
         raise UsageError(f"SOURCE {source!r} names no port; write for example {kind.value}:{shown}:{default}")
     port = _number(port_text)
-    if port is None or not 0 <= port <= 65535 or (port == 0 and not listens):
+    if port is None or not 0 <= port <= 65535 or (port == 0 and not kind.listens):
         raise UsageError(f"SOURCE {source!r}: {port_text!r} is no port; write for example {example}")
     return (host or "0.0.0.0", port)
 
@@ -186,7 +195,7 @@ def cannot_open(spec: LinkSpec, problem: OSError) -> LinkClosed:
         reasons |= dict.fromkeys((errno.EACCES, errno.EPERM), f"no permission for {spec.device}; {remedy}")
         reasons |= dict.fromkeys((errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK), taken)
         reasons |= dict.fromkeys((errno.ENOTTY, errno.EISDIR), other)
-    elif spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN):
+    elif spec.kind.listens:
         taken = f"port {spec.port} is in use by another program (a ground station?);"
         not_ours = f"{spec.host} is not an address of this computer; 0.0.0.0 listens on all of them"
         refused = f"no permission to listen on port {spec.port}; ports below 1024 are root's"

@@ -186,7 +186,7 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
             await made.ready(30.0)
             assert await read_file(made, b"/f") == OURS
             if isinstance(link, UdpLink):
-                port = link.local_address[1]
+                port = parse_source(link.description).port
             forger.connect((HOST, port))
             vehicle.server.change = forging(forger.send)
             for _ in range(20):
