@@ -252,7 +252,7 @@ def _here(outcome: download.Outcome) -> str:
     wanted, here = len(outcome.wanted) + len(outcome.here), len(outcome.fetched) + len(outcome.here)
     if not wanted:
         return "nothing was fetched yet"
-    return f"{here} of {wanted} files are here; the next run goes on with what came of the others"
+    return f"{here} of {wanted} files are here; the next run goes on where this one stopped"
 
 
 def _sync_summary(outcome: download.Outcome, since: float | None) -> str:

@@ -125,7 +125,7 @@ def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: P
         child.send_signal(signal.SIGINT)
         out, err = child.communicate(timeout=COMMAND_TIMEOUT)
     assert (child.returncode, out) == (130, "")
-    told = "0 of 1 files are here; the next run goes on with what came of the others"
+    told = "0 of 1 files are here; the next run goes on where this one stopped"
     assert err == f"mavftpfs: interrupted: {told}\n"
     assert local_files(local) == {"big.bin.part"}
     came = part.read_bytes()
