@@ -8,8 +8,8 @@ Each way to the end of a mount:
   `fusermount3 -uz` of a mount in use that is when its last user leaves.
 - The first SIGINT, SIGTERM or SIGHUP: it leaves, also if it is in use. The next one: it hurries, and what is
   not delivered is kept. While it is starting the first one ends it.
-- The link cannot be opened any more: it ends, and what is not delivered is kept. (A vehicle that is lost ends
-  nothing.)
+- A lost vehicle, or a link that fails, ends nothing: the link is opened again. If another error of ours ends
+  it, what is not delivered is kept, and the log says why.
 - SIGKILL: nothing of this runs. The kernel's mount stays, and answers with ENOTCONN, until
   `mavftpfs umount` (with `auto_unmount`, fusermount3 takes it away); the next mount of that vehicle finds the
   spool.
@@ -62,7 +62,7 @@ class State(Enum):
 
 NEXT = {
     State.STARTING: {State.MOUNTED, State.ENDED},
-    State.MOUNTED: {State.LEAVING, State.ENDED},  # ENDED: the link failed
+    State.MOUNTED: {State.LEAVING, State.ENDED},  # ENDED: by an error
     State.LEAVING: {State.ENDED, State.MOUNTED},  # MOUNTED: one vehicle of several is in use
     State.ENDED: set[State](),
 }

@@ -124,7 +124,7 @@ async def test_what_a_user_should_know_is_in_the_log_too(caplog: pytest.LogCaptu
 
 
 @pytest.mark.holds("promise 3")
-async def test_a_link_that_fails_hides_not_that_bytes_were_left() -> None:
+async def test_an_error_hides_not_that_bytes_were_left() -> None:
     async def left(mount: Mount) -> None:
         mount.note_end(ExitCode.UNDELIVERED, "1 file(s) did not reach the vehicle")
 
