@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import trio
-
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.brought import NAME as MEMORY
 from mavftpfs.client.brought import Brought, Memory
@@ -195,7 +193,7 @@ class Downloads:
             self.outcome.proofs[log.remote] = Proof("size", answer.lacking, answer.later)
             return
         with local_disk(log.local):
-            ours = await trio.to_thread.run_sync(local_crc32, log.local)
+            ours = await local_crc32(log.local)
         if ours == answer.crc:
             self.outcome.proofs[log.remote] = BY_CRC32
         else:

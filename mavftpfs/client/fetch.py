@@ -323,7 +323,7 @@ class Fetcher:
             self.progress.check()
             answer = await ask_crc32(self.session, wanted.remote)
         if answer.crc is not None:
-            return BY_CRC32 if answer.crc == await _crc32_of(wanted.local) else None
+            return BY_CRC32 if answer.crc == await local_crc32(wanted.local) else None
         if wanted.keep_old:
             return Proof("size", answer.lacking, answer.later)
         same_time = int(wanted.local.stat().st_mtime) == wanted.mtime
@@ -345,7 +345,7 @@ class Fetcher:
         """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
         here = size = part.size
         self.progress.begin(wanted.name, wanted.size, here)
-        crc = await _crc32_of(part.path) if here else 0
+        crc = await local_crc32(part.path) if here else 0
 
         async def take(data: bytes | memoryview) -> None:
             part.append(data)
@@ -411,7 +411,3 @@ class Fetcher:
             raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came", size)
         if now < size:
             raise DataUnproven(f"{name} has shrunk from {size} to {now} bytes")
-
-
-async def _crc32_of(file: Path) -> int:
-    return await trio.to_thread.run_sync(local_crc32, file)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import trio
+
 from mavftpfs.client.files import READ_SIZE, Session
 from mavftpfs.protocol.payload import NakCode, crc32
 from mavftpfs.shared.errors import (
@@ -102,10 +104,14 @@ def _why_not(error: MavftpfsError) -> str:
     return str(error)
 
 
-def local_crc32(file: Path) -> int:
+async def local_crc32(file: Path) -> int:
     """Return the CRC32 of a local file."""
-    crc = 0
-    with file.open("rb") as source:
-        while data := source.read(READ_SIZE):
-            crc = crc32(data, crc)
-    return crc
+
+    def compute() -> int:
+        crc = 0
+        with file.open("rb") as source:
+            while data := source.read(READ_SIZE):
+                crc = crc32(data, crc)
+        return crc
+
+    return await trio.to_thread.run_sync(compute)

@@ -194,7 +194,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
 async def _differs(session: Session, path: bytes, kept: Kept) -> bool | None:
     """Compare with the vehicle's checksum; None where there is none."""
     try:
-        return await session.files.crc32(path) != local_crc32(kept.file)
+        return await session.files.crc32(path) != await local_crc32(kept.file)
     except NO_CHECKSUM:
         return None
 
