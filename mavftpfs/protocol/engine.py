@@ -62,6 +62,8 @@ class Engine:
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
         on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
             explains, and with the seconds since its request went out (0 where that is not known).
+        on_late_write: called when a WriteFile is ACKed that nothing waits for any more, and with the time at
+            which it went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -75,6 +77,7 @@ class Engine:
         *,
         op_deadline: float = OP_DEADLINE,
         on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None,
+        on_late_write: Callable[[float], None] = lambda sent_at: None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)
         self.session = self.home_session
@@ -82,6 +85,7 @@ class Engine:
         self.traits = Traits()
         self.stats = EngineStats()
         self._on_unexplained = on_unexplained
+        self._on_late_write = on_late_write
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
@@ -179,6 +183,8 @@ class Engine:
                 self.flow.on_spurious()
             self._on_answers(request, 1, now)
             op = request.op
+            if op is self._ledger.ghost:
+                self._on_late(reply, request.first_sent)
             op.on_reply(request, reply, now)
             if op.done:
                 self.remove(op)
@@ -219,9 +225,17 @@ class Engine:
         explained."""
         self.stats.unknown += 1
         duplicates = self._ledger.duplicates
-        if not duplicates.explains(reply.seq) and reply.req_opcode != _BURST:
+        sent_at = duplicates.explains(reply.seq)
+        if sent_at is not None:
+            self._on_late(reply, sent_at)
+        elif reply.req_opcode != _BURST:
             self.stats.unexplained += 1
             self._on_unexplained(reply, duplicates.late_by(reply.seq, now))
+
+    def _on_late(self, reply: Payload, sent_at: float) -> None:
+        """An answer came that nothing waits for any more. sent_at: when its request went out first."""
+        if reply.opcode == Opcode.ACK and reply.req_opcode == Opcode.WRITE_FILE:
+            self._on_late_write(sent_at)
 
     def _on_replay(self, request: Request) -> None:
         """The server replays an earlier reply under this seq, so it will never answer this one (servers.md

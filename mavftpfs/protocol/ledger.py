@@ -45,7 +45,7 @@ class DuplicateDetector:
     """
 
     def __init__(self) -> None:
-        self._expected: dict[int, int] = {}
+        self._expected: dict[int, tuple[int, float]] = {}  # how many more, and when it went out first
         self._sent: dict[int, float] = {}
 
     def on_sent(self, request: Request) -> None:
@@ -63,18 +63,17 @@ class DuplicateDetector:
             left = request.sends - (len(seqs) - 1) - (seq == answered)
             if left > 0:
                 self._expected.pop(seq, None)
-                self._expected[seq] = left
+                self._expected[seq] = left, request.first_sent
         while len(self._expected) > _MOST_REMEMBERED:
             del self._expected[next(iter(self._expected))]
 
-    def explains(self, seq: int) -> bool:
-        """Return whether an answer to no outstanding request was still to come; it is not expected again."""
-        left = self._expected.get(seq, 0)
+    def explains(self, seq: int) -> float | None:
+        """Return when the request of an answer went out first, if one more answer was to come; it is not
+        expected again. None: no repetition of ours explains this answer."""
+        left, sent_at = self._expected.pop(seq, (0, 0.0))
         if left > 1:
-            self._expected[seq] = left - 1
-        else:
-            self._expected.pop(seq, None)
-        return left > 0
+            self._expected[seq] = left - 1, sent_at
+        return sent_at if left else None
 
     def late_by(self, seq: int, now: float) -> float:
         """Return the seconds since the request with this answer went out first; 0 if that is not known."""

@@ -134,7 +134,13 @@ class Connection:
         signature = 0 if options.signing_key is None else SIGNATURE
         budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
         flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
-        self.engine = Engine(rng, flow, op_deadline=options.op_deadline, on_unexplained=self._on_unexplained)
+        self.engine = Engine(
+            rng,
+            flow,
+            op_deadline=options.op_deadline,
+            on_unexplained=self._on_unexplained,
+            on_late_write=self._on_late_write,
+        )
         self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, trace=trace)
         self.scheduler = Scheduler(
             self.driver,
@@ -249,6 +255,9 @@ class Connection:
 
     def _on_unexplained(self, reply: Payload, late: float) -> None:
         self.scheduler.on_unexplained(reply, late)
+
+    def _on_late_write(self, sent_at: float) -> None:
+        self.scheduler.on_late_write(sent_at)
 
     def _on_armed(self, armed: bool) -> None:
         self.scheduler.on_armed_changed()

@@ -117,6 +117,7 @@ class FileStream(SessionUser):
     def _fail(self, error: MavftpfsError) -> None:
         """What is wanted cannot be had now."""
         self.drop()
+        self._lost = 0  # the next read has as many turns
         self.asked_at = None
         if not self.opened.ended:
             self.opened.end(error)

@@ -438,6 +438,13 @@ class Scheduler:
         if other:
             self.server.abandon()
 
+    def on_late_write(self, sent_at: float) -> None:
+        """A WriteFile was ACKed that nothing waits for any more, and that went out at that time. If that was
+        before the present file was opened, its bytes may be in this file, instead of its own."""
+        session = self.server.session
+        if session is not None and session.writing and sent_at < session.opened_at:
+            self.doubt.raise_it("a WriteFile came after its file was closed", reads=False)
+
     def _on_reads_doubted(self, reason: str) -> None:
         """What was read lately may be another file's, also of files that were closed since."""
         for user in [*self.users, *(user for _, user in self._gone)]:

@@ -7,12 +7,14 @@ not what the card has, because an older copy came late, another client was there
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from functools import partial
 
 import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
+from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, Doubt, LateCopies
@@ -592,6 +594,53 @@ async def test_a_doubt_in_the_middle_of_reading_back_has_it_read_back_again() ->
         await write_file(tree, b"/d/new", data)
         assert here.data(b"/d/new") == data
         assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
+
+
+def delay(here: Rig, chosen: Callable[[bytes], bool], writes: int) -> None:
+    """Have the first transmission of a chosen request arrive late: after so many WriteFiles."""
+    handle, held, left = here.server.handle, list[tuple[bytes, Address]](), writes
+
+    def arrive(wire: bytes, source: Address, now: float) -> None:
+        nonlocal left
+        if not held and chosen(wire):
+            held.append((wire, source))
+            return
+        handle(wire, source, now)
+        left -= wire[3] == Opcode.WRITE_FILE
+        if left == 0 and held:
+            left = -1
+            handle(*held[0], now)
+            here.link.kick()
+
+    here.server.handle = arrive  # type: ignore[method-assign]
+
+
+@pytest.mark.holds("promise 2")
+async def test_a_file_that_may_have_been_emptied_while_it_was_sent_is_compared() -> None:
+    """Later writes hide it from the size; the server's ACK is explained by our repetition."""
+    data = content(300_000)
+    async with rig("mavsdk", {b"/d/f": b"x"}, link=CLEAN) as here:
+        tree = here.mount(verify_max=1000)
+        here.connection.store.traits.rename_works = True
+        delay(here, lambda wire: wire[3] == Opcode.CREATE_FILE, 300)
+        await write_file(tree, b"/d/new", data)
+        assert here.data(b"/d/new") == data
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+async def test_a_write_that_arrives_in_the_next_file_is_noticed(profile: str) -> None:
+    """Its ACK is explained, because it was repeated. Both files had the same session id."""
+    one, two = content(20_000, 1), content(300_000, 2)
+    async with rig(profile, {b"/d/f": b"x"}, link=CLEAN) as here:
+        tree = here.mount(verify_max=1000)
+        here.connection.store.traits.rename_works = True
+        at = (20 * 239).to_bytes(4, "little")
+        delay(here, lambda wire: wire[3] == Opcode.WRITE_FILE and wire[8:12] == at, 400)
+        await write_file(tree, b"/d/one", one)
+        assert not here.connection.store.in_doubt()
+        await write_file(tree, b"/d/two", two)
+        assert (here.data(b"/d/one"), here.data(b"/d/two")) == (one, two)
 
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "littlefs", "mavsdk"])

@@ -32,7 +32,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.rigs import DEFAULTS, Rig
+from tests.support.rigs import DEFAULTS, Rig, rig
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
 
@@ -507,6 +507,18 @@ async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end() -> None
         with trio.fail_after(100), pytest.raises(SessionLost):
             await read_file(connection, path("px4", "f"))
         assert here.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
+
+
+async def test_each_read_has_as_many_turns() -> None:
+    """The second one failed with the first session that it lost."""
+    async with rig("px4", {b"/d/f": DATA}, link=LINK) as here:
+        file = await here.mount().open(b"/d/f")
+        here.faults.ignore(Opcode.READ_FILE)
+        for turns in (1 + REOPENS, 2 + 2 * REOPENS):
+            with pytest.raises(SessionLost):
+                await file.read(0, 100)
+            assert here.count(Opcode.OPEN_FILE_RO) == turns
+        await file.release()
 
 
 @pytest.mark.holds("promise 5", "fault idle close")
