@@ -26,7 +26,7 @@ class LateCopies:
 
     The copy of a request, carried out late, does to the name's next file what was meant for the last one: a
     REMOVE removes it, a RENAME takes it away. So a name rests after such a request: for twice the largest
-    lateness that was seen in the last ten minutes, and a second at least. Where no copy was seen it does not
+    lateness, and a second at least. If no copy was seen for ten minutes, all are forgotten, and it does not
     rest at all.
 
     A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
@@ -45,8 +45,8 @@ class LateCopies:
 
     def saw(self, lateness: float, now: float) -> None:
         """A copy was answered so many seconds after the request was sent first (0: that is not known)."""
-        if lateness >= self._lateness or not self._is_fresh(now):
-            self._lateness, self._seen_at = lateness, now
+        largest = self._lateness if self._is_fresh(now) else 0.0
+        self._lateness, self._seen_at = max(largest, lateness), now
 
     def on_changed(self, path: bytes, now: float) -> None:
         """A request took the file of this name away, or may have done so."""
