@@ -91,12 +91,14 @@ class OpenRequest(Simple):
     been executed.
 
     Attributes:
+        on_opened: called at once when the ACK came, before any later answer is looked at.
         session: the id that the ACK carried, to be used from then on (servers.md 14.6).
         size: as the ACK says, None where it says nothing (ArduPilot's CreateFile).
     """
 
     session: int
     size: int | None = None
+    on_opened: Callable[[OpenRequest], None] = staticmethod(lambda operation: None)
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take session and size; learn whether the server echoes ids."""
@@ -108,6 +110,7 @@ class OpenRequest(Simple):
             self.size = int.from_bytes(reply.data[:4], "little")
         if request.session:
             self.port.learn_session_echo(reply.session == request.session)
+        self.on_opened(self)
 
 
 class Page(NamedTuple):

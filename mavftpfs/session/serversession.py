@@ -207,25 +207,28 @@ class ServerSession:
         """Close what is open and open another file, by OpenFileRO, OpenFileWO or CreateFile.
 
         Raises:
-            FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout. That the other
-                file could not be closed is no news to its user.
+            FtpNak: the server refused. SessionBusy: its session stayed taken. SessionLost: it was open, and
+                is not believed any more. RequestTimeout. That the other file could not be closed is no news
+                to its user.
         """
         await self.close_quietly()
         await self._close_what_may_be_ours()
         try:
-            session = await self._open_past_others(path, opcode)
+            await self._open_past_others(path, opcode)
         finally:
             if opcode == Opcode.CREATE_FILE:
                 self.doubt.late.on_made(path, self.clock())
-        self.session, self.engine.session = session, session.id
-        return session
+        if self.session is None:
+            raise _lost()
+        return self.session
 
-    async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
+    async def _open_past_others(self, path: bytes, opcode: Opcode) -> None:
         """Open, by one remedy after the other while that is refused because a session is taken."""
         remedies, resent = _Remedies(), False
         while True:
             asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
             operation = OpenRequest(opcode, wire_path(path), session=asked)
+            operation.on_opened = partial(self._on_opened, path, resent)
             # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
             if echoes is not False:
                 self.maybe_open[asked] = path
@@ -244,13 +247,23 @@ class ServerSession:
                 if not taken:
                     raise
                 await self._remedy(nak, remedies)
-                continue
-            self.maybe_open.clear()
-            resent |= operation.retransmitted
-            writing, seq = opcode != Opcode.OPEN_FILE_RO, operation.reply.seq
-            return OpenSession(
-                path, operation.session, operation.size, self.clock(), writing=writing, seq=seq, resent=resent
-            )
+            else:
+                return
+
+    def _on_opened(self, path: bytes, resent: bool, operation: OpenRequest) -> None:
+        """The ACK of an open came. Noted at once: what shows that another file is open there may come right
+        behind it, before the task that opened the file goes on. resent: an earlier try was."""
+        self.maybe_open.clear()
+        self.session = OpenSession(
+            path,
+            operation.session,
+            operation.size,
+            self.clock(),
+            writing=operation.opcode != Opcode.OPEN_FILE_RO,
+            seq=operation.reply.seq,
+            resent=resent or operation.retransmitted,
+        )
+        self.engine.session = self.session.id
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
         """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or a late
@@ -330,7 +343,7 @@ class ServerSession:
     def require_open(self, session: OpenSession) -> None:
         """Raise SessionLost unless what was opened then is still open."""
         if self.session is not session:
-            raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
+            raise _lost()
 
     def is_stalled(self, transfer: Operation) -> bool:
         """Return whether answers to a transfer are due, and none of any kind came for a while."""
@@ -425,3 +438,7 @@ class ServerSession:
 
     def _others_heard(self) -> bool:
         return self.vehicle.foreign_client(self.clock())
+
+
+def _lost() -> SessionLost:
+    return SessionLost("the vehicle restarted, or opened another file", by_server=True)

@@ -18,10 +18,11 @@ from mavftpfs.protocol.operations import OpenRequest, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.serversession import ServerSession
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 
-ANSWERS = st.sampled_from(["ack", "ack", "ack", "silence", "forever", 1, 4, 5, 8, 10])
+ANSWERS = st.sampled_from(["ack", "ack", "ack", "taken", "silence", "forever", 1, 4, 5, 8, 10])
 ACTS = st.sampled_from(["read", "write", "close", "abandon", "restart", "close maybe open", "exclude"])
 
 
@@ -32,6 +33,7 @@ class Answering:
         self._answers = answers
         self.engine = Engine(random.Random(1), Flow())
         self.vehicle = Vehicle(0, 0, Address(254, 191))
+        self.server: ServerSession
 
     async def run(self, operation: Operation) -> None:
         await trio.lowlevel.checkpoint()
@@ -47,6 +49,9 @@ class Answering:
             raise FtpNak(opcode, NakCode(answer), retransmitted=answer % 2 == 1)
         if isinstance(operation, OpenRequest):
             operation.session, operation.reply = 1, Payload(1, 0, Opcode.ACK, 0, opcode)
+            operation.on_opened(operation)
+            if answer == "taken":  # another client has it, before the caller goes on
+                self.server.abandon()
 
     async def be_silent(self, seconds: float) -> bool:
         await trio.sleep(seconds)
@@ -62,7 +67,7 @@ def test_what_is_open_is_known_or_in_doubt(acts: list[tuple[str, list[str | int]
 async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     driver = Answering([])
     scheduler = Scheduler(cast(Driver, driver), clock=trio.current_time, op_deadline=10.0)
-    server = scheduler.server
+    server = driver.server = scheduler.server
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):

@@ -64,6 +64,17 @@ def test_a_name_rests_where_copies_come_late() -> None:
     assert late.rest(b"/d/a", LASTS + 0.1) == 0.0, "none was late for ten minutes"
 
 
+def test_a_name_rests_for_ten_minutes_after_any_copy() -> None:
+    late = LateCopies()
+    late.saw(5.0, 0.0)
+    late.saw(3.0, 500.0)
+    late.on_changed(b"/d/a", 601.0)
+    assert late.rest(b"/d/a", 601.0) >= 6.0
+    late.saw(1.0, 500.0 + LASTS + 0.1)
+    late.on_changed(b"/d/a", 500.0 + LASTS + 0.1)
+    assert late.rest(b"/d/a", 500.0 + LASTS + 0.1) == 2.0, "those before are forgotten"
+
+
 def test_what_was_made_rests_no_longer_than_its_copy_may_be_late() -> None:
     late = LateCopies()
     late.saw(0.02, 0.0)
@@ -213,6 +224,19 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(profile: str, nt
         assert copy.late is not None
         await trio.sleep(8)
         assert connection.scheduler.server.session is None
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_nor_does_one_that_comes_right_behind_our_open(profile: str) -> None:
+    """Both answers come at once, before the task that opened the file goes on."""
+    one, two = content(500, 1), content(500, 2)
+    here = Rig(profile, {b"/d/one": one, b"/d/two": two}, CLEAN)
+    async with here.connected() as connection:
+        copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.OPEN_FILE_RO, first=True)
+        assert await read_file(connection, path(profile, "one")) == one
+        assert await read_file(connection, path(profile, "two")) == two
+        assert copy.late is not None
 
 
 @pytest.mark.holds("fault leaving")

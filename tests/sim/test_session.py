@@ -13,6 +13,7 @@ import trio
 
 from mavftpfs.client.connect import _list_root
 from mavftpfs.client.options import Options
+from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions
@@ -32,6 +33,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.faults import STATION
 from tests.support.rigs import DEFAULTS, Rig, rig
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
@@ -456,6 +458,26 @@ async def test_a_session_that_another_client_took_is_its_own(profile: str, ours:
             assert await sink.wait_for(0, len(DATA)) == DATA
     if ours == "writing":
         assert here.data(b"/d/new") == DATA
+
+
+@pytest.mark.holds("promise 6")
+async def test_also_one_that_it_took_right_behind_our_open() -> None:
+    """Both answers come at once, before the task that opened the file goes on."""
+    here = Rig("mavsdk", {b"/d": None}, LinkSettings(delay=0.02))
+    handle, took = here.server.handle, trio.Event()
+
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        handle(wire, source, now)
+        if wire[3] == Opcode.CREATE_FILE and source != STATION and not took.is_set():
+            took.set()
+            here.another_asks(Opcode.CREATE_FILE, path("mavsdk", "its"))
+
+    here.server.handle = on_request  # type: ignore[method-assign]
+    async with here.connected() as connection:
+        await put(connection, path("mavsdk", "new"), DATA[:500])
+        assert took.is_set()
+    assert here.data(b"/d/new") == DATA[:500]
+    assert here.data(b"/d/its") == b""
 
 
 @pytest.mark.holds("rule 14.9")
