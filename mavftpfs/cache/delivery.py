@@ -379,6 +379,7 @@ class Deliverer:
             As Names.rename and replace, and as _confirm.
         """
         store, unfinished, path = self._context.store, self._context.unfinished, node.path
+        sent = Known(draft.size, crc32=crc32)
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.on(Event.COMMITS)
         try:
@@ -392,11 +393,11 @@ class Deliverer:
             draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
             if unknown or unfinished.is_unknown(path):
-                unfinished.on_unknown(path).sent = Known(draft.size, crc32=crc32)
+                unfinished.on_unknown(path).sent = sent
             else:
                 await self._names.discard(attempt.path)
             raise
-        await self._confirm(node, draft, attempt)
+        await self._confirm(node, draft, attempt, sent)
 
     @staticmethod
     async def _end(draft: Draft, attempt: Attempt) -> None:
@@ -408,7 +409,7 @@ class Deliverer:
             draft.give_up()
             raise
 
-    async def _confirm(self, node: Node, draft: Draft, attempt: Attempt) -> None:
+    async def _confirm(self, node: Node, draft: Draft, attempt: Attempt, sent: Known) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.
 
         A late copy of its CreateFile may have emptied it after it was compared. A late copy of an earlier
@@ -425,9 +426,14 @@ class Deliverer:
             elif attempt.upload.resent and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
-            old = self._context.unfinished.on_unknown(path).aside
-            self._context.own.in_use.discard(old or b"")  # if the name has no file, the old one gets it back
-            draft.not_confirmed()
+            record = self._context.unfinished.on_unknown(path)
+            # If the name has no file, the old one gets it back.
+            self._context.own.in_use.discard(record.aside or b"")
+            if isinstance(error, VerificationFailed):
+                draft.not_confirmed()
+            else:  # others may have put a file there before the vehicle is heard again
+                record.sent = sent
+                draft.on(Event.NOT_PLACED)
             if unproven and isinstance(error, VerificationFailed):
                 await self._names.find_out(path)
             raise

@@ -265,8 +265,11 @@ class Draft:
             self.on(Event.GIVEN_UP)
 
     def not_confirmed(self) -> None:
-        """Note that the name got what was sent, and that the comparison afterwards failed: whatever became of
-        it may be replaced. All of the draft is here."""
+        """Note that a comparison right after the rename showed other bytes, or no file: what we placed there
+        is spoilt, and the next delivery may replace it, whatever it has become. All of the draft is here.
+
+        If the comparison was only interrupted, others may have put a file there: see Replacement.sent.
+        """
         self.on(Event.NOT_PLACED)
         self.base, self.base_limit = Known(self.size), 0
 

@@ -359,6 +359,15 @@ class Files:
                 del self._current[version.path]
             version.replace(f"{version.path!r} was changed here")
 
+    def on_unknown(self, path: bytes) -> None:
+        """Note that a path may have another file, or none, because a change of its name was interrupted. The
+        same holds for all paths below it. Open handles read nothing more, and the next open asks the vehicle.
+        """
+        self.on_changed(path)
+        for node in self._nodes.below(path):
+            if not self._nodes.is_changing(node.path):
+                self.on_replaced(node.path)
+
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns
         it."""

@@ -329,6 +329,14 @@ class Names:
                 own.in_use.discard(aside)
         return aside if stays and keep_old else None
 
+    def on_unknown(self, *paths: bytes) -> None:
+        """Note that it is not known what these names are after an interrupted change: the listings and files
+        there, and below, prove nothing from now on."""
+        for path in paths:
+            self._context.directories.forget(path)
+            self._context.directories.expire(split(path)[0])
+            self._context.files.on_unknown(path)
+
     # --- inside
 
     async def _swap(self, source: bytes, target: bytes, aside: bytes, *, compares_later: bool) -> bool:
@@ -384,13 +392,12 @@ class Names:
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
-        """If the outcome of the body is unknown, expire the listings of these names."""
+        """If the outcome of the body is unknown, forget what these names were (`on_unknown`)."""
         try:
             with self._context.directories.changing(*paths):
                 yield
         except (OutcomeUnknown, trio.Cancelled):
-            for path in paths:
-                self._context.directories.expire(split(path)[0])
+            self.on_unknown(*paths)
             raise
 
     async def _undo(self, place: bytes, path: bytes) -> None:

@@ -32,6 +32,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     NotSupported,
+    OutcomeUnknown,
     PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
@@ -216,6 +217,9 @@ class Namespace:
                 await self._names.rename(old, new)
         except NotSupported as error:
             raise CrossDevice(str(error)) from error
+        except (OutcomeUnknown, trio.Cancelled):  # perhaps it was done, and what follows it was not
+            self._names.on_unknown(old, new)
+            raise
         if displaced is not None and not displaced.removed:
             context.nodes.unnamed(displaced)
 

@@ -30,8 +30,9 @@ class Replacement:
     """What is known of one name.
 
     aside: where the old file lies, or may lie; None if none does. placed: whether the new file has the name;
-    None if that is not known. until: when the old file is to be removed, by the caches' clock. sent: the new
-    file, None if any file may be replaced.
+    None if that is not known. until: when the old file is to be removed, by the caches' clock. sent: what the
+    interrupted delivery tried to place. If the name has it, the next delivery may replace it. None if no
+    delivery was interrupted, or if its file proved to be spoilt (`Draft.not_confirmed`).
     """
 
     aside: bytes | None = None

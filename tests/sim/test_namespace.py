@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 
 import pytest
 import trio
@@ -23,6 +24,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
+    FileChanged,
     FtpNak,
     InvalidMove,
     IsADirectory,
@@ -128,6 +130,67 @@ async def test_renames(each: Rig) -> None:
 
 
 @pytest.mark.holds("rule 14.34")
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("held", ["read before", "open", "written, and open"])
+@pytest.mark.parametrize("silent", [False, True])
+@pytest.mark.parametrize(
+    ("profile", "last"), [("px4", Opcode.RENAME), ("ardupilot5", Opcode.REMOVE_FILE)], ids=["one", "three"]
+)
+async def test_after_an_interrupted_rename_the_old_file_is_not_read(
+    profile: str, last: Opcode, silent: bool, held: str
+) -> None:
+    """The vehicle did it. The new file is as large as the old one, and listings need not tell times."""
+    new, old = b"N" * 500, b"O" * 500
+    async with rig(profile, {b"/d/a": new, b"/d/b": old, b"/d/c": b""}, options=QUICK) as here:
+        tree = here.mount()
+        await tree.rename(b"/d/c", b"/d/other")  # finds out how it renames
+        if held == "written, and open":
+            file = await tree.open(b"/d/b", write=True)
+            await file.write(0, old)
+            await file.fsync()
+        else:
+            file = await tree.open(b"/d/b")
+            assert await file.read(0, 500) == old
+        if held == "read before":
+            file.close()
+        with trio.CancelScope() as scope, suppress(MavftpfsError):
+            nth = 2 if held == "open" and last is Opcode.RENAME else 1  # an open file moves aside first
+            here.faults.at(last, (lambda: here.faults.cut_after(0)) if silent else scope.cancel, nth=nth)
+            await tree.rename(b"/d/a", b"/d/b")
+        here.faults.cut_after(None)
+        assert here.data(b"/d/b") == new
+        assert await read_file(tree, b"/d/b") == new
+        if held == "open":
+            with suppress(FileChanged):
+                assert await file.read(0, 500) == old
+        await file.release()
+
+
+@pytest.mark.holds("promise 1")
+async def test_after_an_interrupted_rename_of_a_directory_nothing_is_remembered_below_it() -> None:
+    async with rig("px4", {b"/d/sub/x": b"old"}) as here:
+        tree = here.mount()
+        assert await read_file(tree, b"/d/sub/x") == b"old"
+        with trio.CancelScope() as scope:
+            here.faults.at(Opcode.RENAME, scope.cancel)
+            await tree.rename(b"/d/sub", b"/d/moved")
+        here.put(b"/d/sub/x", b"new")
+        assert await read_file(tree, b"/d/sub/x") == b"new"
+        assert await read_file(tree, b"/d/moved/x") == b"old"
+
+
+@pytest.mark.holds("promise 1")
+async def test_after_an_interrupted_unlink_its_file_is_not_read() -> None:
+    async with rig("px4", {b"/d/a": b"old"}) as here:
+        tree = here.mount()
+        assert await read_file(tree, b"/d/a") == b"old"
+        with trio.CancelScope() as scope:
+            here.faults.at(Opcode.REMOVE_FILE, scope.cancel)
+            await tree.unlink(b"/d/a")
+        here.put(b"/d/a", b"new")
+        assert await read_file(tree, b"/d/a") == b"new"
+
+
 async def test_renames_that_are_refused(each: Rig) -> None:
     tree = each.mount()
     for old, new, error in (

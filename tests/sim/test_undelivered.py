@@ -23,6 +23,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
+    AlreadyExists,
     FileChanged,
     MavftpfsError,
     NoSpace,
@@ -221,6 +222,28 @@ async def test_what_others_put_there_after_an_interruption_stays(
         with pytest.raises(FileChanged):
             await file.release()
         assert here.data(FILE) == b"theirs"
+
+
+@pytest.mark.parametrize("path", [FILE, NEW])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
+async def test_what_others_put_there_before_ours_was_confirmed_stays(profile: str, path: bytes) -> None:
+    """In doubt the file is compared once more under its own name, and the vehicle falls silent there."""
+    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/other", b"found out how it renames")
+        here.connection.scheduler.doubt.raise_it("for the test")
+        file = await (tree.open(path, write=True) if path == FILE else tree.create(path, exclusive=True))
+        await file.write(len(OLD) if path == FILE else 0, b"more")
+        sums = 2 + (path == FILE and profile == "px4")  # without times the old file is compared by one, too
+        here.faults.at(Opcode.CALC_FILE_CRC32, lambda: fall_silent(here), nth=sums)
+        with pytest.raises(MavftpfsError):
+            await file.fsync()
+        assert here.data(path).endswith(b"more"), "its name was given to it"
+        here.replace(path, b"theirs")
+        speak(here)
+        with pytest.raises(FileChanged if path == FILE else AlreadyExists):
+            await file.release()
+        assert here.data(path) == b"theirs"
 
 
 @pytest.mark.parametrize("carried_out", [False, True])
