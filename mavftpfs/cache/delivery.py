@@ -192,7 +192,7 @@ class Deliverer:
             there: bool | None = None if node.delivered_since_open else False
             try:
                 if context.unfinished.is_unknown(node.path):
-                    await self._mend(node, draft)
+                    await self._settle_unfinished(node, draft)
                     if not node.undelivered:
                         return True
                 await self.abandon(node)
@@ -233,7 +233,7 @@ class Deliverer:
             in_place = store.traits.rename_works is False
             try:
                 if self._context.unfinished.is_unknown(node.path):
-                    await self._mend(node, draft)
+                    await self._settle_unfinished(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
                 return
@@ -251,7 +251,7 @@ class Deliverer:
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
 
-    async def _mend(self, node: Node, draft: Draft) -> None:
+    async def _settle_unfinished(self, node: Node, draft: Draft) -> None:
         """Find out by a listing what has the name after interrupted renames, and compare that file with the
         draft.
 
@@ -348,7 +348,7 @@ class Deliverer:
             As Verifier.check and _require_expected.
         """
         # A second CreateFile may have emptied the file, and later writes hide that from its size.
-        doubted = self._context.store.in_doubt(attempt.begun_at) or attempt.upload.resent
+        doubted = self._context.store.in_doubt(attempt.begun_at) or attempt.upload.made_twice
         compare = partial(self.verifier.check, attempt.path, draft, doubted=doubted)
         look = partial(self._require_expected, node, draft)
         if draft.size <= SHORT:
@@ -423,7 +423,7 @@ class Deliverer:
         try:
             if unproven or doubted:
                 await self.verifier.check(path, draft, doubted=doubted)
-            elif attempt.upload.resent and await self._names.size(path) != draft.size:
+            elif attempt.upload.made_twice and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
             record = self._context.unfinished.on_unknown(path)

@@ -138,9 +138,9 @@ class Upload(Protocol):
         ...
 
     @property
-    def resent(self) -> bool:
-        """Whether CreateFile was sent more than once. A late copy of it may empty the file, so the caller
-        compares the size once more after the rename."""
+    def made_twice(self) -> bool:
+        """Whether CreateFile was sent more than once. Its second execution may have emptied the file while it
+        was written, so the caller compares its bytes; and its size once more after the rename."""
         ...
 
     def wake(self) -> None:

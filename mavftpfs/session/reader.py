@@ -50,7 +50,7 @@ class FileStream(SessionUser):
         if expected_size is not None:
             self.opened.end()
         else:
-            self.asked_at = scheduler.clock()
+            self.waiting_since = scheduler.clock()
 
     # --- the cache's side
 
@@ -66,7 +66,7 @@ class FileStream(SessionUser):
             self._transfer.want(start, stop, demand)
         else:
             self._wants.add(self._sink.missing(start, stop), demand=demand)
-        if self.asked_at is None and not self._wants.demand.empty:
+        if self.waiting_since is None and not self._wants.demand.empty:
             self._scheduler.renew(self)
         self._wanted.set()
         self._server.wake()
@@ -78,7 +78,7 @@ class FileStream(SessionUser):
             return
         self._wants.clear(demand=demand)
         if self._wants.demand.empty and self.opened.ended:
-            self.asked_at = None
+            self.waiting_since = None
 
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
@@ -118,7 +118,7 @@ class FileStream(SessionUser):
         """What is wanted cannot be had now."""
         self.drop()
         self._lost = 0  # the next read has as many turns
-        self.asked_at = None
+        self.waiting_since = None
         if not self.opened.ended:
             self.opened.end(error)
         elif not self.closed:
@@ -145,7 +145,7 @@ class FileStream(SessionUser):
                     self._fail(error)
             except MavftpfsError as error:
                 self._fail(error)
-            self.asked_at = None if self._wants.demand.empty else server.clock()
+            self.waiting_since = None if self._wants.demand.empty else server.clock()
 
     async def _open(self, turn: Turn) -> None:
         """Have the file open. Give the caller that waited for that a moment to ask for its bytes, before

@@ -96,14 +96,14 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        asked_at: since when it waits for its turn; None if that is for readahead alone. It stays set during
-            the turn.
+        waiting_since: since when a caller waits for what it does; None if there is only readahead. Set when
+            that begins, cleared by the user when a turn is over and nothing more is waited for.
         writing: its turns are refused while nothing may be written.
     """
 
-    def __init__(self, path: bytes, asked_at: float | None = None, *, writing: bool = False) -> None:
+    def __init__(self, path: bytes, waiting_since: float | None = None, *, writing: bool = False) -> None:
         self.path = path
-        self.asked_at = asked_at
+        self.waiting_since = waiting_since
         self.writing = writing
         self._used = 0.0
         self._until = 0.0
@@ -111,7 +111,7 @@ class SessionUser:
     @property
     def awaited(self) -> bool:
         """Whether a caller waits for it, and gets an error if it has no turn in time."""
-        return self.asked_at is not None
+        return self.waiting_since is not None
 
     @property
     def idle(self) -> bool:
@@ -141,23 +141,23 @@ class SessionUser:
 
     def used(self, now: float) -> float:
         """Return the seconds of use that still count: they fade, but not while it waits."""
-        until = now if self.asked_at is None else min(now, self.asked_at)
+        until = now if self.waiting_since is None else min(now, self.waiting_since)
         return self._used * min(1.0, max(0.0, 1.0 - (until - self._until) / USE_MEMORY))
 
     def waited_long(self, now: float, rtt: float | None) -> bool:
         """Return whether it is not to be passed over any more."""
         limit = max(LONG_WAIT, LONG_WAIT_TRIPS * (rtt or 0.0))
-        return self.asked_at is not None and now - self.asked_at >= limit
+        return self.waiting_since is not None and now - self.waiting_since >= limit
 
     def rank(self, now: float, rtt: float | None) -> tuple[bool, float]:
         """Return its place among the users that wait: the least goes first."""
         heavy = self.used(now) >= LIGHT_USE and not self.waited_long(now, rtt)
-        return heavy, now if self.asked_at is None else self.asked_at
+        return heavy, now if self.waiting_since is None else self.waiting_since
 
     def gives_way(self, rival_use: float, began: float, now: float, rtt: float | None) -> bool:
         """Return whether its turn, which began then, ends for a user that waits. rival_use: see Turn."""
-        slice_ = now - began
-        if slice_ < RELIEF and self.waited_long(began, rtt):
+        slice_, had_waited_long = now - began, self.waited_long(began, rtt)
+        if slice_ < RELIEF and had_waited_long:
             return False
         if rival_use < LIGHT_USE and max(self.used(now), slice_) >= LIGHT_USE:
             return True
@@ -269,8 +269,8 @@ class Scheduler:
     def renew(self, user: SessionUser) -> None:
         """A caller begins to wait for it now, and waits as long as any. If it waits already, it keeps its
         place."""
-        if user.asked_at is None:
-            user.asked_at = self.clock()
+        if user.waiting_since is None:
+            user.waiting_since = self.clock()
         if user in self._queue:
             self._limit(self._queue[user])
 
@@ -317,7 +317,7 @@ class Scheduler:
 
     def waiting(self, now: float) -> list[SessionUser]:
         """Return the users that want more than readahead, and could use the session now."""
-        return [user for user in self._queue if user.asked_at is not None and self._may_use(user, now)]
+        return [user for user in self._queue if user.waiting_since is not None and self._may_use(user, now)]
 
     def next_user(self) -> SessionUser | None:
         """Return the user that is to have the session now. Readahead comes only if nothing waits, and that of

@@ -208,8 +208,8 @@ class ServerSession:
 
         Raises:
             FtpNak: the server refused. SessionBusy: its session stayed taken. SessionLost: it was open, and
-                is not believed any more. RequestTimeout. That the other file could not be closed is no news
-                to its user.
+                is not believed any more. RequestTimeout: it was not answered; or a file that may
+                be open from before could not be closed.
         """
         await self.close_quietly()
         await self._close_what_may_be_ours()
@@ -275,8 +275,9 @@ class ServerSession:
     async def close(self, limit: float | None = None) -> bool:
         """Terminate; return False if the server had closed it before, by itself.
 
-        If a repeated Terminate finds no session, the first one closed it, unless the server may have closed
-        it as idle. limit: seconds to wait for the answer; None: as for any request.
+        "No such session" in answer to a repeated Terminate means that the first one closed it. After 8 s it
+        may mean that the server closed it as idle. limit: seconds to wait for the answer; None: as for any
+        request.
 
         Raises:
             FtpNak: closing failed over there. RequestTimeout: no answer; it may be open now.

@@ -75,13 +75,13 @@ class Upload(SessionUser):
     """Implements cache.remote.Upload. Nothing is sent before the source has something.
 
     Attributes:
-        begun, resent: see cache.remote.Upload.
+        begun, made_twice: see cache.remote.Upload.
     """
 
     def __init__(self, path: bytes, source: SendBuffer, scheduler: Scheduler) -> None:
         super().__init__(path, writing=True)
         self._source = source
-        self.begun = self.resent = False
+        self.begun = self.made_twice = False
         self._scheduler = scheduler
         self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
@@ -89,7 +89,7 @@ class Upload(SessionUser):
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
-        self._parked = False  # nothing is sent before the next `finish`: refused, or all would go again
+        self._until_finish = False  # nothing is sent before the next `finish`: refused, or all would go again
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
         self._retry_at = 0.0  # not to be touched before
@@ -112,7 +112,7 @@ class Upload(SessionUser):
         if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._parked, self._losses, self._retry_at = False, 0, 0.0
+        self._until_finish, self._losses, self._retry_at = False, 0, 0.0
         first, finisher = not self.awaited, Future()
         self._finishers.append(finisher)
         if first:
@@ -178,14 +178,14 @@ class Upload(SessionUser):
         elif not self._has_work():
             self._complete(list(self._finishers))
         else:
-            self.asked_at = self.asked_at or self._clock()
+            self.waiting_since = self.waiting_since or self._clock()
             async with self._scheduler.turn(self) as turn:
                 await self._use(turn)
 
     def _due_in(self) -> float:
         """Return in how many seconds it wants a turn, unless it is woken before. While the vehicle is armed
         it wants none, so that no reader makes way for it."""
-        wanted = self.awaited or (not self._parked and self._has_work())
+        wanted = self.awaited or (not self._until_finish and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
         return self._retry_at - self._clock()
@@ -199,7 +199,7 @@ class Upload(SessionUser):
         """Raise an error in all `finish`, and try again later; after a refusal only at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
-        self._parked = isinstance(error, REFUSALS)
+        self._until_finish = isinstance(error, REFUSALS)
         self._retry_at = self._clock() + RETRY_AFTER
 
     async def _use(self, turn: Turn) -> None:
@@ -219,7 +219,7 @@ class Upload(SessionUser):
             self._on_failure(error)
         finally:
             self.on_turn(began, self._clock())
-            self.asked_at = None
+            self.waiting_since = None
 
     def _on_failure(self, error: MavftpfsError) -> None:
         """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost
@@ -241,14 +241,14 @@ class Upload(SessionUser):
             raise error.__cause__ if isinstance(error.__cause__, MavftpfsError) else error
 
     @property
-    def _keeps(self) -> bool:
+    def _keeps_content(self) -> bool:
         """Whether OpenFileWO was seen to keep what a file has."""
         return self._engine.traits.wo_truncates is False
 
     @property
-    def _resumable(self) -> bool:
+    def _may_interrupt(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
-        return self._keeps or (self._engine.traits.wo_truncates is None and self._source.reached > 0)
+        return self._keeps_content or (self._engine.traits.wo_truncates is None and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
         """Let these callers go: everything that the source had when they began to wait is ACKed, and the file
@@ -257,26 +257,26 @@ class Upload(SessionUser):
         for finisher in finishers:
             finisher.end()
         self._losses = 0
-        self._parked = self._source.closed and not self._resumable
+        self._until_finish = self._source.closed and not self._may_interrupt
 
     # --- opening
 
     async def _open(self, turn: Turn) -> OpenSession:
         """Open the upload's file: to go on with it where that is possible, else to begin it."""
         source = self._source
-        if source.closed and self._resumable:
+        if source.closed and self._may_interrupt:
             session = await self._reopen(turn)
             if session is not None:
                 return session
         source.start_over()
-        self.resent |= self.begun
+        self.made_twice |= self.begun
         self.begun = True  # what is there from now on may be ours
         try:
             session = await turn.open(self.path, Opcode.CREATE_FILE)
         except FtpNak as nak:
-            self.resent |= nak.retransmitted
+            self.made_twice |= nak.retransmitted
             raise
-        self.resent |= session.resent
+        self.made_twice |= session.resent
         return session
 
     async def _reopen(self, turn: Turn) -> OpenSession | None:
@@ -364,7 +364,7 @@ class Upload(SessionUser):
             stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
             # After a silence the session may be gone (servers.md 14.9): the answer to Terminate tells. Where
             # closing costs the whole file, it is closed only if another client was heard.
-            closes = self._keeps or self._vehicle.foreign_client(clock())
+            closes = self._keeps_content or self._vehicle.foreign_client(clock())
             stalled = closes and server.is_stalled(transfer)
             if stalled and stop is None:
                 stop = Stop.YIELD
@@ -388,13 +388,13 @@ class Upload(SessionUser):
             return Stop.ARMED
         if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
-        now, rival_use, resumable = self._clock(), turn.rival_use, self._resumable
+        now, rival_use, resumable = self._clock(), turn.rival_use, self._may_interrupt
         if transfer.starved:
             makes_room = resumable or now - session.opened_at >= TRICKLE
             least = BRIEF_STARVE if rival_use is not None and makes_room else STARVE
             return Stop.STARVED if self.awaited or starved_for >= least else None
         if rival_use is None:
-            over = self._keeps and now - session.opened_at >= CHECKPOINT_EVERY
+            over = self._keeps_content and now - session.opened_at >= CHECKPOINT_EVERY
         else:
             over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
@@ -406,7 +406,7 @@ class Upload(SessionUser):
         lost is sent when the file is open again. But where path operations cause refusals (NuttX) the answers
         are waited for, because only the running upload can put that right.
         """
-        if not self._keeps or self._engine.traits.paths_block_writes:
+        if not self._keeps_content or self._engine.traits.paths_block_writes:
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
@@ -437,8 +437,8 @@ class Upload(SessionUser):
     async def _close(self, stop: Stop) -> None:
         """Close the file, and judge by that what of it is written.
 
-        A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). That restart
-        is news that takes the bytes back (`_open`) and has the file compared (`Doubt`).
+        A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). But that
+        restart raises doubt, so the file is compared; and `_reopen` compares its size.
         """
         transfer = self._transfer  # if any, its last requests are on their way
         try:

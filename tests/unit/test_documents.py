@@ -90,9 +90,9 @@ def unknown_modules(text: str) -> list[str]:
     return [name for name in named if not (package / name).exists() and not (PROJECT / name).exists()]
 
 
-def test_the_page_about_the_code_names_what_is_there() -> None:
-    page = (PROJECT / "docs/architecture.md").read_text()
-    assert unknown_modules(page) == []
+def test_the_pages_about_the_code_name_what_is_there() -> None:
+    for page in ("architecture.md", "processes.md"):
+        assert unknown_modules((PROJECT / "docs" / page).read_text()) == []
     assert unknown_modules("see `cache/nothing.py: Class` and `nowhere/`") == ["cache/nothing.py", "nowhere/"]
 
 

@@ -48,17 +48,17 @@ def test_use_fades_but_not_while_it_waits() -> None:
     assert user.used(100.0) == 2.0
     assert user.used(100.0 + USE_MEMORY / 2) == pytest.approx(1.0)
     assert user.used(100.0 + 2 * USE_MEMORY) == 0.0
-    user.asked_at = 100.0
+    user.waiting_since = 100.0
     assert user.used(100.0 + USE_MEMORY / 2) == 2.0
     user.on_turn(130.0, 131.0)
-    user.asked_at = None
+    user.waiting_since = None
     assert user.used(131.0) == 3.0
 
 
 def test_who_used_little_goes_first_until_another_waited_long() -> None:
     busy, light = heavy(), SessionUser(b"/g")
-    busy.asked_at = 100.0
-    light.asked_at = 101.0
+    busy.waiting_since = 100.0
+    light.waiting_since = 101.0
     assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)
     late = 100.0 + LONG_WAIT
     assert busy.rank(late, 0.02) < light.rank(late, 0.02)
@@ -67,7 +67,7 @@ def test_who_used_little_goes_first_until_another_waited_long() -> None:
 
 def test_who_waited_long_keeps_the_session_for_a_while() -> None:
     user = heavy()
-    user.asked_at = 100.0
+    user.waiting_since = 100.0
     began = 100.0 + LONG_WAIT
     assert user.gives_way(0.0, began - 0.1, began, 0.02)
     assert not user.gives_way(0.0, began, began + 0.1, 0.02)
