@@ -173,7 +173,7 @@ class Life(ABC):
         else:
             log.error("unmounted: %s", reason)
 
-    # -- who ends it
+    # -- what ends it
 
     async def _watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
         with trio.open_signal_receiver(*ending_signals()) as signals:
