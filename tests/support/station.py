@@ -34,7 +34,7 @@ class RecordedStation(mavutil.mavudp):  # type: ignore[misc]
     def __init__(self, port: int, record: Path) -> None:
         super().__init__(f"127.0.0.1:{port}", input=True, source_system=255, source_component=190)
         self.record = record.open("w", encoding="ascii")
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()
         self.splitter = Splitter(stream=False)
 
     def recv(self, n: int | None = None) -> bytes:
@@ -44,8 +44,9 @@ class RecordedStation(mavutil.mavudp):  # type: ignore[misc]
         return data
 
     def write(self, buf: bytes) -> None:
-        self.note(">", bytes(buf))
-        super().write(buf)
+        with self.lock:  # two threads send: a frame is noted and sent before the next one is
+            self.note(">", bytes(buf))
+            super().write(buf)
 
     def note(self, mark: str, data: bytes) -> None:
         with self.lock:
