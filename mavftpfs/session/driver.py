@@ -82,6 +82,7 @@ class Driver:
         self._deadline = inf  # of `pump`
         self._may_send = False
         self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
+        self._to_begin: set[Operation] = set()  # when the silence is over
         self._silences = 0
         self._changed = trio.lowlevel.ParkingLot()  # what is under way, or silence, ended
         self._budget = engine.flow.budget
@@ -144,16 +145,24 @@ class Driver:
         on_finished: Callable[[], None],
         on_batch: Callable[[float], None] | None = None,
     ) -> None:
-        """Begin an operation, once nobody wants silence any more. `on_finished` is called from the pump when
-        it is done or failed, and `on_batch` until then after each batch of input, with the time."""
-        while self._silences:
-            await self._changed.park()
+        """Begin an operation, once nobody wants silence any more; not if it was cancelled by then.
+        `on_finished` is called from the pump when it is done or failed, and `on_batch` until then after each
+        batch of input, with the time."""
+        self._to_begin.add(operation)
+        try:
+            while self._silences:
+                await self._changed.park()
+            if operation not in self._to_begin:
+                return
+        finally:
+            self._to_begin.discard(operation)
         self._under_way[operation] = on_finished, on_batch
         self.engine.start(operation, self._clock())
         self.kick()
 
     def cancel(self, operation: Operation) -> None:
         """Forget an operation (harmless when it is finished)."""
+        self._to_begin.discard(operation)
         if self._under_way.pop(operation, None) is not None:
             self._changed.unpark_all()
             self.engine.remove(operation)

@@ -67,6 +67,7 @@ class FileStream(SessionUser):
         else:
             self._wants.add(self._sink.missing(start, stop), demand=demand)
         if self.waiting_since is None and not self._wants.demand.empty:
+            self.waiting_since = self._scheduler.clock()
             self._scheduler.renew(self)
         self._wanted.set()
         self._server.wake()
@@ -145,7 +146,8 @@ class FileStream(SessionUser):
                     self._fail(error)
             except MavftpfsError as error:
                 self._fail(error)
-            self.waiting_since = None if self._wants.demand.empty else server.clock()
+            if not self._wants.demand.empty or not self.opened.ended:
+                self.waiting_since = server.clock()
 
     async def _open(self, turn: Turn) -> None:
         """Have the file open. Give the caller that waited for that a moment to ask for its bytes, before

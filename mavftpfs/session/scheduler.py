@@ -96,8 +96,8 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        waiting_since: since when a caller waits for what it does; None if there is only readahead. Set when
-            that begins, cleared by the user when a turn is over and nothing more is waited for.
+        waiting_since: since when a caller waits for what it does; None if there is only readahead. The user
+            sets it, and it ends with the turn.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -267,17 +267,13 @@ class Scheduler:
         self.server.wake()
 
     def renew(self, user: SessionUser) -> None:
-        """A caller begins to wait for it now, and waits as long as any. If it waits already, it keeps its
-        place."""
-        if user.waiting_since is None:
-            user.waiting_since = self.clock()
+        """A caller begins to wait for it now, and waits as long as any; its place in the queue stays."""
         if user in self._queue:
             self._limit(self._queue[user])
 
     def _limit(self, turn: Turn) -> None:
         """From now on it waits as long as any. Without a caller it waits without limit."""
-        if turn.user.awaited:
-            turn.limit.deadline = trio.current_time() + self._longest_wait
+        turn.limit.deadline = trio.current_time() + self._longest_wait if turn.user.awaited else inf
 
     @asynccontextmanager
     async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
@@ -301,6 +297,7 @@ class Scheduler:
             self.server.vehicle.require(self.clock(), writing=user.writing)
             yield turn
         finally:
+            user.waiting_since = None
             if self._queue.get(user) is turn:
                 del self._queue[user]
             if self.holder is turn:

@@ -178,7 +178,7 @@ class Upload(SessionUser):
         elif not self._has_work():
             self._complete(list(self._finishers))
         else:
-            self.waiting_since = self.waiting_since or self._clock()
+            self.waiting_since = self._clock()
             async with self._scheduler.turn(self) as turn:
                 await self._use(turn)
 
@@ -219,7 +219,6 @@ class Upload(SessionUser):
             self._on_failure(error)
         finally:
             self.on_turn(began, self._clock())
-            self.waiting_since = None
 
     def _on_failure(self, error: MavftpfsError) -> None:
         """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost

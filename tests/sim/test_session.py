@@ -460,24 +460,42 @@ async def test_a_session_that_another_client_took_is_its_own(profile: str, ours:
         assert here.data(b"/d/new") == DATA
 
 
-@pytest.mark.holds("promise 6")
-async def test_also_one_that_it_took_right_behind_our_open() -> None:
-    """Both answers come at once, before the task that opened the file goes on."""
-    here = Rig("mavsdk", {b"/d": None}, LinkSettings(delay=0.02))
+def taken_behind(here: Rig, opcode: Opcode) -> trio.Event:
+    """Have another client make a file right behind our first open: both answers come at once, before the task
+    that opened the file goes on."""
     handle, took = here.server.handle, trio.Event()
 
     def on_request(wire: bytes, source: Address, now: float) -> None:
         handle(wire, source, now)
-        if wire[3] == Opcode.CREATE_FILE and source != STATION and not took.is_set():
+        if wire[3] == opcode and source != STATION and not took.is_set():
             took.set()
             here.another_asks(Opcode.CREATE_FILE, path("mavsdk", "its"))
 
     here.server.handle = on_request  # type: ignore[method-assign]
+    return took
+
+
+@pytest.mark.holds("promise 6")
+async def test_also_one_that_it_took_right_behind_our_open() -> None:
+    here = Rig("mavsdk", {b"/d": None}, LinkSettings(delay=0.02))
+    took = taken_behind(here, Opcode.CREATE_FILE)
     async with here.connected() as connection:
         await put(connection, path("mavsdk", "new"), DATA[:500])
         assert took.is_set()
     assert here.data(b"/d/new") == DATA[:500]
     assert here.data(b"/d/its") == b""
+
+
+async def test_then_the_caller_that_opens_a_file_still_waits() -> None:
+    """It does not fall behind those that came later, and gets its error in time."""
+    here = Rig("mavsdk", {b"/d/f": DATA}, LinkSettings(delay=0.02))
+    took = taken_behind(here, Opcode.OPEN_FILE_RO)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(read_file, connection, path("mavsdk", "f"))
+        await took.wait()
+        await trio.sleep(1.0)
+        (user,) = connection.scheduler.users
+        assert user.awaited
 
 
 @pytest.mark.holds("rule 14.9")

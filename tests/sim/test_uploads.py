@@ -473,6 +473,30 @@ async def test_a_file_that_cannot_be_opened_again_is_sent_again(probed: bool, co
     assert here.card.data(b"/d/new") == bytes(source.content)
 
 
+async def test_what_was_abandoned_during_a_silence_is_not_sent_after_it() -> None:
+    """A taken session is waited out between the open and the first WriteFile; what is open may be another's
+    file by then."""
+    async with uploading(content(3000)) as (here, source, upload), trio.open_nursery() as nursery:
+        here.faults.requests.clear()
+        here.faults.at(Opcode.CREATE_FILE, lambda: nursery.start_soon(here.connection.driver.be_silent, 3.5))
+        nursery.start_soon(upload.finish)
+        await trio.sleep(2.0)
+        here.connection.scheduler.server.abandon()
+        await trio.sleep(20.0)
+        assert source.all_proven
+        requests = here.faults.requests
+        assert requests[:2] == [Opcode.CREATE_FILE, Opcode.TERMINATE_SESSION]
+    assert here.card.data(b"/d/new") == bytes(source.content)
+
+
+async def test_a_finish_with_nothing_to_send_leaves_no_early_place() -> None:
+    """What comes in the background later has waited since then, not since that call."""
+    async with uploading(content(3000)) as (_, _, upload):
+        await upload.finish()
+        await upload.finish()
+        assert upload.waiting_since is None
+
+
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) -> None:
     async with uploading(content(3000), known=probed) as (here, source, upload):
