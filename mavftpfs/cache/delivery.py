@@ -297,7 +297,11 @@ class Deliverer:
         crc32 = await self._compare_and_look(node, draft, attempt)
         node.attempt = None
         try:
-            await self._end(draft, attempt)
+            try:
+                await attempt.upload.end()
+            except BaseException:  # the caller was cancelled: the draft is sent again
+                draft.give_up()
+                raise
             if not attempt.in_place:
                 await self._commit(node, draft, attempt, crc32)
         finally:
@@ -376,19 +380,18 @@ class Deliverer:
         """Rename what was sent and verified into place. crc32: as the vehicle told it, if it did.
 
         Raises:
-            As Names.rename and replace, and as _confirm.
+            As Names.rename and replace, and as _compare_again.
         """
-        store, unfinished, path = self._context.store, self._context.unfinished, node.path
+        unfinished, path = self._context.unfinished, node.path
         sent = Known(draft.size, crc32=crc32)
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.on(Event.COMMITS)
         try:
-            compares_later = crc32 is not None or store.in_doubt()  # as quick as a listing, and tells more
             if draft.base is None:
                 await self._names.forget_old(path)
-                await self._names.rename(attempt.path, path, compares_later=compares_later)
+                await self._names.rename(attempt.path, path)
             else:
-                await self._names.replace(attempt.path, path, compares_later=compares_later)
+                await self._names.replace(attempt.path, path)
         except BaseException as error:
             draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
@@ -397,23 +400,14 @@ class Deliverer:
             else:
                 await self._names.discard(attempt.path)
             raise
-        await self._confirm(node, draft, attempt, sent)
+        await self._compare_again(node, draft, attempt, sent)
 
-    @staticmethod
-    async def _end(draft: Draft, attempt: Attempt) -> None:
-        """End the task of an upload that sent everything. If the caller is cancelled meanwhile, the draft is
-        sent again."""
-        try:
-            await attempt.upload.end()
-        except BaseException:
-            draft.give_up()
-            raise
-
-    async def _confirm(self, node: Node, draft: Draft, attempt: Attempt, sent: Known) -> None:
+    async def _compare_again(self, node: Node, draft: Draft, attempt: Attempt, sent: Known) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.
 
         A late copy of its CreateFile may have emptied it after it was compared. A late copy of an earlier
-        rename may have taken it away. A server may ACK a rename and do something else.
+        rename may have taken it away. A server may ACK a rename and do something else: it is believed once it
+        was seen to rename.
 
         Raises:
             VerificationFailed: it is not there. Else as Verifier.check. The replacement is unfinished then.
@@ -421,10 +415,10 @@ class Deliverer:
         store, path = self._context.store, node.path
         doubted, unproven = store.in_doubt(attempt.begun_at), store.traits.rename_works is None
         try:
-            if unproven or doubted:
+            if doubted or (unproven and sent.crc32 is not None):
                 await self.verifier.check(path, draft, doubted=doubted)
-            elif attempt.upload.made_twice and await self._names.size(path) != draft.size:
-                raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
+            elif (unproven or attempt.upload.made_twice) and await self._names.size(path) != draft.size:
+                raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
         except BaseException as error:
             record = self._context.unfinished.on_unknown(path)
             # If the name has no file, the old one gets it back.

@@ -123,7 +123,6 @@ class Draft:
         base_limit: below this, bytes that are not held are the base's.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
-        lacked: whether the vehicle lacked something of it when the base was replaced (STALE).
         sent_in_place: the file may exist under its own name because of us (cards that cannot rename).
     """
 
@@ -136,7 +135,6 @@ class Draft:
         self.sending: SendBuffer | None = None
         self.sent_in_place = False
         self._held = ExtentSet()
-        self.lacked = False
 
     # --- what it is
 
@@ -286,7 +284,6 @@ class Draft:
     def lose_base(self) -> None:
         """Note that others replaced the base. That changes nothing if no byte of the base was to stay."""
         if self.base_limit and self.state is not State.STALE:
-            self.lacked = self.state is not State.CLEAN
             self.give_up()
             self.on(Event.REPLACED)
 

@@ -258,12 +258,10 @@ class Files:
         version.require_not_replaced()
 
     def _is_sure(self, version: Version) -> bool:
-        """Return whether a listing would tell nothing more of a version: it is CURRENT, or the open reply,
-        which shows that the file did not become smaller, is all the proof that there can be."""
-        if version.current:
-            return True
-        reply = Opened(version.size, self._directories.tells_times)  # a smaller one was refused
-        return compare(version.known, reply) is Sameness.SAME
+        """Return whether a listing would tell nothing more of a version: it is CURRENT, or no times are told,
+        and the open reply showed that the file did not become smaller. After a restart that is no proof."""
+        timed = self._directories.tells_times or version.mtime is not None
+        return version.current or not (timed or version.known.restarted)
 
     async def _compare(self, version: Version) -> None:
         path = version.path

@@ -174,36 +174,21 @@ class Names:
             log.info("%r stays until its directory is listed again: %s", path, error)
             self._context.directories.expire(split(path)[0])
 
-    async def rename(
-        self,
-        old: bytes,
-        new: bytes,
-        *,
-        completes: bool = False,
-        over: bool = False,
-        compares_later: bool = False,
-    ) -> None:
-        """Rename; both paths fit a request. A listing confirms it in doubt, and until this server was seen to
-        rename.
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
+        """Rename; both paths fit a request.
 
-        completes: see VehicleStore. over: a file has the new name. compares_later: the caller
-        compares the file afterwards, so no listing is needed.
+        completes: see VehicleStore. over: a file has the new name.
 
         Raises:
-            NotSupported: the card cannot rename, even if its server says that it did. AlreadyExists: the new
-            name is taken, and not `over`. Else as VehicleStore.
+            NotSupported: the card cannot rename. AlreadyExists: the new name is taken, and not `over`. Else
+            as VehicleStore.
         """
         store = self._context.store
         if store.traits.rename_works is False:
             raise NotSupported("this server cannot rename")
         try:
             async with self._changing(old, new):
-                confirm = not compares_later and (store.traits.rename_works is None or store.in_doubt())
-                await store.rename(old, new, completes=completes, confirm=confirm)
-        except NotSupported:
-            if store.traits.rename_works is None:
-                store.traits.rename_works = False
-            raise
+                await store.rename(old, new, completes=completes)
         except FtpNak as nak:
             taken = nak.code == NakCode.FILE_EXISTS
             if store.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
@@ -213,8 +198,6 @@ class Names:
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
-        if not compares_later:
-            store.traits.rename_works = True
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
@@ -289,10 +272,8 @@ class Names:
 
     # --- giving a verified file its name
 
-    async def replace(
-        self, source: bytes, target: bytes, *, keep_old: bool = False, compares_later: bool = False
-    ) -> bytes | None:
-        """Rename over a file that exists. compares_later: see rename.
+    async def replace(self, source: bytes, target: bytes, *, keep_old: bool = False) -> bytes | None:
+        """Rename over a file that exists.
 
         keep_old: keep the old file, and return its reserved name, which is in `OwnNames.in_use`; None if the
         old file was gone.
@@ -307,7 +288,7 @@ class Names:
         traits = self._context.store.traits
         if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
             try:
-                await self.rename(source, target, over=True, compares_later=compares_later)
+                await self.rename(source, target, over=True)
                 traits.rename_replaces = True
                 return None
             except FtpNak as nak:
@@ -322,7 +303,7 @@ class Names:
         own.in_use.add(aside)
         stays = False
         try:
-            if await self._swap(source, target, aside, compares_later=compares_later):
+            if await self._swap(source, target, aside):
                 stays = keep_old or await self._discard_old(target, aside)
         finally:
             if not stays:
@@ -339,7 +320,7 @@ class Names:
 
     # --- inside
 
-    async def _swap(self, source: bytes, target: bytes, aside: bytes, *, compares_later: bool) -> bool:
+    async def _swap(self, source: bytes, target: bytes, aside: bytes) -> bool:
         """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
 
         Raises:
@@ -348,14 +329,14 @@ class Names:
         moved: bool | None = None  # not known
         try:
             try:
-                await self.rename(target, aside, compares_later=compares_later)
+                await self.rename(target, aside)
                 moved = True
             except FtpNak as nak:
                 gone = errno_for(nak) == errno.ENOENT
                 if not gone or await self._context.directories.current(target) is not None:
                     raise
                 moved = False
-            await self.rename(source, target, completes=moved, compares_later=compares_later)
+            await self.rename(source, target, completes=moved)
         except (OutcomeUnknown, trio.Cancelled):
             if moved is not False:
                 self._note_unfinished(target, aside, placed=None if moved else False)

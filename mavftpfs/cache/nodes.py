@@ -82,10 +82,7 @@ class Node:
     @property
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
-        draft = self.draft
-        if draft is None or self.removed:
-            return False
-        return draft.lacked if draft.state is State.STALE else draft.state is not State.CLEAN
+        return self.draft is not None and not self.removed and self.draft.state is not State.CLEAN
 
     @property
     def changing(self) -> bool:
@@ -217,10 +214,10 @@ class Nodes:
         node = self._by_path.get(path)
         if node is None or node.delivery is not None:
             return False  # a delivery compares the base itself
-        draft = node.draft
+        draft, lacks = node.draft, node.undelivered
         if draft is not None:
             draft.lose_base()
-        gone = draft is None or (draft.state is State.STALE and not draft.lacked)
+        gone = draft is None or (draft.state is State.STALE and not lacks)
         if gone:
             self.replaced(node)
         return gone

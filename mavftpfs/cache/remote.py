@@ -228,12 +228,7 @@ class VehicleStore(RemoteStore, Protocol):
         """Remove what is known to be an empty directory."""
         ...
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; both paths together must fit one request (238 bytes). completes: without this rename a name
-        lacks its file, so it is done even if the vehicle was armed meanwhile. confirm: a listing has to show
-        it.
-
-        Raises:
-            NotSupported: the listing shows that it was not done, though the server ACKed it.
-        """
+        lacks its file, so it is done even if the vehicle was armed meanwhile."""
         ...

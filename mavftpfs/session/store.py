@@ -31,7 +31,6 @@ from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
     MavftpfsError,
-    NotSupported,
     OutcomeUnknown,
     PathTooLong,
     RemoteProtocolError,
@@ -321,17 +320,13 @@ class Store:
         async with self._changing(path):
             await self._perform(request, partial(self._is_new_directory, path))
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, confirm: bool = False) -> None:
-        """Rename; readers of the old path go on under the new one. completes: in flight, too. confirm: the
-        ACK alone is not believed."""
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        """Rename; readers of the old path go on under the new one. completes: in flight, too."""
         data = wire_path(old) + b"\0" + wire_path(new)
         if len(data) > RENAME_ROOM:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            is_renamed = partial(self._is_renamed, old, new)
-            await self._perform(partial(Simple, Opcode.RENAME, data), is_renamed)
-            if confirm:
-                await self._confirm(is_renamed)
+            await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
             self._late.on_replaced(new)
@@ -389,19 +384,6 @@ class Store:
                 return
             if outcome is not Outcome.DID_NOT or last:
                 raise error
-
-    async def _confirm(self, verify: Verdict) -> None:
-        """Look whether a change is there that was ACKed. A listing that is not whole contradicts no ACK.
-
-        Raises:
-            NotSupported: it is not. OutcomeUnknown: nothing could be listed.
-        """
-        try:
-            outcome = await verify()
-        except MavftpfsError as error:
-            raise OutcomeUnknown(f"whether it was done cannot be seen: {error}") from error
-        if outcome in (Outcome.DID_NOT, Outcome.CONFLICT):
-            raise NotSupported("the server says that it renamed, and its listing says that it did not")
 
     def _may_be_second(self, nak: FtpNak) -> bool:
         """Whether a refusal may answer the second execution of a request.

@@ -49,10 +49,9 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """The size in a reply to an open. tells_times: listings of this server tell times."""
+    """The size in a reply to an open."""
 
     size: int
-    tells_times: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ def compare(known: Known, seen: Seen) -> Sameness:
 def _by_open(known: Known, seen: Opened) -> Sameness:
     if seen.size < known.size:
         return Sameness.OTHER
-    if known.restarted or known.mtime is not None or seen.tells_times:
+    if known.restarted or known.mtime is not None:
         return Sameness.UNPROVEN  # a listing tells more
     return Sameness.SAME if seen.size == known.size else Sameness.GREW
 

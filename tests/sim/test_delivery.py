@@ -22,7 +22,6 @@ from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
-    CrossDevice,
     FileChanged,
     FileTooLarge,
     FtpNak,
@@ -149,29 +148,6 @@ async def test_a_server_that_says_that_it_renames_and_does_not(
             with pytest.raises(NotSupported):
                 await write_file(tree, FILE, content(size))
             assert here.data(FILE) == OLD
-
-
-@pytest.mark.parametrize("loses", [False, True], ids=["does nothing", "removes it"])
-@pytest.mark.parametrize("doubted", [False, True])
-async def test_nor_is_it_believed_when_a_program_renames(here: Rig, doubted: bool, loses: bool) -> None:
-    tree = here.mount()
-    if doubted:
-        await write_file(tree, FRESH, NEW)
-        here.connection.scheduler.doubt.raise_it("a copy was late")
-    never_rename(here, loses=loses)
-    with pytest.raises(CrossDevice):
-        await tree.rename(OTHER, b"/d/another")
-    assert here.files().get(OTHER) == (None if loses else NEW)
-
-
-async def test_renames_are_confirmed_once(here: Rig) -> None:
-    tree = here.mount()
-    await tree.list(b"/d")
-    for name, listings in ((b"/d/a", 2), (b"/d/b", 0)):
-        listed = here.count(Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
-        await tree.rename(OTHER if name == b"/d/a" else b"/d/a", name)
-        now = here.count(Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
-        assert now - listed == listings
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])

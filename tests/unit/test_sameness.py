@@ -24,12 +24,11 @@ TABLE: list[tuple[str, Known, Seen, Sameness]] = [
     ("opened smaller", Known(SIZE), Opened(SIZE - 1), OTHER),
     ("opened equal", Known(SIZE), Opened(SIZE), SAME),
     ("opened larger", Known(SIZE), Opened(SIZE + 1), GREW),
-    ("opened, a listing tells its time", Known(SIZE), Opened(SIZE, tells_times=True), UNPROVEN),
     ("opened, its time is known", Known(SIZE, 5), Opened(SIZE), UNPROVEN),
     ("opened larger, its time is known", Known(SIZE, 5), Opened(SIZE + 1), UNPROVEN),
     ("opened after a restart", Known(SIZE, restarted=True), Opened(SIZE), UNPROVEN),
     ("opened larger after a restart", Known(SIZE, restarted=True), Opened(SIZE + 1), UNPROVEN),
-    ("opened smaller, whatever else", Known(SIZE, 5, restarted=True), Opened(SIZE - 1, True), OTHER),
+    ("opened smaller, whatever else", Known(SIZE, 5, restarted=True), Opened(SIZE - 1), OTHER),
     ("gone", Known(SIZE), NONE, OTHER),
     ("not in what came of a listing", Known(SIZE), PART, UNPROVEN),
     ("a directory", Known(SIZE), listed(kind=EntryKind.DIRECTORY), OTHER),
@@ -66,7 +65,7 @@ def rows() -> list[tuple[Known, Seen]]:
     knowns = [
         Known(SIZE, mtime, crc32, *flags) for mtime, crc32, flags in product(times, (None, 0, 7), FLAGS)
     ]
-    seens: list[Seen] = [Opened(size, told) for size, told in product(sizes, (False, True))]
+    seens: list[Seen] = [Opened(size) for size in sizes]
     seens += [listed(size, mtime, kind) for size, mtime, kind in product(sizes, times, EntryKind)]
     seens += [NONE, PART, *map(Summed, sums)]
     return list(product(knowns, seens))
