@@ -56,11 +56,15 @@ class _Connection:
         return self._drone is not None
 
     def _close_later(self) -> None:
-        if self._timer is not None:  # else each call of many threads would leave one
-            self._timer.cancel()
+        self._call_off()
         self._timer = threading.Timer(self._idle, self.close)
         self._timer.daemon = True
         self._timer.start()
+
+    def _call_off(self) -> None:
+        """End the thread that waits to close it: else each call, and each closed connection, leaves one."""
+        if self._timer is not None:
+            self._timer.cancel()
 
     def close(self) -> None:
         """Close it, unless it is used."""
@@ -70,6 +74,7 @@ class _Connection:
             if self._drone.has_open_files:
                 self._close_later()
                 return
+            self._call_off()
             self._drone.close()
             self._drone = None
 
