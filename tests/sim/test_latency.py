@@ -149,8 +149,11 @@ UPLOADS = [
         *(("far", "read"), ("far radio", "read")),
     )
 ]
-MUCH = (("px4", "fast", "ls"), ("px4", "far", "ls"), ("px4", "far", "read"))
-"""Of these many bytes are copied."""
+MUCH = (
+    *(("px4", "fast", "ls"), ("px4", "far", "ls"), ("px4", "far", "read"), ("px4", "slow", "read")),
+    ("px4-nuttx", "far", "ls"),
+)
+"""Of these many bytes are copied: they are left to the soak."""
 
 CASES = [
     pytest.param(*case, way, marks=pytest.mark.soak if case[0] in ALIKE or case in MUCH else ())

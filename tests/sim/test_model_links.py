@@ -199,7 +199,7 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
 
 
 @pytest.mark.holds("promise 3")
-@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES), soak=("px4", "ardupilot")))
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES), soak=("px4", "ardupilot", "mavsdk")))
 @settings(max_examples=1, phases=ONCE)
 @given(programs=st.lists(short, min_size=3, max_size=3), seed=st.integers(0, 99))
 def test_a_day_of_trouble_loses_no_byte(

@@ -13,6 +13,7 @@ from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from tests.support.memory import MemoryLink
 from tests.support.rigs import Rig, write_file
+from tests.support.takingturns import taking_turns
 from tests.support.transfers import ROOTS, content, path, read_file
 
 RTT = 0.3
@@ -172,7 +173,7 @@ async def upload(profile: str, victim: int) -> float:
 
 
 @pytest.mark.holds("rule 14.38")
-@pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
+@pytest.mark.parametrize("profile", taking_turns(("ardupilot", "mavsdk", "px4"), soak=("mavsdk",)))
 async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(profile: str) -> None:
     """Question or answer. It was asked for again after 6.3 s, where the whole copy takes one or two."""
     usual = await upload(profile, -1)

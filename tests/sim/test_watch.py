@@ -28,6 +28,7 @@ from mavftpfs.sim.vehicle import SimVehicle
 from tests.ops.faketree import session_of
 from tests.support.memory import MemoryLink
 from tests.support.rigs import Rig, wall
+from tests.support.takingturns import taking_turns
 from tests.support.transfers import content
 
 PLACES = {
@@ -138,7 +139,7 @@ def day(tmp_path: Path) -> Day:
 # -- flights --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("profile", PLACES)
+@pytest.mark.parametrize("profile", taking_turns(PLACES))
 async def test_each_log_of_three_flights_comes_once_whole_and_proven(tmp_path: Path, profile: str) -> None:
     day, flights = Day(tmp_path / "logs", profile), {}
     async with day.watched():
