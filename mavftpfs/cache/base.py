@@ -40,6 +40,8 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """
     while True:
         node.require_current()
+        if node.draft is not None:
+            await find_out(context, node.draft)
         if node.base_handle is None:
             opened = await open_node(context, node)
             if node.base_handle is None:
@@ -61,6 +63,19 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             ):
                 context.files.on_replaced(node.path)
             raise
+
+
+async def find_out(context: Context, draft: Draft) -> None:
+    """Find out by a listing whether changes of names that were not answered took the name away from the base.
+
+    Raises:
+        FileChanged: one did, so the draft is stale. Else as Directories.current.
+    """
+    for path in list(draft.base_if):
+        if await context.directories.current(path) is None:
+            draft.lose_base()
+            raise FileChanged(f"{path!r} is gone: what was changed here is another file by now")
+        draft.base_if.discard(path)
 
 
 async def fetch(context: Context, node: Node, draft: Draft) -> None:

@@ -366,10 +366,11 @@ class Deliverer:
         """Check that a new file's name is free, or that a base of which a part stays is still the same.
 
         Raises:
-            AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free and
-            Verifier.is_same.
+            AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free, base.find_out
+            and Verifier.is_same.
         """
         if draft.base is not None and draft.base_limit:
+            await base.find_out(self._context, draft)
             if not await self.verifier.is_same(node.path, draft.base):
                 draft.lose_base()
                 raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")
@@ -445,7 +446,6 @@ class Deliverer:
         node.generation += 1
         node.delivered_since_open = True
         node.proven_at = context.clock()
-        node.close_base()
         context.files.on_changed(node.path)
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:

@@ -351,20 +351,14 @@ class Files:
             self.kill(version)
 
     def on_changed(self, path: bytes) -> None:
-        """Note that we wrote or removed the file of a path. Handles of the old file open the path again."""
+        """Note that we wrote or removed the file of a path and those below it, or may have. Handles of
+        the old file open the path again."""
         for version in self._at_or_below(path):
             if self._current.get(version.path) is version:
                 del self._current[version.path]
             version.replace(f"{version.path!r} was changed here")
-
-    def on_unknown(self, path: bytes) -> None:
-        """Note that a path may have another file, or none, because a change of its name was interrupted. The
-        same holds for all paths below it. Open handles read nothing more, and the next open asks the vehicle.
-        """
-        self.on_changed(path)
         for node in self._nodes.below(path):
-            if not self._nodes.is_changing(node.path):
-                self.on_replaced(node.path)
+            node.close_base()
 
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns

@@ -316,7 +316,7 @@ class Names:
         for path in paths:
             self._context.directories.forget(path)
             self._context.directories.expire(split(path)[0])
-            self._context.files.on_unknown(path)
+            self._context.files.on_changed(path)
 
     # --- inside
 

@@ -122,6 +122,22 @@ class Namespace:
             if node is not None:
                 nodes.maybe_forget(node)
 
+    @asynccontextmanager
+    async def _looks_later(self, *paths: bytes) -> AsyncIterator[None]:
+        """If the outcome of the body is unknown, forget what these names were. If it happened, the first one
+        is gone: so what changes a file of these names, and is not delivered, looks for that one first."""
+        context = self._context
+        try:
+            yield
+        except (OutcomeUnknown, trio.Cancelled):  # perhaps it was done, and what follows it was not
+            self._names.on_unknown(*paths)
+            for node in [n for path in paths for n in context.nodes.below(path)]:
+                if node.undelivered and node.draft is not None:
+                    node.draft.base_if.add(paths[0])
+                else:
+                    context.files.on_replaced(node.path)
+            raise
+
     # --- inside: unlinking
 
     async def _unlink(self, path: bytes) -> None:
@@ -140,12 +156,13 @@ class Namespace:
         else:
             context.require_idle(path)
         await self._names.purge(path)
-        if there and node is not None and node.needs_card:
-            await self._hide(node)
-            return
-        if there:
-            await self._names.remove_if_there(path)
-            context.files.on_changed(path)
+        async with self._looks_later(path):
+            if there and node is not None and node.needs_card:
+                await self._hide(node)
+                return
+            if there:
+                await self._names.remove_if_there(path)
+                context.files.on_changed(path)
         if node is not None:
             context.nodes.unnamed(node)
 
@@ -207,19 +224,17 @@ class Namespace:
         await self._names.purge(old)
         keep = displaced is not None and displaced.needs_card
         try:
-            if listed is not None and listed.kind is EntryKind.FILE:
-                kept = await self._names.replace(old, new, keep_old=keep)
-                if kept is not None and displaced is not None:
-                    await self._on_hidden(displaced, kept)
-            else:
-                if listed is not None:
-                    await self._names.remove_directory(new)
-                await self._names.rename(old, new)
+            async with self._looks_later(old, new):
+                if listed is not None and listed.kind is EntryKind.FILE:
+                    kept = await self._names.replace(old, new, keep_old=keep)
+                    if kept is not None and displaced is not None:
+                        await self._on_hidden(displaced, kept)
+                else:
+                    if listed is not None:
+                        await self._names.remove_directory(new)
+                    await self._names.rename(old, new)
         except NotSupported as error:
             raise CrossDevice(str(error)) from error
-        except (OutcomeUnknown, trio.Cancelled):  # perhaps it was done, and what follows it was not
-            self._names.on_unknown(old, new)
-            raise
         if displaced is not None and not displaced.removed:
             context.nodes.unnamed(displaced)
 

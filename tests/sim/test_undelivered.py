@@ -28,6 +28,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NoSpace,
     NotDeliveredYet,
+    OutcomeUnknown,
     RequestTimeout,
     SpoolFailed,
 )
@@ -198,9 +199,14 @@ RENAMES = [
 """Which requests give a file its name instead of an old one."""
 
 
+def silence(here: Rig, *, carried_out: bool, nth: int) -> None:
+    """Fall silent at a rename."""
+    here.faults.at(Opcode.RENAME, lambda: fall_silent(here), nth=nth, drop=not carried_out)
+
+
 async def interrupt(here: Rig, file: OpenFile, *, carried_out: bool, nth: int) -> None:
     """Deliver it, and fall silent at a rename."""
-    here.faults.at(Opcode.RENAME, lambda: fall_silent(here), nth=nth, drop=not carried_out)
+    silence(here, carried_out=carried_out, nth=nth)
     with pytest.raises(MavftpfsError):
         await file.fsync()
 
@@ -286,6 +292,66 @@ async def test_an_old_file_that_is_kept_for_a_while_is_not_put_in_a_later_one_s_
         tree.forget_caches()
         await tree.list(b"/d")
         assert here.litter() == []
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("carried_out", [False, True])
+@pytest.mark.parametrize(
+    ("profile", "nth", "whole"),
+    [(*each, True) for each in RENAMES]
+    + [(profile, nth, False) for profile in ("px4", "mavsdk", "px4-nuttx", "ardupilot5") for nth in (1, 2)],
+)
+async def test_an_append_survives_a_rename_over_its_file_that_did_not_happen(
+    profile: str, nth: int, whole: bool, carried_out: bool
+) -> None:
+    """If it did happen, the append is refused: the file that has the name now is as large as the old one, and
+    listings need not tell times. Nor does the handle read that file."""
+    async with rig(
+        profile, {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)
+    ) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/other", b"found out how it renames")
+        file = await tree.open(FILE, write=True)
+        if whole:  # else the old file moves aside first, because a program has it open
+            await file.write(0, OLD)
+        await file.write(len(OLD), b"more")
+        silence(here, carried_out=carried_out, nth=nth)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        happened = here.files().get(FILE) == OLD[::-1]
+        if happened:
+            with pytest.raises(FileChanged):
+                await (file.fsync() if whole else file.read(0, 1000))
+            with pytest.raises(FileChanged):
+                await file.release()
+            assert here.data(FILE) == OLD[::-1]
+        else:
+            assert await file.read(0, 1000) == OLD[:1000]
+            await file.write(file.size, b" and more")
+            await file.release()
+            assert here.data(FILE) == OLD + b"more and more"
+        assert happened == (NEW not in here.files())
+
+
+@pytest.mark.parametrize("carried_out", [False, True])
+async def test_an_append_survives_a_removal_that_did_not_happen(carried_out: bool) -> None:
+    """The card cannot rename. If it did happen, the append is refused, as there is no file."""
+    async with rig("px4", {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        await file.write(0, OLD)
+        here.faults.at(Opcode.REMOVE_FILE, lambda: fall_silent(here), drop=not carried_out)
+        with pytest.raises(OutcomeUnknown):
+            await tree.unlink(FILE)
+        speak(here)
+        if carried_out:
+            with pytest.raises(FileChanged):
+                await file.release()
+        else:
+            await file.write(len(OLD), b"more")
+            await file.release()
+            assert here.files() == {FILE: OLD + b"more"}
 
 
 async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree: Tree) -> None:
