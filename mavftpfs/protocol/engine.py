@@ -62,8 +62,8 @@ class Engine:
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
         on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
             explains, and with the seconds since its request went out (0 where that is not known).
-        on_late_write: called when a WriteFile is ACKed that nothing waits for any more, and with the time at
-            which it went out first.
+        on_late: called with each ACK that nothing waits for any more, of a request that we repeated, and with
+            the time at which that went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -77,7 +77,7 @@ class Engine:
         *,
         op_deadline: float = OP_DEADLINE,
         on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None,
-        on_late_write: Callable[[float], None] = lambda sent_at: None,
+        on_late: Callable[[Payload, float], None] = lambda reply, sent_at: None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)
         self.session = self.home_session
@@ -85,7 +85,7 @@ class Engine:
         self.traits = Traits()
         self.stats = EngineStats()
         self._on_unexplained = on_unexplained
-        self._on_late_write = on_late_write
+        self._tell_late = on_late
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
@@ -234,8 +234,8 @@ class Engine:
 
     def _on_late(self, reply: Payload, sent_at: float) -> None:
         """An answer came that nothing waits for any more. sent_at: when its request went out first."""
-        if reply.opcode == Opcode.ACK and reply.req_opcode == Opcode.WRITE_FILE:
-            self._on_late_write(sent_at)
+        if reply.opcode == Opcode.ACK:
+            self._tell_late(reply, sent_at)
 
     def _on_replay(self, request: Request) -> None:
         """The server replays an earlier reply under this seq, so it will never answer this one (servers.md

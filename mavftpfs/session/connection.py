@@ -139,7 +139,7 @@ class Connection:
             flow,
             op_deadline=options.op_deadline,
             on_unexplained=self._on_unexplained,
-            on_late_write=self._on_late_write,
+            on_late=self._on_late,
         )
         self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, trace=trace)
         self.scheduler = Scheduler(
@@ -256,8 +256,8 @@ class Connection:
     def _on_unexplained(self, reply: Payload, late: float) -> None:
         self.scheduler.on_unexplained(reply, late)
 
-    def _on_late_write(self, sent_at: float) -> None:
-        self.scheduler.on_late_write(sent_at)
+    def _on_late(self, reply: Payload, sent_at: float) -> None:
+        self.scheduler.on_late(reply, sent_at)
 
     def _on_armed(self, armed: bool) -> None:
         self.scheduler.on_armed_changed()

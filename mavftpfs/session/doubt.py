@@ -27,7 +27,8 @@ class LateCopies:
     The copy of a request, carried out late, does to the name's next file what was meant for the last one: a
     REMOVE removes it, a RENAME takes it away. So a name rests after such a request: for twice the largest
     lateness, and a second at least. If no copy was seen for ten minutes, all are forgotten, and it does not
-    rest at all.
+    rest at all. But where we repeated such a request two were on the way, and the other one may come late on
+    any link. So after that the name rests as if a copy had come as late as the answer.
 
     A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
     CreateFile that comes even later empties the file, which is found when it is compared again under its
@@ -40,8 +41,9 @@ class LateCopies:
     def __init__(self) -> None:
         self._lateness = 0.0
         self._seen_at = -inf
-        # By name: when a request last concerned it, and until when it rests at least; the oldest in front.
-        self._names: dict[bytes, tuple[float, float]] = {}
+        # By name, the oldest in front: when a request last concerned it; until when it rests at least, where
+        # copies come late; until when on any link.
+        self._names: dict[bytes, tuple[float, float, float]] = {}
 
     def saw(self, lateness: float, now: float) -> None:
         """A copy was answered so many seconds after the request was sent first (0: that is not known)."""
@@ -50,11 +52,16 @@ class LateCopies:
 
     def on_changed(self, path: bytes, now: float) -> None:
         """A request took the file of this name away, or may have done so."""
-        self._note(path.lower(), now, now + LEAST_REST)
+        self._note(path.lower(), now, now + LEAST_REST, now)
+
+    def on_repeated(self, path: bytes, seconds: float, now: float) -> None:
+        """A request that may have taken the file of this name away was sent more than once, and answered so
+        many seconds after the first time."""
+        self._note(path.lower(), now, now, now + max(LEAST_REST, min(MOST_REST, 2 * seconds)))
 
     def on_made(self, path: bytes, now: float) -> None:
         """CreateFile made, or emptied, the file of this name."""
-        self._note(path.lower(), now, now)
+        self._note(path.lower(), now, now, now)
 
     def on_replaced(self, path: bytes) -> None:
         """The name got its file by a rename: a copy of that finds nothing to rename."""
@@ -62,15 +69,15 @@ class LateCopies:
 
     def rest(self, path: bytes, now: float) -> float:
         """Return for how many seconds more the name is not to be changed."""
-        if not self._is_fresh(now):
-            return 0.0
-        since, until = self._names.get(path.lower(), (-inf, -inf))
-        return max(0.0, until - now, since + min(MOST_REST, 2 * self._lateness) - now)
+        since, least, rests_until = self._names.get(path.lower(), (-inf, -inf, -inf))
+        if self._is_fresh(now):
+            rests_until = max(rests_until, least, since + min(MOST_REST, 2 * self._lateness))
+        return max(0.0, rests_until - now)
 
-    def _note(self, name: bytes, now: float, until: float) -> None:
+    def _note(self, name: bytes, now: float, least: float, on_any_link: float) -> None:
         """Note a request, and forget those that are too long ago to matter."""
-        _, before = self._names.pop(name, (now, now))
-        self._names[name] = now, max(until, before)
+        _, *before = self._names.pop(name, (now, now, now))
+        self._names[name] = now, max(least, before[0]), max(on_any_link, before[1])
         while now - next(iter(self._names.values()))[0] > MOST_REST:
             del self._names[next(iter(self._names))]
 

@@ -435,11 +435,15 @@ class Scheduler:
         if other:
             self.server.abandon()
 
-    def on_late_write(self, sent_at: float) -> None:
-        """A WriteFile was ACKed that nothing waits for any more, and that went out at that time. If that was
-        before the present file was opened, its bytes may be in this file, instead of its own."""
-        session = self.server.session
-        if session is not None and session.writing and sent_at < session.opened_at:
+    def on_late(self, reply: Payload, sent_at: float) -> None:
+        """An ACK came that nothing waits for any more, since we had repeated its request. sent_at: when that
+        went out first. An open may have put its file in the place of the present one; a WriteFile may have
+        put its bytes into a later file."""
+        server = self.server
+        if reply.req_opcode in OPENING:
+            if server.session is None or server.session.seq != reply.seq:
+                self.on_unexplained(reply, self.clock() - sent_at)
+        elif reply.req_opcode == Opcode.WRITE_FILE and sent_at < server.wrote_at:
             self.doubt.raise_it("a WriteFile came after its file was closed", reads=False)
 
     def _on_reads_doubted(self, reason: str) -> None:

@@ -150,6 +150,7 @@ class ServerSession:
         writes it now.
         maybe_open: files that may be open over there by our doing, by session id: a request was not answered
         yet, or never, or the session is not believed any more.
+        wrote_at: when the last file was opened for writing.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
         changed: where tasks park until something more is closed.
     """
@@ -170,6 +171,7 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
+        self.wrote_at = -inf
         self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
@@ -264,6 +266,8 @@ class ServerSession:
             resent=resent or operation.retransmitted,
         )
         self.engine.session = self.session.id
+        if self.session.writing:
+            self.wrote_at = self.session.opened_at
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
         """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or a late

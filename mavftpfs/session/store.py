@@ -305,20 +305,20 @@ class Store:
         """Remove what is known to be a file."""
         request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
         async with self._changing(path):
-            await self._perform(request, partial(self._is_absent, path))
+            await self._perform(path, request, partial(self._is_absent, path))
             self._scheduler.on_removed(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
         request = partial(Simple, Opcode.REMOVE_DIRECTORY, wire_path(path))
         async with self._changing(path, below=True):
-            await self._perform(request, partial(self._is_absent, path))
+            await self._perform(path, request, partial(self._is_absent, path))
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
         request = partial(Simple, Opcode.CREATE_DIRECTORY, wire_path(path))
         async with self._changing(path):
-            await self._perform(request, partial(self._is_new_directory, path))
+            await self._perform(path, request, partial(self._is_new_directory, path))
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; readers of the old path go on under the new one. completes: in flight, too."""
@@ -326,7 +326,9 @@ class Store:
         if len(data) > RENAME_ROOM:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
+            await self._perform(
+                old, partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new)
+            )
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
             self._late.on_replaced(new)
@@ -356,18 +358,22 @@ class Store:
 
     # --- did that change happen?
 
-    async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
-        """Run a request; look what became of it if its answer may not be that to its first execution."""
+    async def _perform(self, path: bytes, make: Callable[[], Simple], verify: Verdict) -> None:
+        """Run a request; look what became of it if its answer may not be that to its first execution. path:
+        the name that a late copy of it would harm."""
         for last in (False, True):
             self._under_way += 1
             self._sent += 1
+            began, repeated = self._clock(), False
             try:
-                await self._server.ask(make, changes=True)
+                repeated = (await self._server.ask(make, changes=True)).retransmitted
                 return
             except (FtpNak, RequestTimeout) as failure:
-                error = failure
+                error, repeated = failure, isinstance(failure, FtpNak) and failure.retransmitted
             finally:
                 self._under_way -= 1
+                if repeated:
+                    self._late.on_repeated(path, self._clock() - began, self._clock())
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(verify)
                 if outcome is Outcome.HAPPENED:

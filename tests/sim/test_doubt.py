@@ -22,7 +22,7 @@ from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support import rigs
-from tests.support.latecomers import Latecomer, come_again
+from tests.support.latecomers import Latecomer, come_again, come_late
 from tests.support.rigs import KINDS, RENAMING, Rig, rig, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySink, begin_to_read, content, path, put, read_file
@@ -73,6 +73,17 @@ def test_a_name_rests_for_ten_minutes_after_any_copy() -> None:
     late.saw(1.0, 500.0 + LASTS + 0.1)
     late.on_changed(b"/d/a", 500.0 + LASTS + 0.1)
     assert late.rest(b"/d/a", 500.0 + LASTS + 0.1) == 2.0, "those before are forgotten"
+
+
+def test_a_name_whose_request_was_repeated_rests_on_any_link() -> None:
+    late = LateCopies()
+    for seconds, expected in ((0.1, LEAST_REST), (2.0, 4.0), (30.0, MOST_REST)):
+        late.on_repeated(b"/d/a", seconds, 0.0)
+        late.on_changed(b"/d/a", 0.0)
+        assert late.rest(b"/d/A", 0.0) == expected
+    assert late.rest(b"/d/other", 0.0) == 0.0
+    late.on_replaced(b"/d/a")
+    assert late.rest(b"/d/a", 0.0) == 0.0
 
 
 def test_what_was_made_rests_no_longer_than_its_copy_may_be_late() -> None:
@@ -289,12 +300,13 @@ SWIFTEST = 2.5
 
 @pytest.mark.holds("rule 14.12")
 async def test_a_create_that_we_repeated_comes_after_the_file_was_compared() -> None:
-    """Our own repetition explains its answer, so there is no doubt; its copy empties what was compared."""
+    """The answer to the copy that empties what was compared gets lost, so there is no doubt."""
     here = Rig("px4", {b"/d": None}, CLEAN)
     async with here.mounted(b"/d") as tree:
         here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
         copy = Latecomer(here, Opcode.CREATE_FILE, after=Opcode.CALC_FILE_CRC32)
         here.faults.lose_reply_to(Opcode.CREATE_FILE)
+        here.faults.at(Opcode.CALC_FILE_CRC32, lambda: here.faults.lose_reply_to(Opcode.CREATE_FILE))
         await write_file(tree, b"/d/new", content(300))
         assert copy.late is not None
         assert not here.connection.store.in_doubt()
@@ -459,6 +471,60 @@ async def test_a_late_write_of_one_file_in_the_next(profile: str, verify: str) -
         assert copy.late is not None
         for name, number in ((b"two", 2), (b"three", 3)):
             assert here.data(b"/d/" + name) == content(200, number)
+
+
+@pytest.mark.holds("promise 2", "rule 14.12")
+@pytest.mark.parametrize("lateness", [0.24, 0.4, 0.8])
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("profile", taking_turns(RENAMING))
+async def test_a_change_of_a_name_that_we_repeated_comes_late(
+    profile: str, moves: bool, lateness: float
+) -> None:
+    """The repetition was ACKed, and the name has a new file."""
+    async with rig(profile, {b"/d/f": content(500, 1)}, link=LinkSettings(delay=0.01)) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        came = come_late(here, lateness, Opcode.RENAME if moves else Opcode.REMOVE_FILE)
+        if moves:
+            await tree.rename(b"/d/f", b"/d/f~")
+        else:
+            await tree.unlink(b"/d/f")
+        await write_file(tree, b"/d/f", content(400, 2))
+        assert came.is_set()
+        assert here.data(b"/d/f") == content(400, 2)
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("delay", [0.01, 0.1])
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk", "ardupilot5"])
+async def test_an_open_that_we_repeated_comes_late(profile: str, delay: float) -> None:
+    """It puts its file in the place of the one that is read."""
+    files = {b"/d/one": content(60_000, 1), b"/d/two": content(60_000, 2)}
+    for percent in range(100, 500, 20):
+        async with rig(profile, files, link=LinkSettings(delay=delay)) as here:
+            tree = here.mount()
+            await tree.list(b"/d")
+            assert await rigs.read_file(tree, b"/d/one") == files[b"/d/one"]
+            tree.forget_caches()
+            come_late(here, percent / 100 * (0.1 if delay < 0.1 else 0.4), Opcode.OPEN_FILE_RO)
+            for name, data in files.items():
+                assert await rigs.read_file(tree, name) == data
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "mavsdk"])
+async def test_a_write_that_we_repeated_comes_into_the_last_round_trip_of_the_next_file(profile: str) -> None:
+    """Its ACK comes when that file's Terminate is on its way. A file of this size is not compared unasked."""
+    for lateness in (0.385, 0.405, 0.425, 0.445):
+        async with rig(profile, {b"/d/k": b"x"}, link=LinkSettings(delay=0.025)) as here:
+            tree = here.mount(verify_max=1000)
+            for number in range(2):
+                await write_file(tree, b"/d/k%d" % number, content(100_000, 5))
+            come_late(here, lateness, Opcode.WRITE_FILE, nth=3)
+            for number in (1, 2):
+                await write_file(tree, b"/d/%d" % number, content(20_000, number))
+            for number in (1, 2):
+                assert here.data(b"/d/%d" % number) == content(20_000, number)
 
 
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])

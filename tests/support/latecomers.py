@@ -1,5 +1,5 @@
-"""Requests that the network delivers once more: at an exact place among those that came after them, or at an
-exact time.
+"""Requests that the network delivers late, or once more: at an exact place among those that came after them,
+or at an exact time.
 """
 
 from __future__ import annotations
@@ -54,6 +54,28 @@ class Latecomer:
                 self._here.link.kick()
         if wire[_OPCODE] == self._what and not (self._first and self._kept is not None):
             self._kept = (wire, now)
+
+
+def come_late(here: Rig, seconds: float, opcode: Opcode, nth: int = 1) -> trio.Event:
+    """Have the nth request of a kind executed only so long after it came; the event is set then."""
+    handle, left, came = here.server.handle, [nth], trio.Event()
+    here.faults.orphans = True
+
+    async def later(wire: bytes, source: Address) -> None:
+        await trio.sleep(seconds)
+        handle(wire, source, trio.current_time())
+        here.link.kick()
+        came.set()
+
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        left[0] -= wire[_OPCODE] == opcode
+        if wire[_OPCODE] == opcode and left[0] == 0:
+            here.nursery.start_soon(later, wire, source)
+        else:
+            handle(wire, source, now)
+
+    here.server.handle = on_request  # type: ignore[method-assign]
+    return came
 
 
 def come_again(here: Rig, seconds: float, chosen: Callable[[bytes], bool]) -> None:
