@@ -1,4 +1,4 @@
-"""fsspec: its own tests of file systems on three kinds of server, and what people use it for."""
+"""fsspec: its own tests of file systems, and what people use it for."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from mavftpfs.api import fs as fs_module
 from mavftpfs.api.fs import DroneFileSystem
 from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
+from tests.support.takingturns import taking_turns
 from tests.support.trees import content
 
 ROOTS = {"px4": "/", "ardupilot5": "/APM", "mavsdk": "/"}
@@ -28,9 +29,9 @@ pytestmark = pytest.mark.filterwarnings(
 )  # of the suite's own fixtures
 
 
-@pytest.fixture(scope="module", params=ROOTS)
+@pytest.fixture(scope="module", params=taking_turns(ROOTS, soak=("mavsdk",)))
 def place(request: pytest.FixtureRequest, module_field: Field) -> Iterator[tuple[DroneFileSystem, str]]:
-    """A vehicle of each kind, and the directory there that may be written."""
+    """A vehicle (in the soak one of each kind of server), and the directory there that may be written."""
     card = module_field.local("card")
     root = ROOTS[request.param].rstrip("/")
     (card / root.strip("/") / "tests").mkdir(parents=True)
