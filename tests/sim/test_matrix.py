@@ -7,8 +7,7 @@ What must hold, whatever happens and whenever:
 - In the end the card holds what a local disk would hold, nothing of ours beside it, and no session is open.
 - Each call ends in time.
 
-The daily run takes one request of each cell, on half of the servers one that changes a name; the soak takes
-all of them.
+The daily run takes one request of each cell; the soak takes all of them.
 """
 
 from __future__ import annotations
@@ -460,14 +459,14 @@ REQUESTS: dict[tuple[str, Call], list[int]] = {}
 
 
 async def sampled(profile: str, operation: Call, event: Event, place: Path) -> int:
-    """Return which request the daily run takes of a cell: on one half of the servers one that changes a name
-    (if any does), on the other half any one."""
+    """Return which request the daily run takes of a cell. It is one that changes a name, if there is one,
+    where a message is lost or doubled, and else on half of the servers; on the others it is any one."""
     if (profile, operation) not in REQUESTS:
         REQUESTS[profile, operation] = await meet(profile, operation, nothing, 0, place)
     every = range(1, len(REQUESTS[profile, operation]) + 1)
     changing = [number for number in every if REQUESTS[profile, operation][number - 1] in CHANGING]
     turn = crc32(f"{operation.__name__} {event.__name__}".encode()) + DAILY.index(profile)
-    numbers = changing if changing and turn % 2 else every
+    numbers = changing if changing and (turn % 2 or event in UNNOTICED) else every
     return numbers[crc32(f"{profile} {operation.__name__} {event.__name__}".encode()) % len(numbers)]
 
 
