@@ -96,33 +96,35 @@ class PathGate:
     """Keeps requests that carry a path out while an upload writes, and lets them in now and then.
 
     Attributes:
-        shut: they wait. waiting: how many do.
+        shut: they wait. waiting: how many do. inside: how many are let in, and not answered yet.
     """
 
     def __init__(self) -> None:
         self.shut = False
         self.waiting = 0
-        self._inside = 0
+        self.inside = 0
         self._changed = trio.lowlevel.ParkingLot()
 
     @asynccontextmanager
-    async def passing(self, on_shut: Callable[[], None]) -> AsyncIterator[None]:
-        """Wait to be let in, and stay inside for the length of the body. on_shut: called while the gate is
-        shut, to wake the upload that shut it."""
+    async def passing(self, wake: Callable[[], None]) -> AsyncIterator[None]:
+        """Wait to be let in, and stay inside for the length of the body. wake: wakes the upload that shut
+        the gate."""
         self.waiting += 1
         try:
             while self.shut:
-                on_shut()
+                wake()
                 await self._changed.park()
         finally:
             self.waiting -= 1
             self._changed.unpark_all()
-        self._inside += 1
+        self.inside += 1
         try:
             yield
         finally:
-            self._inside -= 1
+            self.inside -= 1
             self._changed.unpark_all()
+            if self.shut:
+                wake()
 
     def open(self) -> None:
         """Keep nobody out any longer."""
@@ -130,14 +132,12 @@ class PathGate:
         self._changed.unpark_all()
 
     async def let_in(self, seconds: float) -> None:
-        """Let requests in for at most so long, and wait until the last of them is out. Then it is shut."""
+        """Let requests in for at most so long. Then it is shut, and some may be inside."""
         self.open()
         with trio.move_on_after(seconds):
-            while self.waiting or self._inside:
+            while self.waiting or self.inside:
                 await self._changed.park()
         self.shut = True
-        while self._inside:
-            await self._changed.park()
 
 
 class ServerSession:

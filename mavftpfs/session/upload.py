@@ -325,6 +325,7 @@ class Upload(SessionUser):
                 transfer = WriteTransfer(
                     session.id, self._source, chunks, in_flight=most, on_starved=server.wake
                 )
+                transfer.paused = blocked or (gate.shut and gate.inside > 0)
                 self._transfer = server.transfer = transfer
                 stop = None
                 try:
@@ -340,9 +341,7 @@ class Upload(SessionUser):
                 if not is_blocked(error) or (blocked and not transfer.acked_bytes):
                     raise error
                 # From now on path operations take turns with uploads: first those under way end.
-                blocked = traits.paths_block_writes = True
-                await gate.let_in(0.0)
-                await self._unblock()
+                blocked = gate.shut = traits.paths_block_writes = True
         finally:
             gate.open()
 
@@ -355,7 +354,7 @@ class Upload(SessionUser):
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
         """Return the reason to let go; None if the transfer ended by itself."""
         server, gate, clock = self._server, self._server.path_gate, self._clock
-        fed_at = clock()
+        fed_at, let_in_at = clock(), -inf
         while not transfer.done:
             server.require_open(session)
             if not transfer.starved:
@@ -367,14 +366,18 @@ class Upload(SessionUser):
             stalled = closes and server.is_stalled(transfer)
             if stalled and stop is None:
                 stop = Stop.YIELD
-            transfer.paused = stop is not None or (gate.shut and gate.waiting > 0)
+            transfer.paused = stop is not None or (gate.shut and (transfer.paused or gate.waiting > 0))
             if stop is not None:
                 if transfer.idle or stalled or stop is Stop.ARMED or self._let_trail(transfer):
                     return stop
             elif transfer.paused and transfer.idle:
-                await gate.let_in(max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0)))
-                await self._unblock()
-                transfer.paused = False
+                paths_turn = max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0))
+                if gate.waiting and clock() - let_in_at >= 2.0 * paths_turn:
+                    let_in_at = clock()
+                    await gate.let_in(paths_turn)
+                if not gate.inside:  # a long listing or checksum: others go in, too, and may have the session
+                    await self._unblock()
+                    transfer.paused, let_in_at = False, -inf
             self._driver.kick()
             await server.sleep(BRIEF_STARVE if transfer.starved else _OFTEN)
         return None
