@@ -325,7 +325,7 @@ class ServerSession:
         """
         closed = False
         for session in list(self.maybe_open):
-            if session != 0 or not self._others_heard():
+            if session != 0 or self.clock() >= self.others.file_open_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
             self._forget(session)

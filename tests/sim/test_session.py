@@ -381,6 +381,45 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.parametrize("profile", ONE_SESSION)
+async def test_a_client_that_only_lists_does_not_keep_our_lost_open_open(profile: str) -> None:
+    """Its requests keep that session alive; it can only be ours."""
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+
+        async def rival_lists() -> None:
+            while True:
+                here.another_asks(Opcode.LIST_DIRECTORY, b"/")
+                await trio.sleep(0.05)
+
+        nursery.start_soon(rival_lists)
+        await trio.sleep(12.0)
+        here.faults.lose_reply_to(Opcode.OPEN_FILE_RO)
+        with trio.fail_after(5.0):
+            assert await read_file(connection, path(profile, "f")) == DATA
+        assert here.count(Opcode.RESET_SESSIONS) == 0
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("promise 6")
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
+async def test_the_file_that_another_client_opened_after_a_lost_open_of_ours_stays_open(profile: str) -> None:
+    """It got the session in place of what may be open by our doing."""
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection:
+        here.faults.at(Opcode.OPEN_FILE_RO, here.link.cut)
+        with trio.move_on_after(0.5):
+            await connection.store.stat_size(path(profile, "f"))
+        here.link.restore()
+        assert connection.scheduler.server.maybe_open
+        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
+        for _ in range(12):
+            await trio.sleep(1.0)
+            here.another_asks(Opcode.READ_FILE)
+        assert path(profile, "theirs") in here.server.open_paths
+        assert here.count(Opcode.TERMINATE_SESSION) == 0
+
+
 @pytest.mark.holds("promise 6")
 async def test_what_may_be_open_by_our_doing_does_not_keep_another_client_out() -> None:
     """ArduPilot refuses each of its requests. Each refusal keeps our session alive, and is news for us."""
