@@ -325,7 +325,8 @@ class ServerSession:
         """
         closed = False
         for session in list(self.maybe_open):
-            if session != 0 or self.clock() >= self.others.file_open_until:
+            # MAVSDK ends the session of another client, whatever id is asked for.
+            if self.engine.traits.ack_carries_own_session or self.clock() >= self.others.file_open_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
             self._forget(session)
