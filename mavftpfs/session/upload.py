@@ -97,6 +97,7 @@ class Upload(SessionUser):
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
         self._losses = 0  # of the session, without progress
         self._furthest = 0  # in the file, when the session was lost the last time
+        self._was_refused = False  # its file could not be opened again, or no size was told
 
     # --- the owner's side
 
@@ -247,7 +248,8 @@ class Upload(SessionUser):
     @property
     def _may_interrupt(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
-        return self._keeps_content or (self._engine.traits.wo_truncates is None and self._source.reached > 0)
+        to_tell = self._engine.traits.wo_truncates is None and not self._was_refused
+        return self._keeps_content or (to_tell and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
         """Let these callers go: everything that the source had when they began to wait is ACKed, and the file
@@ -282,21 +284,22 @@ class Upload(SessionUser):
         """Open an interrupted file to go on with it; None if it does not have what was proven.
 
         The first time in a mount that finds out what OpenFileWO does (docs/servers.md 8): the size tells,
-        asked afterwards, since the reply to OpenFileWO may say what it was before. What is not seen to keep
-        the file passes for emptying it.
+        asked afterwards, since the reply to OpenFileWO may say what it was before. A refusal says nothing of
+        the server: only this upload is not interrupted any more.
         """
         traits, reached = self._engine.traits, self._source.reached
         try:
             session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
             if traits.wo_truncates is None:
                 size = (await turn.open(self.path)).size
-                traits.wo_truncates = size is None or size < reached
-                if traits.wo_truncates:
+                if size is not None:
+                    traits.wo_truncates = size < reached
+                if not self._keeps_content:
+                    self._was_refused = True
                     return None
                 session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
         except FtpNak:  # the file is gone, or this server opens none like that
-            if traits.wo_truncates is None:
-                traits.wo_truncates = True
+            self._was_refused = True
             return None
         if session.size is None or session.size >= reached:
             return session

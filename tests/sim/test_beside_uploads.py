@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import Armed, FtpNak, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -283,6 +283,25 @@ async def test_uploads_that_alternate_fill_a_short_queue(count: int, link: LinkS
             data = content(60_000, number)
             nursery.start_soon(upload, here, b"%d" % number, data)
     assert trio.current_time() - began < most
+
+
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("times", [1, 99])
+async def test_an_upload_that_was_refused_to_go_on_begins_once_more_and_the_next_one_is_asked(
+    times: int,
+) -> None:
+    """One refusal says nothing of the server. If it refuses always, each upload asks once."""
+    data = content(60_000)
+    here = Rig("px4", FILES, PLAIN)
+    async with here.connected() as connection:
+        here.faults.refuse(Opcode.OPEN_FILE_WO, NakCode.FAIL_ERRNO, 5, times=times)
+        for beginnings in (2, 1 if times == 1 else 2):
+            async with under_way(connection, "px4", data) as source:
+                await read_brief(here)
+                assert not source.all_proven
+            assert source.all_proven
+            assert source.beginnings == beginnings
+            assert here.data(b"/d/new") == data
 
 
 # --- requests about other paths, on PX4's NuttX and elsewhere

@@ -460,8 +460,8 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
 @pytest.mark.parametrize("code", [NakCode.FILE_NOT_FOUND, NakCode.UNKNOWN_COMMAND])
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_file_that_cannot_be_opened_again_is_sent_again(probed: bool, code: NakCode) -> None:
-    """It is gone, or the server opens no file for writing without emptying it. Where that is not known, it is
-    not asked a second time."""
+    """It is gone, or the server opens no file for writing without emptying it. Whether it does stays as known
+    as it was."""
     async with uploading(content(3000), known=probed) as (here, source, upload):
         await upload.finish()
         here.faults.refuse(Opcode.OPEN_FILE_WO, code)
@@ -469,7 +469,7 @@ async def test_a_file_that_cannot_be_opened_again_is_sent_again(probed: bool, co
         upload.wake()
         await upload.finish()
         assert (source.all_proven, source.beginnings) == (True, 2)
-        assert here.connection.store.traits.wo_truncates is not probed
+        assert here.connection.store.traits.wo_truncates is (False if probed else None)
     assert here.card.data(b"/d/new") == bytes(source.content)
 
 
