@@ -71,11 +71,11 @@ async def find_out(context: Context, draft: Draft) -> None:
     Raises:
         FileChanged: one did, so the draft is stale. Else as Directories.current.
     """
-    for path in list(draft.base_if):
+    for path in list(draft.taken_if_gone):
         if await context.directories.current(path) is None:
             draft.lose_base()
             raise FileChanged(f"{path!r} is gone: what was changed here is another file by now")
-        draft.base_if.discard(path)
+        draft.taken_if_gone.discard(path)
 
 
 async def fetch(context: Context, node: Node, draft: Draft) -> None:

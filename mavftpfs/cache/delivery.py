@@ -369,8 +369,8 @@ class Deliverer:
             AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free, base.find_out
             and Verifier.is_same.
         """
+        await base.find_out(self._context, draft)
         if draft.base is not None and draft.base_limit:
-            await base.find_out(self._context, draft)
             if not await self.verifier.is_same(node.path, draft.base):
                 draft.lose_base()
                 raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")

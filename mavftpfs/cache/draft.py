@@ -121,8 +121,8 @@ class Draft:
         size: bytes, as programs see it.
         base: what is known of the file on the vehicle, None if there is none.
         base_limit: below this, bytes that are not held are the base's.
-        base_if: the base has the file's name only if the vehicle has a file at each of these paths: changes
-            of names were not answered, and would have taken them away.
+        taken_if_gone: if one of these paths is gone, a change of names that was not answered took the base's
+            name away.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
         sent_in_place: the file may exist under its own name because of us (cards that cannot rename).
@@ -133,7 +133,7 @@ class Draft:
         self.size = 0 if base is None else base.size
         self.base = base
         self.base_limit = self.size
-        self.base_if: set[bytes] = set()
+        self.taken_if_gone: set[bytes] = set()
         self.state = State.DIRTY if base is None else State.CLEAN
         self.sending: SendBuffer | None = None
         self.sent_in_place = False
@@ -281,7 +281,7 @@ class Draft:
             self.on(Event.COMMITS)
         self.on(Event.PLACED)
         self.base, self.base_limit = Known(self.size, crc32=crc32), self.size
-        self.base_if.clear()
+        self.taken_if_gone.clear()
         self.sent_in_place = False
         self.content.mark_unneeded()
 

@@ -360,6 +360,13 @@ class Files:
         for node in self._nodes.below(path):
             node.close_base()
 
+    async def make_way(self, path: bytes, entry: DirEntry) -> None:
+        """Another file, listed as `entry`, is about to get this path: nothing kept passes for it."""
+        if self.kept is not None:
+            for version in self._at_or_below(path):
+                version.kept = None
+            await self.kept.forget(path, entry)
+
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns
         it."""

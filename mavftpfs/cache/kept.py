@@ -119,6 +119,14 @@ class KeptCache:
             return None  # or it was listed anew, or changed by us, meanwhile
         return Kept(key)
 
+    async def forget(self, path: bytes, entry: DirEntry) -> None:
+        """Another file, listed as `entry`, is about to get this path: what is kept of one of the same path,
+        size and time would pass for it."""
+        key = key_of(self._identity(), path, entry, self._wall())
+        if key is not None and _is_dated(key):
+            indices = range(-(-key.size // BLOCK_SIZE))
+            await self._run(self._disk.remove, [key.block(*_extent(key.size, index)) for index in indices])
+
     async def _begins(self, key: FileKey) -> bool:
         """Return whether the first block of a file is kept."""
         return await self._run(self._disk.read, key.block(*_extent(key.size, 0))) is not None

@@ -18,6 +18,7 @@ import os
 import stat
 import struct
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
@@ -114,6 +115,12 @@ class KeptDisk:
         self._until_shrink -= len(data)
         if self._until_shrink <= 0:
             self.shrink()
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Keep blocks no longer."""
+        for name in names:
+            with suppress(OSError):
+                (self._path / name[:2] / name).unlink()
 
     def shrink(self) -> None:
         """If there is too much, remove the blocks not used for longest; and remove what crashed writers

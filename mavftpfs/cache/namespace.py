@@ -129,11 +129,12 @@ class Namespace:
         context = self._context
         try:
             yield
+            context.nodes.on_gone(paths[0])
         except (OutcomeUnknown, trio.Cancelled):  # perhaps it was done, and what follows it was not
             self._names.on_unknown(*paths)
             for node in [n for path in paths for n in context.nodes.below(path)]:
                 if node.undelivered and node.draft is not None:
-                    node.draft.base_if.add(paths[0])
+                    node.draft.taken_if_gone.add(paths[0])
                 else:
                     context.files.on_replaced(node.path)
             raise
@@ -202,6 +203,8 @@ class Namespace:
         for path in (old, new):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
+        if source.kind is EntryKind.FILE:
+            await context.files.make_way(new, source)
         await self._move(old, new, listed)
         if source.kind is EntryKind.DIRECTORY:
             context.directories.forget(old)

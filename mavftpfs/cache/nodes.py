@@ -184,6 +184,13 @@ class Nodes:
         """Return the nodes at a path and below it."""
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
 
+    def on_gone(self, path: bytes) -> None:
+        """A change of ours took this name away, and was answered: so none before it did
+        (`Draft.taken_if_gone`)."""
+        for node in self._by_path.values():
+            if node.draft is not None:
+                node.draft.taken_if_gone.discard(path)
+
     def maybe_forget(self, node: Node) -> None:
         """Forget a node if no program has it open and nothing of it is undelivered."""
         if not (node.handles or node.undelivered or node.lock.locked() or node.attempt):

@@ -159,7 +159,13 @@ class Cleaner:
                 self._on_found(known_target)
 
     async def _exists(self, path: bytes) -> bool:
+        """Return whether the vehicle has a file of this name.
+
+        Raises:
+            VehicleLost: only an old listing was to be had, in which we may have put the name ourselves.
+        """
         with suppress(NotFound, NotADirectory):
             await self._context.directories.find(path)
+            self._context.directories.require_heard()
             return True
         return False

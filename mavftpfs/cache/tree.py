@@ -373,8 +373,10 @@ class Tree:
             await self._require_parent(target)
             self._local.rename(source, target, noreplace=noreplace)
         else:
-            await self._writing.namespace.rename(source, target, noreplace=noreplace)
-            self._checksums.clear()  # two files may have one size and mtime
+            try:
+                await self._writing.namespace.rename(source, target, noreplace=noreplace)
+            finally:
+                self._checksums.clear()  # two files may have one size and mtime
             self._local.follow_rename(source, target)
 
     async def withdraw(self, path: bytes) -> bool | None:

@@ -436,9 +436,9 @@ class Scheduler:
             self.server.abandon()
 
     def on_late(self, reply: Payload, sent_at: float) -> None:
-        """An ACK came that nothing waits for any more, since we had repeated its request. sent_at: when that
-        went out first. An open may have put its file in the place of the present one; a WriteFile may have
-        put its bytes into a later file."""
+        """An ACK came that nothing waits for any more: its request was repeated, or is a WriteFile that was
+        cancelled. sent_at: when it went out first. An open may have put its file in the place of the present
+        one; a WriteFile may have put its bytes into a later file."""
         server = self.server
         if reply.req_opcode in OPENING:
             if server.session is None or server.session.seq != reply.seq:

@@ -525,6 +525,18 @@ async def test_also_one_that_it_took_right_behind_our_open() -> None:
     assert here.data(b"/d/its") == b""
 
 
+@pytest.mark.holds("fault duplicate")
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
+async def test_the_answer_to_an_open_that_was_cancelled_is_no_reason_for_doubt(profile: str) -> None:
+    here = Rig(profile, {b"/d/f": DATA}, LinkSettings(delay=0.1))
+    async with here.connected() as connection:
+        with trio.move_on_after(0.15):
+            await connection.store.stat_size(path(profile, "f"))
+        await trio.sleep(1.0)
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
+        assert not connection.store.in_doubt()
+
+
 async def test_then_the_caller_that_opens_a_file_still_waits() -> None:
     """It does not fall behind those that came later, and gets its error in time."""
     here = Rig("mavsdk", {b"/d/f": DATA}, LinkSettings(delay=0.02))

@@ -335,6 +335,55 @@ async def test_an_append_survives_a_rename_over_its_file_that_did_not_happen(
 
 
 @pytest.mark.parametrize("carried_out", [False, True])
+async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(carried_out: bool) -> None:
+    """Nothing of the old file was to stay, and the other file is nowhere else."""
+    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, b"new")
+        silence(here, carried_out=carried_out, nth=1)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        if carried_out:
+            with pytest.raises(FileChanged):
+                await file.release()
+            assert here.files() == {FILE: OLD[::-1]}
+        else:
+            await file.release()
+            assert here.files() == {FILE: b"new", NEW: OLD[::-1]}
+
+
+@pytest.mark.holds("promise 1")
+async def test_a_checksum_is_asked_for_again_after_a_rename_without_an_answer() -> None:
+    """Two files may have one size and time."""
+    async with rig("mavsdk", options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        here.put(FILE, OLD, 1_600_000_000)
+        here.put(NEW, OLD[::-1], 1_600_000_000)
+        tree = here.mount()
+        checksums = [await tree.crc32(path) for path in (FILE, NEW)]
+        silence(here, carried_out=True, nth=1)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        assert await tree.crc32(FILE) == checksums[1] != checksums[0]
+
+
+async def test_a_rename_that_did_not_happen_is_no_reason_once_its_file_went_otherwise() -> None:
+    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        await file.write(len(OLD), b"more")
+        silence(here, carried_out=False, nth=1)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        await tree.unlink(NEW)
+        await file.release()
+        assert here.files() == {FILE: OLD + b"more"}
+
+
+@pytest.mark.parametrize("carried_out", [False, True])
 async def test_an_append_survives_a_removal_that_did_not_happen(carried_out: bool) -> None:
     """The card cannot rename. If it did happen, the append is refused, as there is no file."""
     async with rig("px4", {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:

@@ -153,6 +153,18 @@ async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) ->
     handle.close()
 
 
+@pytest.mark.holds("promise 1")
+async def test_nor_is_what_was_kept_a_file_that_was_moved_to_its_name(mounts: Mounts) -> None:
+    """Of the same size and time, as copies and parameter files may be; nor in a later mount."""
+    other = content(len(DATA), seed=8)
+    mounts.here.put(b"/logs/b.bin", other, MTIME)
+    await mounts.read_and_settle()
+    tree = mounts.mount()
+    await tree.rename(b"/logs/b.bin", LOG)
+    assert await read_file(tree, LOG) == other
+    assert await read_file(mounts.mount(), LOG) == other
+
+
 async def test_what_is_kept_of_an_older_file_is_not_read_again(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     assert await read_file(mounts.mount(), LOG) == DATA
