@@ -2,14 +2,15 @@
 
 A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a description beside it,
 `NNNNNN.json`:
-- `path`: its path on the vehicle. Nothing more while a program writes, and no close was confirmed or refused;
+- `path`: its path on the vehicle; `system` and `uid`: which vehicle, `uid` null if it did not tell its id.
+  Nothing more while a program writes, and no close was confirmed or refused;
 - what `describe` tells of a file that could not be delivered;
 - `needed` false: the vehicle has all of it, or no program wants it any more.
 
 The description is written before the first byte. So the next mount can always say what it found, whenever the
 process was killed: `SpoolDirectory.rescue` moves both files to a recovery directory. A mount that ends moves
 there what it could not deliver. From there nothing is sent to a vehicle by itself, because the file on the
-vehicle may have changed since.
+vehicle may have changed since. And it may be another vehicle with the same system id.
 """
 
 from __future__ import annotations

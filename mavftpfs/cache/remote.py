@@ -187,6 +187,10 @@ class VehicleStore(RemoteStore, Protocol):
         """Return the vehicle's system and component id."""
         ...
 
+    def board(self) -> str | None:
+        """Return the unique id of the vehicle's board in hex, None if it did not tell one."""
+        ...
+
     async def write_whole(
         self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
     ) -> None:

@@ -39,10 +39,17 @@ class Spool:
     """
 
     def __init__(
-        self, *, spool_max: int, directory: Path | None = None, memory_max: Callable[[], int] = lambda: 0
+        self,
+        *,
+        spool_max: int,
+        directory: Path | None = None,
+        memory_max: Callable[[], int] = lambda: 0,
+        vehicle: Callable[[], Mapping[str, object]] = dict,
     ) -> None:
-        """`memory_max()` bytes in memory, `spool_max` on disk, in `directory` or one made when needed."""
+        """`memory_max()` bytes in memory, `spool_max` on disk, in `directory` or one made when needed.
+        `vehicle`: what each description says of the vehicle, as JSON holds it."""
         self.memory_max = memory_max
+        self.vehicle = vehicle
         self.in_memory = 0
         self.on_disk = 0
         self.full = False
@@ -171,6 +178,7 @@ class SpoolContent:
             raise SpoolFailed(f"{self._path} lost bytes that were in it")
         if self._durable:
             return str(self._path)
+        facts = {**facts, **self._spool.vehicle()}
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
         write_facts(self._path, facts, durable=True)
@@ -203,7 +211,7 @@ class SpoolContent:
         """
         facts: dict[str, Any] = {"needed": False}
         if self.name is not None and needed:
-            facts = {"path": self.name.decode(errors="surrogateescape")}
+            facts = {"path": self.name.decode(errors="surrogateescape"), **self._spool.vehicle()}
         if self._path is not None and facts != self._told:
             try:
                 write_facts(self._path, facts, durable=False)

@@ -87,6 +87,7 @@ class Writeback:
                 spool_max=options.spool_max,
                 directory=None if spool_directory is None else spool_directory.path,
                 memory_max=limit.bytes,
+                vehicle=lambda: {"system": store.address()[0], "uid": store.board()},
             ),
             retry_later=self._retry_later,
         )

@@ -393,7 +393,8 @@ def _recover_parser(name: str) -> Parser:
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="put back to there; default: list")
     parser.add_argument("names", metavar="FILE", nargs="*", help="a file or directory of the list")
     parser.add_argument("--all", action="store_true", help="all files of the list")
-    parser.add_argument("--force", action="store_true", help="also over a file that was changed since")
+    more = "also over a file that was changed since; with FILE also to another vehicle"
+    parser.add_argument("--force", action="store_true", help=more)
     parser.add_argument("--json", action="store_true", help="list as JSON")
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")

@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -425,13 +426,18 @@ def recover(args: Args) -> int:
         how = "was there already" if there_already else "is on the vehicle now, verified"
         print(f"{_name(kept.path or b'')} {how}; the copy here is removed", flush=True)
 
-    async def work(session: Session) -> None:
+    async def work(session: Session) -> list[recovering.Kept]:
         async with noting_losses(session, bar):
-            await recovering.put_back(session, wanted, bar, tell, force=args.force)
+            return await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
     with shown(bar):
-        with_session(args, work, writing=True)
-    return ExitCode.OK
+        others = with_session(args, work, writing=True)
+    for vehicle, count in Counter(kept.vehicle for kept in others).items():
+        say(
+            f"{count} file(s) of {vehicle} stay here: this is another vehicle; "
+            "give theirs as SOURCE, or name a file and --force"
+        )
+    return ExitCode.INCOMPLETE if others else ExitCode.OK
 
 
 def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
@@ -445,6 +451,7 @@ def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
             directory = kept.file.parent
             print(f"{directory}:")
         belongs = "?" if kept.path is None else _name(kept.path)
+        belongs += f" on {kept.vehicle}" if kept.vehicle else ""
         at = kept.facts.get("at")
         when = f", {datetime.fromtimestamp(at):%Y-%m-%d %H:%M}" if isinstance(at, int | float) else ""
         reason = kept.hindrance or kept.facts.get("error") or ""

@@ -74,18 +74,20 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
 
 
 def rescue(spool: SpoolDirectory, source: str) -> str:
-    """Move the files that a killed mount of this vehicle left to a recovery directory; return a line on them,
-    or ""."""
+    """Move the files that a killed mount of this vehicle, or of another one with its system id, left to a
+    recovery directory; return a line on them, or ""."""
     directory = recovery_directory(source)
     try:
         found = spool.rescue(directory)
     except OSError as exc:
-        message = f"an earlier mount left files that did not reach the vehicle in {spool.path.parent}: {exc}"
+        message = (
+            f"an earlier mount left files that did not reach their vehicle in {spool.path.parent}: {exc}"
+        )
     else:
         if not found:
             return ""
         message = (
-            f"{len(found)} file(s) of an earlier mount did not reach the vehicle; they are in {directory}; "
+            f"{len(found)} file(s) of an earlier mount did not reach their vehicle; they are in {directory}; "
             + put_back_by(source, directory)
         )
     return message

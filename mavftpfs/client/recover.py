@@ -2,7 +2,8 @@
 
 A mount that ends with undelivered files moves them below `recovered`, with a `NAME.json` beside each file
 (cache.recovery). The next mount moves there what a killed mount held. Nothing is put back by itself, because
-the file on the vehicle may have changed since.
+the file on the vehicle may have changed since. A file of another vehicle is put back only if a person names
+the file itself, and insists.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import trio
+
+from mavftpfs.client.connect import VERSION_PATIENCE
 from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import NO_CHECKSUM, local_crc32
@@ -27,13 +31,20 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.model import EntryKind, normalise
 from mavftpfs.shared.readable import name_text
 
+_TICK = 0.05
+"""Seconds between two questions whether the vehicle told its unique id."""
+
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """A file that did not reach the vehicle. facts: what was written down about it, as JSON holds it."""
+    """A file that did not reach the vehicle.
+
+    facts: what was written down about it, as JSON holds it. named: a person named this file itself.
+    """
 
     file: Path
     facts: Mapping[str, Any] = field(default_factory=dict)
+    named: bool = False
 
     @property
     def path(self) -> bytes | None:
@@ -45,6 +56,21 @@ class Kept:
     def size(self) -> int:
         """Bytes of the local copy."""
         return self.file.stat().st_size
+
+    @property
+    def vehicle(self) -> str:
+        """The vehicle it is of, for people; "" if that was not written down."""
+        return _vehicle_text(self.facts)
+
+    def is_of_another(self, vehicle: Mapping[str, Any]) -> bool:
+        """Return whether it is of another vehicle than this one (as in `status --json`). False if one of them
+        has no unique id.
+
+        A board may have a long id and a short one, and only the short one goes over MAVLink 1. After one of
+        them the other counts as another board's.
+        """
+        mine, other = self.facts.get("uid"), vehicle.get("uid")
+        return bool(mine and other and mine != other)
 
     @property
     def hindrance(self) -> str:
@@ -60,7 +86,16 @@ class Kept:
         path = None if self.path is None else name_text(self.path)
         error, at = self.facts.get("error"), self.facts.get("at")
         facts = {"file": str(self.file), "path": path, "size": self.size, "error": error, "at": at}
-        return {**facts, "hindrance": self.hindrance or None}
+        vehicle = {"system": self.facts.get("system"), "uid": self.facts.get("uid")}
+        return {**facts, **vehicle, "hindrance": self.hindrance or None}
+
+
+def _vehicle_text(facts: Mapping[str, Any]) -> str:
+    """Return a vehicle for people: its system id and its unique id; "" if no system id is known."""
+    system, uid = facts.get("system"), facts.get("uid")
+    if system is None:
+        return ""
+    return f"vehicle {system} (id {uid})" if uid else f"vehicle {system}"
 
 
 # -- what there is --------------------------------------------------------------------------------
@@ -118,7 +153,7 @@ def chosen(names: Sequence[str], base: Path) -> list[Kept]:
             continue
         if not path.is_file():
             raise UsageError(f"{name} is nothing that was kept; `mavftpfs recover` lists what is")
-        found += [kept for kept in kept_in(path.parent) if kept.file.name == path.name]
+        found += [replace(kept, named=True) for kept in kept_in(path.parent) if kept.file.name == path.name]
     return found
 
 
@@ -132,15 +167,19 @@ async def put_back(
     tell: Callable[[Kept, bool], None],
     *,
     force: bool,
-) -> None:
+) -> list[Kept]:
     """Put files where they belonged. Once it is proven that the vehicle has a file, the copy here is removed.
 
     tell: called for each file, with whether it was there already. force: also replace a file that is not the
-    one they were to replace.
+    one they were to replace, and put files that a person named on another vehicle than theirs.
+
+    Returns those of other vehicles, which stay here.
 
     Raises:
         UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
     """
+    others = await _of_others(session, wanted, force=force)
+    wanted = [kept for kept in wanted if kept not in others]
     for kept in wanted:
         if kept.hindrance:
             raise UsageError(
@@ -156,6 +195,30 @@ async def put_back(
                 raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
         _forget(kept)
         tell(kept, there_already)
+    return others
+
+
+async def _of_others(session: Session, wanted: Sequence[Kept], *, force: bool) -> list[Kept]:
+    """Return the files that are of another vehicle. force: but not those that a person named.
+
+    Raises:
+        UsageError: a person named one of them.
+    """
+    if not any(kept.facts.get("uid") for kept in wanted):
+        return []
+    vehicle = (await session.status())["vehicle"]
+    with trio.move_on_after(VERSION_PATIENCE):
+        while vehicle["firmware"] is None:  # it is told together with the unique id
+            await trio.sleep(_TICK)
+            vehicle = (await session.status())["vehicle"]
+    others = [kept for kept in wanted if kept.is_of_another(vehicle) and not (kept.named and force)]
+    for kept in others:
+        if kept.named:
+            here = _vehicle_text(vehicle)
+            raise UsageError(
+                f"{kept.file} is of {kept.vehicle}, and this is {here}; --force puts it here all the same"
+            )
+    return others
 
 
 def _in_session(session: Session, kept: Kept) -> bytes:

@@ -250,6 +250,10 @@ class Store:
         address = self._vehicle.address
         return (1, 1) if address is None else (address.system, address.component)
 
+    def board(self) -> str | None:
+        """Return the unique id of the vehicle's board (see VehicleStore)."""
+        return None if self._vehicle.version is None else self._vehicle.version.board
+
     async def write_whole(
         self, path: bytes, pieces: Sequence[bytes], progress: Callable[[int], None] | None = None
     ) -> None:

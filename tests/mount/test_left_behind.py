@@ -17,7 +17,7 @@ from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 
-LINE = re.compile(r"1 file\(s\) of an earlier mount did not reach the vehicle; they are in ([^;\n]+)")
+LINE = re.compile(r"1 file\(s\) of an earlier mount did not reach their vehicle; they are in ([^;\n]+)")
 
 
 def test_a_mount_that_fails_takes_no_news_away(

@@ -14,9 +14,9 @@ import pytest
 from mavftpfs.client.control import find_socket, own_directories
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
-from tests.mount.test_writing_ends import QUICK, holding
+from tests.mount.test_writing_ends import QUICK, holding, told
+from tests.support.mounts import abort_mount, wait_until
 from tests.support.mounts import command as run
-from tests.support.mounts import wait_until
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
 
@@ -135,8 +135,8 @@ def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path
     assert directory.stat().st_mode & 0o777 == 0o700
     heading, line = run("recover")[0].splitlines()
     assert heading == f"{directory}:"
-    assert line.startswith("  lost.bin for /lost.bin, 60.0 kB, 20")
     (facts,) = json.loads(run("recover", "--json")[0])
+    assert line.startswith(f"  lost.bin for /lost.bin on vehicle 1 (id {facts['uid']}), 60.0 kB, 20")
     assert (facts["file"], facts["path"], facts["size"]) == (f"{directory}/lost.bin", "/lost.bin", 60_000)
     assert facts["hindrance"] is None
     assert not (card / "lost.bin").exists(), "never by itself"
@@ -171,6 +171,55 @@ def test_what_changed_since_is_replaced_only_by_force_and_what_is_there_is_not_s
     assert (card / "changed").read_bytes() == b"somebody else's"
     assert "/same was there already" in run("recover", source, "--all", "--force")[0]
     assert ((card / "changed").read_bytes(), (card / "same").stat().st_mtime) == (b"kept here", 1)
+    assert list(state.iterdir()) == []
+
+
+@pytest.mark.holds("promise 3")
+def test_a_file_is_put_on_another_vehicle_only_by_its_name_and_force(
+    field: Field, data: Path, state: Path
+) -> None:
+    """`--all` and directories mean files of the vehicle, and those of which that is not known."""
+    mount = field.mount(field.sim(field.local("card"), "ardupilot5").source)
+    mount.run("cp", data, mount.path / "no?such*name", code=None)
+    process, mount.process = mount.alive(), None
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == ExitCode.UNDELIVERED
+    (directory,) = state.iterdir()
+    (facts,) = json.loads(run("recover", "--json")[0])
+    assert (facts["system"], len(facts["uid"])) == (1, 16)
+    card = field.local("card")
+    other = field.sim(card, options=("--system", "2")).source
+    keep(state, unknown={"path": "/unknown", "whole": True})
+    stays = f"mavftpfs: 1 file(s) of vehicle 1 (id {facts['uid']}) stay here: this is another vehicle; "
+    for words in (("--all",), (directory,), ("--all", "--force")):
+        assert stays in run("recover", other, *words, code=ExitCode.INCOMPLETE)[1]
+    assert [path.name for path in card.iterdir()] == ["unknown"]
+    _, said = run("recover", other, facts["file"], code=ExitCode.USAGE)
+    assert f"is of vehicle 1 (id {facts['uid']}), and this is vehicle 2 (id " in said
+    assert len(list(card.iterdir())) == 1
+    run("recover", other, facts["file"], "--force")
+    assert (card / "no?such*name").read_bytes() == data.read_bytes()
+    assert list(state.iterdir()) == []
+
+
+@pytest.mark.holds("promise 3")
+def test_what_was_held_for_another_vehicle_of_the_same_system_id_waits_for_that_one(
+    field: Field, data: Path, state: Path
+) -> None:
+    """The mount was killed, and the next one finds it: PX4's system id is 1 wherever it is fresh."""
+    mount, vehicle, card = holding(field, data)
+    vehicle.left_alone = True
+    mount.kill()
+    abort_mount(mount.path)
+    vehicle.kill()
+    others = field.local("card")
+    second = field.mount(field.sim(others, options=("--seed", "5")).source)
+    assert (told(second.alive()) / "lost.bin").read_bytes() == data.read_bytes()
+    assert "of vehicle 1 (id " in run("recover", second.path, "--all", code=ExitCode.INCOMPLETE)[1]
+    assert list(others.iterdir()) == []
+    vehicle.start()
+    run("recover", vehicle.source, "--all")
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
     assert list(state.iterdir()) == []
 
 

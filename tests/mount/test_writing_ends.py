@@ -25,7 +25,7 @@ from tests.support.trees import content
 from tests.support.vehicles import Process, SimVehicle
 
 QUICK = ("op_deadline=6",)
-RECOVERED = re.compile(r"did not reach the vehicle; they are (?:kept )?in (.+?); put them back by: ")
+RECOVERED = re.compile(r"did not reach the\w* vehicle; they are (?:kept )?in (.+?); put them back by: ")
 
 WRITER = """
 import errno, os, sys, time

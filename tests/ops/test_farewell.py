@@ -111,7 +111,7 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     dead.close()
     spool = SpoolDirectory(base, random.Random(2))
     line = leftovers.rescue(spool, "tcp:x:1")
-    assert line.startswith("1 file(s) of an earlier mount did not reach the vehicle; they are in ")
+    assert line.startswith("1 file(s) of an earlier mount did not reach their vehicle; they are in ")
     place = line.rpartition(" in ")[2].partition("; ")[0]
     assert [path.read_bytes() for path in Path(place).iterdir()] == [b"held"]
     assert line.endswith(f"; put them back by: mavftpfs recover tcp:x:1 {place}")

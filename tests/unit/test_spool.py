@@ -190,6 +190,18 @@ def test_the_name_is_written_down_before_the_first_byte(tmp_path: Path) -> None:
     assert facts == {"path": "/card/log.bin"}
 
 
+@pytest.mark.parametrize("close", [False, True])
+def test_the_description_names_the_vehicle_whenever_it_is_written(tmp_path: Path, close: bool) -> None:
+    vehicle = {"system": 1, "uid": "0123456789abcdef"}
+    spool = Spool(spool_max=1 << 20, directory=tmp_path, vehicle=lambda: vehicle)
+    content = SpoolContent(spool, b"/card/log.bin")
+    content.put(0, b"so far")
+    if close:
+        content.persist({"path": "/card/log.bin", "size": 6})
+    facts = json.loads((tmp_path / "000001.json").read_text())
+    assert {name: facts.get(name) for name in vehicle} == vehicle
+
+
 def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:
     directory, content = spilled(tmp_path)
     content.cut(0)
