@@ -212,8 +212,8 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     async def settle(self, path: bytes) -> None:
-        """Return when no late copy of the CreateFile of this name is to be feared any more: at once, unless
-        copies were seen to come late."""
+        """Return when no late copy of a request that concerned this name is to be feared any more: at once,
+        unless copies were seen to come late, or we repeated such a request (session.doubt: LateCopies)."""
         ...
 
     async def create_empty(self, path: bytes) -> None:

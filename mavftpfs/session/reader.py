@@ -140,6 +140,7 @@ class FileStream(SessionUser):
                     await self._open(turn)
                     await self._read(turn)
             except SessionLost as error:  # the next turn goes on at the same offset (promise 5)
+                # The turn is over, but nothing was awaited since: nobody else has opened a file yet.
                 server.lose(error)
                 self._lost += 1
                 if self._lost > REOPENS:

@@ -96,8 +96,8 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        waiting_since: since when a caller waits for what it does; None if there is only readahead. The user
-            sets it, and it ends with the turn.
+        waiting_since: since when it wants more than readahead; None if it does not. A caller waits for that
+            (`awaited`), or none does: uploads in the background. The user sets it; it ends with the turn.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -123,7 +123,7 @@ class SessionUser:
         return False
 
     def on_queued(self) -> None:
-        """It waits for another reason than the vehicle's silence."""
+        """It goes on waiting, because others have the session: the vehicle is not silent."""
 
     def on_removed(self) -> None:
         """The file of its path was removed or replaced."""

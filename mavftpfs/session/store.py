@@ -3,7 +3,8 @@
 Did that change happen? A request whose answer was lost is sent again, may be carried out twice, and is then
 refused the second time (docs/servers.md 14.4). So after such a refusal, and after a silence, a listing tells
 whether the change happened. While there is doubt (session.doubt) the network may also have doubled a request
-that we sent once. Then names rest between two changes: `settle` is the one place that waits for late copies.
+that we sent once. Where copies of requests came late, names rest between two changes (LateCopies): `settle`
+is the one place that waits for that.
 """
 
 from __future__ import annotations

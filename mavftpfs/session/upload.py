@@ -309,8 +309,8 @@ class Upload(SessionUser):
     # --- writing
 
     async def _write(self, turn: Turn, session: OpenSession) -> Stop:
-        """Write until there is a reason to stop. The session is open then, and what is in flight waits for
-        nothing but its answers: `_end_transfer` follows when the session is closed.
+        """Write until there is a reason to stop. The session is open then. A trailing transfer still waits
+        for its answers: `_close` ends it.
 
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.

@@ -27,7 +27,8 @@ class SendBuffer:
     Attributes:
         todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
             bytes ACKed before it was last closed. All other bytes are on their way.
-        closed: a Terminate was ACKed, so the card has the proven bytes.
+        closed: a Terminate was ACKed since the file was begun, so the card has the proven bytes; the file may
+            be open again.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
         reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
