@@ -139,9 +139,9 @@ class Names:
     # --- changing
 
     async def remove(self, path: bytes) -> None:
-        """Remove a file. Raises as VehicleStore."""
+        """Remove a file. Raises as VehicleStore. A reserved name is used once, so it does not rest before."""
         async with self._changing(path):
-            await self._context.store.remove(path)
+            await self._context.store.remove(path, at_once=is_reserved(split(path)[1]))
         self._context.directories.put(path, None)
 
     async def remove_if_there(self, path: bytes) -> None:

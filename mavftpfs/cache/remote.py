@@ -220,8 +220,9 @@ class VehicleStore(RemoteStore, Protocol):
         """Make an empty file, or empty it: CreateFile + Terminate."""
         ...
 
-    async def remove(self, path: bytes) -> None:
-        """Remove what is known to be a file."""
+    async def remove(self, path: bytes, *, at_once: bool = False) -> None:
+        """Remove what is known to be a file. at_once: without `settle`, because the name is not used again: a
+        late copy of CreateFile could only leave an empty file there."""
         ...
 
     async def make_directory(self, path: bytes) -> None:

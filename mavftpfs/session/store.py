@@ -306,10 +306,10 @@ class Store:
         """Wait until a late copy of an earlier request does this name no harm (session.doubt: LateCopies)."""
         await trio.sleep(self._late.rest(path, self._clock()))
 
-    async def remove(self, path: bytes) -> None:
+    async def remove(self, path: bytes, *, at_once: bool = False) -> None:
         """Remove what is known to be a file."""
         request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
-        async with self._changing(path):
+        async with self._changing(path, at_once=at_once):
             await self._perform(path, request, partial(self._is_absent, path))
             self._scheduler.on_removed(path)
 
@@ -340,16 +340,16 @@ class Store:
 
     @asynccontextmanager
     async def _changing(
-        self, *paths: bytes, below: bool = False, in_flight: bool = False
+        self, *paths: bytes, below: bool = False, in_flight: bool = False, at_once: bool = False
     ) -> AsyncIterator[None]:
         """Check that writing is allowed now, and keep our own session off the paths.
 
-        below: also off all that lies below the first. in_flight: armed or not.
+        below: also off all that lies below the first. in_flight: armed or not. at_once: no name rests before.
         """
         self._vehicle.require(self._clock(), writing=not in_flight)
         with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
             async with self._scheduler.excluded(*paths, below=below):
-                for path in paths:
+                for path in () if at_once else paths:
                     await self.settle(path)
                 # closing our session may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)

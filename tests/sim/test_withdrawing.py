@@ -111,3 +111,24 @@ async def test_what_others_write_too_is_theirs(here: Rig, tree: Tree) -> None:
     assert await file.give_up() is None
     await other.release()
     assert here.data(FRESH) == b"ourstheirs"
+
+
+async def test_a_listing_does_not_wait_because_its_requests_came_late(here: Rig, tree: Tree) -> None:
+    """Names rest after late copies, for up to ten seconds, but not a reserved name that is only removed.
+    (ArduPilot refuses the listing for 3 s: one of these requests opened a file.)"""
+    handle, held = here.server.handle, []
+    here.faults.orphans = True
+    here.server.handle = lambda *request: held.append(request)  # type: ignore[method-assign]
+    file = await opened(tree, FRESH)
+    await file.write(0, NEW)
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+    await file.give_up()
+    here.server.handle = handle  # type: ignore[method-assign]
+    for wire, source, _ in held:
+        handle(wire, source, trio.current_time())
+    here.link.kick()
+    await trio.sleep(0.1)
+    began = trio.current_time()
+    await tree.list(b"/d")
+    assert trio.current_time() - began < 4.0
