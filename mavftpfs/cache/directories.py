@@ -23,7 +23,6 @@ Callers ask about a directory, or about one name in it, and say how good the ans
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
@@ -38,8 +37,14 @@ from mavftpfs.cache.attributes import tidy
 from mavftpfs.cache.options import DIR_TIMEOUT, CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
+from mavftpfs.shared.errors import (
+    FtpNak,
+    ListingIncomplete,
+    NotADirectory,
+    NotFound,
+    PathTooLong,
+    VehicleLost,
+)
 from mavftpfs.shared.model import (
     DOT,
     ROOT,
@@ -278,26 +283,17 @@ class Directories:
     async def find(self, path: bytes) -> Found:
         """Return what is known of a path below the root.
 
-        If an incomplete listing lacks a name, it is opened as a file: there is no other way to ask.
-
         Raises:
-            NotFound: its parent's listing does not show it.
-            NotADirectory: a part of the path is a file. Else as RemoteStore.list_directory and open_reader.
+            NotFound: its parent's listing does not show it. ListingIncomplete: nor does it prove anything.
+            NotADirectory: a part of the path is a file. Else as RemoteStore.list_directory.
         """
         if path.count(b"/") > MAX_DEPTH:
             raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
         parent, name = split(path)
         directory = await self.get(parent)
         entry = directory.entries.get(name)
-        if entry is None and not directory.complete and name:
-            self.require_heard()
-            try:
-                entry = DirEntry(name, EntryKind.FILE, await self._store.stat_size(path))
-            except FtpNak as nak:
-                if errno_for(nak) != errno.ENOENT:
-                    raise
-            else:
-                directory.entries.setdefault(name, entry)
+        if entry is None and not directory.complete:
+            raise ListingIncomplete(f"{path!r} is not in what is known of its directory", [])
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
