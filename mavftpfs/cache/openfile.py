@@ -83,10 +83,6 @@ class OpenFile:
         self.close()
         return True
 
-    def undo_open(self) -> None:
-        """Close, because the call that opened the file failed. If that call made the file, it goes, too."""
-        self.close()
-
     def close(self) -> None:
         """Close without delivering; what was not delivered is kept for later. Twice is harmless."""
         raise NotImplementedError

@@ -141,7 +141,7 @@ class Writeback:
                 if made:
                     node.begin_draft(context.spool, None, context.clock())
                     context.touch(path)
-                return WriteFile(self._parts, node, made=made)
+                return WriteFile(self._parts, node)
         if exclusive:
             raise AlreadyExists(f"{path!r} exists")
         return await self.open(path, truncate=False)

@@ -178,10 +178,8 @@ class WriteFile(ReadFile):
 
     writable = True
 
-    def __init__(self, parts: Parts, node: Node, *, made: bool = False) -> None:
-        """`made`: there was no such file before."""
+    def __init__(self, parts: Parts, node: Node) -> None:
         super().__init__(parts, node)
-        self._made = made
         if not node.writers:
             node.delivered_since_open = False
         node.writers += 1
@@ -232,15 +230,6 @@ class WriteFile(ReadFile):
             return await self._parts.deliverer.withdraw(self._node)
         finally:
             await self._let_go()
-
-    def undo_open(self) -> None:
-        """Close, also after release; see OpenFile.undo_open."""
-        self.close()
-        node = self._node
-        wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
-        if self._made and not wanted and node.undelivered and node.draft is not None and not node.draft.size:
-            node.forget_draft()  # no program learnt of the new file
-        self._context.nodes.maybe_forget(node)
 
     # --- inside
 

@@ -209,7 +209,7 @@ class Operations(pyfuse3.Operations):
         path = self._child(parent_inode, name)
         exclusive = bool(flags & os.O_EXCL)
         file = await self._tree.create(path, exclusive=exclusive, program=lambda: program_of(ctx.pid))
-        with closed_on_failure(file.undo_open):
+        with closed_on_failure(file.close):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
@@ -342,8 +342,7 @@ class Operations(pyfuse3.Operations):
             raise FUSEError(errno.EPERM)
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=True)
-        with closed_on_failure(file.undo_open):
-            await file.release()
+        await file.release()
         return await self._new_entry(path, mode)
 
     @handler

@@ -80,10 +80,6 @@ class FakeFile:
         data = memoryview(self.content)[offset : offset + size]
         return data[: self.tree.short_read] if self.tree.short_read is not None else data
 
-    def undo_open(self) -> None:
-        self.tree.calls.append(("undo_open", self.path))
-        self.closed = True
-
     def close(self) -> None:
         self.closed = True
 

@@ -257,7 +257,7 @@ async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(succe
             await writer.fsync()
         assert here.data(PATH) == successor
         assert here.litter() == []
-        writer.undo_open()
+        writer.close()
 
 
 @pytest.mark.parametrize("profile", TIMED)

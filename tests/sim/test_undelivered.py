@@ -91,35 +91,6 @@ async def test_a_checksum_is_the_vehicle_s_or_none(here: Rig, tree: Tree) -> Non
     await file.release()
 
 
-async def test_a_file_whose_creation_failed_does_not_appear_later(here: Rig, tree: Tree) -> None:
-    file = await tree.create(NEW, exclusive=True)
-    fall_silent(here)
-    with pytest.raises(RequestTimeout):
-        await file.release()
-    file.undo_open()
-    assert tree.undelivered() == []
-    speak(here)
-    await trio.sleep(100)
-    assert here.files() == {FILE: OLD}
-
-
-async def test_a_file_whose_creation_failed_stays_if_somebody_wrote_it_or_it_was_there(
-    here: Rig, tree: Tree
-) -> None:
-    file = await tree.create(NEW, exclusive=True)
-    other = await tree.open(NEW, write=True)
-    await other.write(0, b"abc")
-    file.undo_open()
-    assert tree.undelivered() == [NEW]
-    other.close()
-    (await tree.create(NEW, exclusive=False)).undo_open()
-    (await tree.open(FILE, write=True, truncate=True)).close()
-    (await tree.create(FILE, exclusive=False)).undo_open()
-    assert sorted(tree.undelivered()) == [FILE, NEW]
-    assert await tree.drain(100) == []
-    assert here.files() == {NEW: b"abc", FILE: b""}
-
-
 @pytest.mark.parametrize("end", ["flush", "release"])
 async def test_an_upload_of_what_was_taken_back_is_called_off(end: str) -> None:
     async with rig("mavsdk", {FILE: OLD}) as here:
