@@ -31,9 +31,6 @@ log = logging.getLogger("mavftpfs.cache")
 PIECE = 64 * 1024
 """Bytes that are read back at once."""
 
-READ_TRIES = 3
-"""How often a file is read back at most. It is read again if another FTP client was active meanwhile."""
-
 
 class Verifier:
     """Compares files. Counts for status: comparisons by CRC32, by reading back and by size alone, and
@@ -56,8 +53,8 @@ class Verifier:
 
         Raises:
             VerificationFailed: the vehicle has another file or none, or told no CRC32 although verify=crc.
-            Armed: a CRC32 is not asked for in flight. SessionBusy: another client was active each time the
-            file was read back. Else as VehicleStore.stat_size.
+            Armed: a CRC32 is not asked for in flight. SessionBusy: another client was active while the file
+            was read back. Else as VehicleStore.stat_size.
         """
         options, crc32 = self._context.options, None
         if options.verify == "none" and not doubted:
@@ -127,32 +124,29 @@ class Verifier:
         """Compare byte by byte.
 
         Raises:
-            VerificationFailed: the card has other bytes. SessionBusy: each time another client was active, or
+            VerificationFailed: the card has other bytes. SessionBusy: another client was active meanwhile, or
             the server ended the session. Else as RemoteStore.open_reader.
         """
         context = self._context
-        for _ in range(READ_TRIES):
-            blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
-            version = Version(blocks, path)  # past every cache
-            version.reader = reader = await context.store.open_reader(path, version)
-            version.size = reader.size
-            try:
-                same = version.size == draft.size
-                at = 0
-                while same and at < draft.size and not version.ignores_data:
-                    stop = min(at + PIECE, draft.size)
-                    reader.want(at, stop, demand=True)
-                    await version.wait_for(at, stop)
-                    same = version.get(at, stop) == draft.local_bytes(at, stop)
-                    at = stop
-            except FileChanged:
-                same = False
-            finally:
-                version.close_reader()
-            if not version.ignores_data:
-                break
-        else:
-            raise SessionBusy(f"whenever {path!r} was read back, what was read became doubtful")
+        blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
+        version = Version(blocks, path)  # past every cache
+        version.reader = reader = await context.store.open_reader(path, version)
+        version.size = reader.size
+        try:
+            same = version.size == draft.size
+            at = 0
+            while same and at < draft.size and not version.ignores_data:
+                stop = min(at + PIECE, draft.size)
+                reader.want(at, stop, demand=True)
+                await version.wait_for(at, stop)
+                same = version.get(at, stop) == draft.local_bytes(at, stop)
+                at = stop
+        except FileChanged:
+            same = False
+        finally:
+            version.close_reader()
+        if version.ignores_data:
+            raise SessionBusy(f"while {path!r} was read back, what was read became doubtful")
         if not same:
             raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
         self.counts["verified_by_reading"] += 1
