@@ -2,7 +2,7 @@
 
 A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is the token of the mount that made
 it, SSS counts, and the kind k is
-  n  what is sent of a file, perhaps incomplete (version 0.1 used t for some of these);
+  n  what is sent of a file, perhaps incomplete;
   o  the old file of NAME, moved aside until the new one has its name;
   d  a file that was unlinked while a program has it open.
 It lies beside the file that it belongs to. Only o tells its NAME, if that fits: a rename carries both paths
@@ -33,7 +33,7 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntod])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([nod])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
 _OWNER_LENGTH = 4
 
@@ -87,7 +87,7 @@ def parse(name: bytes) -> Reserved | None:
     if match is None:
         return None
     owner, kind, serial, target = match.groups()
-    return Reserved(owner, Kind(kind.replace(b"t", b"n")), serial, target)
+    return Reserved(owner, Kind(kind), serial, target)
 
 
 def new_owner(rng: Random) -> bytes:
