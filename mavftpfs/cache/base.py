@@ -39,7 +39,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
         FileChanged: it is another file by now. Else as Files.open and VersionHandle.read.
     """
     while True:
-        node.require_current()
+        node.require_not_stale()
         if node.draft is not None:
             await find_out(context, node.draft)
         if node.base_handle is None:
@@ -69,10 +69,10 @@ async def find_out(context: Context, draft: Draft) -> None:
     """Find out by a listing whether changes of names that were not answered took the name away from the base.
 
     Raises:
-        FileChanged: one did, so the draft is stale. Else as Directories.current.
+        FileChanged: one did, so the draft is stale. Else as Directories.ask_entry.
     """
     for path in list(draft.taken_if_gone):
-        if await context.directories.current(path) is None:
+        if await context.directories.ask_entry(path) is None:
             draft.lose_base()
             raise FileChanged(f"{path!r} is gone: what was changed here is another file by now")
         draft.taken_if_gone.discard(path)

@@ -256,15 +256,15 @@ class Deliverer:
         draft.
 
         Raises:
-            As Directories.current, Verifier.check and Verifier.is_same.
+            As Directories.ask_entry, Verifier.check and Verifier.is_same.
         """
         context, path = self._context, node.path
-        there, record = await context.directories.current(path), context.unfinished.get(path)
+        there, record = await context.directories.ask_entry(path), context.unfinished.get(path)
         if there is None and record is not None and record.aside is not None:
             with suppress(FtpNak):  # the cleaner was faster, or it is gone
                 await self._names.rename(record.aside, path, completes=True)
                 record.placed = False
-            there = await context.directories.current(path)
+            there = await context.directories.ask_entry(path)
         if draft.whole and there is None:
             draft.base, draft.base_limit = None, 0
         elif draft.whole and record is not None and record.placed is None:

@@ -18,7 +18,7 @@ Callers ask about a directory, or about one name in it, and say how good the ans
 |---|---|---|
 | what is remembered, however old; costs nothing | `known` | `entry` |
 | fresh, and any while the vehicle is lost: for programs | `get` | `find` |
-| listed since a moment: before something is changed or believed | `ask` | `current` |
+| listed since a moment: before something is changed or believed | `ask` | `ask_entry` |
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ class Directories:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
 
-    async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
+    async def ask_entry(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
         """Return what the vehicle has at a path, whatever drafts say. It is listed now, or was listed at most
         `within` seconds ago; longer where listings take long (LOOK_FACTOR).
 

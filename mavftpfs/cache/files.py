@@ -100,7 +100,7 @@ class Files:
         self._directories = directories
         self._invalidate = invalidate
         self.paths = PathLocks(cache.patience)
-        self._current: OrderedDict[bytes, Version] = OrderedDict()
+        self._newest: OrderedDict[bytes, Version] = OrderedDict()  # by path
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self.reopening: SingleFlight[Version, None] = SingleFlight()
@@ -130,9 +130,9 @@ class Files:
     async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
         """Return the version to serve, and whether it was served before."""
         entry, fresh = found.entry, self._clock() < found.directory.fresh_until
-        version = self._current.get(path)
+        version = self._newest.get(path)
         if version is not None and self._still_right(version, found, fresh):
-            self._current.move_to_end(path)
+            self._newest.move_to_end(path)
             return version, True
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
         if kept is not None:
@@ -175,7 +175,7 @@ class Files:
         version.prove(self._clock())
         if entry.size == reader.size:
             version.mtime = entry.mtime
-        old = self._current.get(path)
+        old = self._newest.get(path)
         if old is not None and compare(old.known, Opened(reader.size)) is Sameness.OTHER:
             self.kill(old)
         self._replace(version)
@@ -192,7 +192,7 @@ class Files:
         Raises:
             DataUnproven: it shows another size. NotFound; else as RemoteStore.list_directory.
         """
-        entry = await self._directories.current(path)
+        entry = await self._directories.ask_entry(path)
         if entry is None:
             raise NotFound(f"{path!r} does not exist any more")
         if entry.size != size:
@@ -222,12 +222,12 @@ class Files:
         version.reader = reader
 
     def _replace(self, version: Version) -> None:
-        old = self._current.pop(version.path, None)
+        old = self._newest.pop(version.path, None)
         if old is not None and not old.handles:
             old.clear()
-        self._current[version.path] = version
-        if len(self._current) > MAX_CLOSED:
-            surplus = next((v for v in self._current.values() if not v.handles and v is not version), None)
+        self._newest[version.path] = version
+        if len(self._newest) > MAX_CLOSED:
+            surplus = next((v for v in self._newest.values() if not v.handles and v is not version), None)
             if surplus is not None:
                 self._forget(surplus)
 
@@ -306,7 +306,7 @@ class Files:
     def kill(self, version: Version) -> None:
         """Make a version REPLACED, and with the newest one of a path all older ones."""
         path = version.path
-        newest = self._current.get(path) in (version, None)
+        newest = self._newest.get(path) in (version, None)
         older = [v for v in self.open_versions if newest and v.path == path]
         for one in dict.fromkeys((version, *older)):
             if not one.replaced:
@@ -322,24 +322,24 @@ class Files:
 
     def forget_pages(self, path: bytes) -> None:
         """Drop the kernel's pages of a path: they may be of a file that had it before."""
-        current = self._current.get(path)
-        if current is not None:
-            current.in_kernel = False
+        newest = self._newest.get(path)
+        if newest is not None:
+            newest.in_kernel = False
         self._invalidate(path)
 
     def _on_doubt(self, version: Version) -> None:
         """Drop the kernel's pages of a version whose bytes were dropped."""
         version.in_kernel = False
-        current = self._current.get(version.path) is version
-        if current or version in self.open_versions:
+        newest = self._newest.get(version.path) is version
+        if newest or version in self.open_versions:
             self._invalidate(version.path)
-        if current and not version.handles:
+        if newest and not version.handles:
             self._forget(version)  # opening it again costs less than comparing it with a listing
 
     def rebooted(self) -> None:
         """Forget all proofs. Open files are compared before more of their bytes are given out."""
         self._restarted_at = self._clock()
-        for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
+        for version in dict.fromkeys((*self._newest.values(), *self.open_versions)):
             version.on_restart(self._restarted_at)
 
     # --- we changed the file ourselves
@@ -354,8 +354,8 @@ class Files:
         """Note that we wrote or removed the file of a path and those below it, or may have. Handles of
         the old file open the path again."""
         for version in self._at_or_below(path):
-            if self._current.get(version.path) is version:
-                del self._current[version.path]
+            if self._newest.get(version.path) is version:
+                del self._newest[version.path]
             version.replace(f"{version.path!r} was changed here")
         for node in self._nodes.below(path):
             node.close_base()
@@ -384,19 +384,19 @@ class Files:
         """Note that a file, or a directory with all below it, has another path now; open files follow."""
         self.on_changed(new)
         for version in self._at_or_below(old):
-            current = self._current.get(version.path) is version
-            if current:
-                del self._current[version.path]
+            newest = self._newest.get(version.path) is version
+            if newest:
+                del self._newest[version.path]
             version.close_reader()
             version.path = new + version.path[len(old) :]
             version.ask_again()
-            if current:
-                self._current[version.path] = version
+            if newest:
+                self._newest[version.path] = version
 
     def _at_or_below(self, path: bytes) -> list[Version]:
         """Return the versions, older ones too, of a path and of all paths below it."""
         found, below = [], path + b"/"
-        for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
+        for version in dict.fromkeys((*self._newest.values(), *self.open_versions)):
             if version.path == path or version.path.startswith(below):
                 found.append(version)
         return found
@@ -411,20 +411,20 @@ class Files:
         del self.open_versions[version]
         version.close_reader()
         version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
-        if self._current.get(version.path) is not version:
+        if self._newest.get(version.path) is not version:
             version.clear()
         elif version.replaced or version.proven_at == NEVER:
             self._forget(version)
 
     def forget_closed(self) -> None:
         """Drop everything that is not open."""
-        for version in list(self._current.values()):
+        for version in list(self._newest.values()):
             if not version.handles:
                 self._forget(version)
 
     def _forget(self, version: Version) -> None:
         version.clear()
-        del self._current[version.path]
+        del self._newest[version.path]
 
 
 class VersionHandle(OpenFile):

@@ -2,7 +2,7 @@
 
 Servers check little before they change a name. RemoveFile removes an empty directory where the server calls
 remove(3). On NuttX a rename moves into a directory. A rename may replace a file that others made (servers.md
-9, 14.34). So the vehicle is asked what has a name before the name is changed (`Directories.current`).
+9, 14.34). So the vehicle is asked what has a name before the name is changed (`Directories.ask_entry`).
 
 The session finds out whether a change happened. Here the remembered listings are updated.
 
@@ -72,7 +72,7 @@ class Names:
         context = self._context
         beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
         if beside and context.store.traits.wo_truncates:
-            entry = await context.directories.current(path)
+            entry = await context.directories.ask_entry(path)
             if entry is not None:
                 return entry.size
         try:
@@ -96,7 +96,7 @@ class Names:
             if errno_for(nak) == errno.ENOENT:
                 return True
             # Other numbers may be those of an older refusal.
-            return not perhaps_directory and await self._context.directories.current(path) is None
+            return not perhaps_directory and await self._context.directories.ask_entry(path) is None
         return False
 
     async def require_new(self, path: bytes) -> None:
@@ -230,7 +230,7 @@ class Names:
                 store.traits.rename_works = True
         except FtpNak as nak:
             log.debug("an empty file beside %r was refused: %s", near, nak)
-            if place == second and await context.directories.current(second) is None:
+            if place == second and await context.directories.ask_entry(second) is None:
                 store.traits.rename_works = False
         finally:
             own.in_use -= {first, second}
@@ -333,7 +333,7 @@ class Names:
                 moved = True
             except FtpNak as nak:
                 gone = errno_for(nak) == errno.ENOENT
-                if not gone or await self._context.directories.current(target) is not None:
+                if not gone or await self._context.directories.ask_entry(target) is not None:
                     raise
                 moved = False
             await self.rename(source, target, completes=moved)

@@ -146,7 +146,7 @@ class Namespace:
         draft = None if node is None else node.draft
         if node is not None:
             await self._deliverer.abandon(node)
-        entry = await context.directories.current(path, within=RECENT)
+        entry = await context.directories.ask_entry(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # a file of others under its name is not to be removed
             there &= draft.base is not None or draft.sent_in_place or context.unfinished.is_unknown(path)
@@ -181,7 +181,7 @@ class Namespace:
     async def _rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         context = self._context
         wire_path(new)
-        listed = await context.directories.current(new, within=RECENT)
+        listed = await context.directories.ask_entry(new, within=RECENT)
         target = listed or await self._context.entry(new)
         source = await self._context.entry(old)
         if source is None:

@@ -118,8 +118,8 @@ class Node:
         if self.removed and not self.hidden:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
-    def require_current(self) -> None:
-        """Raise FileChanged if another file has its name."""
+    def require_not_stale(self) -> None:
+        """Raise FileChanged if its draft is stale: others replaced the base."""
         if self.draft is not None and self.draft.state is State.STALE:
             raise FileChanged(f"{self.path!r} is another file by now")
 

@@ -86,12 +86,12 @@ class Verifier:
         """Return whether a file on the vehicle is still the base.
 
         Raises:
-            As VehicleStore.stat_size and Directories.current.
+            As VehicleStore.stat_size and Directories.ask_entry.
         """
         context, options = self._context, self._context.options
         timed = context.directories.tells_times or base.mtime is not None
         if timed:
-            entry = await context.directories.current(path)
+            entry = await context.directories.ask_entry(path)
             if compare(base, Listed(entry)) in (Sameness.OTHER, Sameness.GREW):
                 return False
         if base.crc32 is not None and base.size <= options.verify_max and options.verify in ("auto", "crc"):

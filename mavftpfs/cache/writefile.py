@@ -86,7 +86,7 @@ class ReadFile(OpenFile):
             state = (node.generation, node.draft)
             try:
                 if node.removed:
-                    node.require_current()
+                    node.require_not_stale()
                 if self._handle is not None and state == (self._generation, None):
                     return await self._handle.read(offset, size)
                 return await self._read_changed(offset, size)
@@ -190,7 +190,7 @@ class WriteFile(ReadFile):
         await self._have_room(stop)
         async with node.lock:
             self._context.require_disarmed()
-            node.require_current()
+            node.require_not_stale()
             assert node.draft is not None
             self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
             node.draft.write(offset, data)
@@ -252,7 +252,7 @@ class WriteFile(ReadFile):
     async def _truncate(self, node: Node, size: int) -> None:
         self._context.require_disarmed()
         if node.removed or size:
-            node.require_current()
+            node.require_not_stale()
         assert node.draft is not None
         if size == node.draft.size:
             return
