@@ -41,7 +41,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     while True:
         node.require_not_stale()
         if node.draft is not None:
-            await find_out(context, node.draft)
+            await require_base_there(context, node.draft)
         if node.base_handle is None:
             opened = await open_node(context, node)
             if node.base_handle is None:
@@ -65,11 +65,12 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             raise
 
 
-async def find_out(context: Context, draft: Draft) -> None:
-    """Find out by a listing whether changes of names that were not answered took the name away from the base.
+async def require_base_there(context: Context, draft: Draft) -> None:
+    """Check by listings that the base of a draft still has its name. Costs nothing unless changes of names
+    were not answered.
 
     Raises:
-        FileChanged: one did, so the draft is stale. Else as Directories.ask_entry.
+        FileChanged: one of them took the name away, so the draft is stale. Else as Directories.ask_entry.
     """
     for path in list(draft.taken_if_gone):
         if await context.directories.ask_entry(path) is None:

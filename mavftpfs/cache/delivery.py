@@ -320,13 +320,13 @@ class Deliverer:
         # With `inplace` the card may have no room for both files, so it is found out before any file.
         overwrites = context.options.inplace and draft.base is not None
         if traits.rename_works is None and (draft.size >= START_AT or overwrites):
-            await self._names.find_out(path)
+            await self._names.learn_rename_works(path)
             self._require_deliverable(draft)
         in_place = traits.rename_works is False  # then it is sent under its own name
         begun_at = context.clock()
         try:
             if in_place:
-                await self._require_expected(node, draft)
+                await self._require_untouched(node, draft)
             else:
                 path = context.own.beside(node.path, Kind.NEW)
                 context.own.in_use.add(path)
@@ -349,12 +349,12 @@ class Deliverer:
         is computed.
 
         Raises:
-            As Verifier.check and _require_expected.
+            As Verifier.check and _require_untouched.
         """
         # A second CreateFile may have emptied the file, and later writes hide that from its size.
         doubted = self._context.store.in_doubt(attempt.begun_at) or attempt.upload.made_twice
         compare = partial(self.verifier.check, attempt.path, draft, doubted=doubted)
-        look = partial(self._require_expected, node, draft)
+        look = partial(self._require_untouched, node, draft)
         if draft.size <= SHORT:
             crc32 = await together(compare, look)
         else:
@@ -362,14 +362,15 @@ class Deliverer:
             await look()
         return crc32
 
-    async def _require_expected(self, node: Node, draft: Draft) -> None:
-        """Check that a new file's name is free, or that a base of which a part stays is still the same.
+    async def _require_untouched(self, node: Node, draft: Draft) -> None:
+        """Check that others left the name alone: a new file's is free, and a base of which a part stays is
+        still the same.
 
         Raises:
-            AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free, base.find_out
-            and Verifier.is_same.
+            AlreadyExists. FileChanged: the draft is stale from now on. Else as base.require_base_there,
+            Names.is_free and Verifier.is_same.
         """
-        await base.find_out(self._context, draft)
+        await base.require_base_there(self._context, draft)
         if draft.base is not None and draft.base_limit:
             if not await self.verifier.is_same(node.path, draft.base):
                 draft.lose_base()
@@ -430,7 +431,7 @@ class Deliverer:
                 record.sent = sent
                 draft.on(Event.NOT_PLACED)
             if unproven and isinstance(error, VerificationFailed):
-                await self._names.find_out(path)
+                await self._names.learn_rename_works(path)
             raise
         store.traits.rename_works = True
 

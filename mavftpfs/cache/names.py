@@ -192,7 +192,7 @@ class Names:
         except FtpNak as nak:
             taken = nak.code == NakCode.FILE_EXISTS
             if store.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
-                await self.find_out(old)
+                await self.learn_rename_works(old)
                 if store.traits.rename_works is False:
                     raise NotSupported("this server cannot rename") from nak
             if taken and not over:
@@ -200,16 +200,16 @@ class Names:
             raise
         self._context.directories.rename(old, new)
 
-    async def find_out(self, near: bytes) -> None:
-        """Find out with an empty file of ours whether the card can rename (`Traits.rename_works`). near: a
-        path beside which it is made.
+    async def learn_rename_works(self, near: bytes) -> None:
+        """Learn with an empty file of ours whether the card can rename (`Traits.rename_works`). near: a path
+        beside which it is made.
 
         The refusal of another file's rename does not tell: its error number proves nothing (servers.md 12),
         and the card may refuse only that name. An ACK does not tell either. So the file is removed under its
         new name: if that works, the rename worked.
 
         Raises:
-            As VehicleStore, but FtpNak. Also if nothing is raised, nothing may have been found out.
+            As VehicleStore, but no FtpNak: after a refusal the trait may be as unknown as before.
         """
         context, store, own = self._context, self._context.store, self._context.own
         try:

@@ -497,7 +497,7 @@ class Scheduler:
         """Nobody can use the session now: close it in time, and wait for news."""
         server, news_in = self.server, inf
         if self._queue and now < self.others_until:
-            await server.find_out_sessions()
+            await server.learn_several_sessions()
             for user in self._queue:
                 user.on_queued()
             news_in = max(0.0, self.others_until - now)

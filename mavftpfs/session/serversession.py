@@ -385,8 +385,10 @@ class ServerSession:
             else:
                 return operation
 
-    async def find_out_sessions(self) -> None:
-        """Ask something while another client has a session: an ArduPilot that has no other refuses it."""
+    async def learn_several_sessions(self) -> None:
+        """Learn whether the server has several sessions (`Traits.several_sessions`) while another client has
+        one: an ArduPilot with a single session refuses a listing then. Asks at most every LEFT_OPEN seconds.
+        """
         now, traits = self.clock(), self.engine.traits
         ours = self.others.session == self.engine.home_session
         if not traits.ack_carries_own_session or ours or now - self._asked_sessions_at < LEFT_OPEN:
