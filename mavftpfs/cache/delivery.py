@@ -192,7 +192,7 @@ class Deliverer:
             there: bool | None = None if node.delivered_since_open else False
             try:
                 if context.unfinished.is_unknown(node.path):
-                    await self._settle_unfinished(node, draft)
+                    await self._end_unfinished(node, draft)
                     if not node.undelivered:
                         return True
                 await self.abandon(node)
@@ -233,7 +233,7 @@ class Deliverer:
             in_place = store.traits.rename_works is False
             try:
                 if self._context.unfinished.is_unknown(node.path):
-                    await self._settle_unfinished(node, draft)
+                    await self._end_unfinished(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
                 return
@@ -251,9 +251,9 @@ class Deliverer:
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
 
-    async def _settle_unfinished(self, node: Node, draft: Draft) -> None:
-        """Find out by a listing what has the name after interrupted renames, and compare that file with the
-        draft.
+    async def _end_unfinished(self, node: Node, draft: Draft) -> None:
+        """End the record of a replacement that was interrupted: a listing tells whether the name has a file,
+        and that is compared with the draft.
 
         Raises:
             As Directories.ask_entry, Verifier.check and Verifier.is_same.
@@ -293,7 +293,7 @@ class Deliverer:
         await attempt.upload.finish()
         if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        await self._context.store.settle(attempt.path)
+        await self._context.store.let_rest(attempt.path)
         crc32 = await self._compare_and_look(node, draft, attempt)
         node.attempt = None
         try:

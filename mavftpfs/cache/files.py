@@ -138,7 +138,7 @@ class Files:
         if kept is not None:
             version = self._version(path, kept.key.size, entry.mtime)
             version.kept, version.proven_at = kept, found.directory.listed_at
-            self._replace(version)
+            self._set_newest(version)
         else:
             version = await self._start_version(path, entry)
             if fresh and self.kept is not None:
@@ -178,7 +178,7 @@ class Files:
         old = self._newest.get(path)
         if old is not None and compare(old.known, Opened(reader.size)) is Sameness.OTHER:
             self.kill(old)
-        self._replace(version)
+        self._set_newest(version)
         if entry.size != reader.size:  # what the kernel was told is wrong
             self._directories.learn_size(path, reader.size)
             self._invalidate(path)
@@ -221,7 +221,7 @@ class Files:
             version.require_not_replaced()
         version.reader = reader
 
-    def _replace(self, version: Version) -> None:
+    def _set_newest(self, version: Version) -> None:
         old = self._newest.pop(version.path, None)
         if old is not None and not old.handles:
             old.clear()
@@ -310,13 +310,14 @@ class Files:
         older = [v for v in self.open_versions if newest and v.path == path]
         for one in dict.fromkeys((version, *older)):
             if not one.replaced:
-                one.replace(f"{path!r} changed on the vehicle after it was opened")
+                one.mark_replaced(f"{path!r} changed on the vehicle after it was opened")
                 self._invalidate(path)
         if newest and not self._nodes.is_changing(path):
             self.on_replaced(path)
 
     def on_replaced(self, path: bytes) -> None:
-        """Note that others replaced the file of a path."""
+        """Note that another file has the path now, or may have: others replaced it, or it is not known what
+        a change of ours did."""
         if self._nodes.on_replaced(path):
             self.forget_pages(path)
 
@@ -356,7 +357,7 @@ class Files:
         for version in self._at_or_below(path):
             if self._newest.get(version.path) is version:
                 del self._newest[version.path]
-            version.replace(f"{version.path!r} was changed here")
+            version.mark_replaced(f"{version.path!r} was changed here")
         for node in self._nodes.below(path):
             node.close_base()
 
@@ -376,7 +377,7 @@ class Files:
         version = self._version(path, size)
         version.proven_at, version.in_kernel = proven_at, True
         version.ours = True
-        self._replace(version)
+        self._set_newest(version)
         for at in range(0, size, ADOPTED_AT_ONCE):
             version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
 

@@ -216,8 +216,8 @@ class Nodes:
         return self.unfinished.is_unknown(path) or (node is not None and node.changing)
 
     def on_replaced(self, path: bytes) -> bool:
-        """Note that others replaced the file of a path. Handles that are open never read the new one. A draft
-        of which no byte of the old file is to stay goes on. Returns whether the path has no node any more."""
+        """Note that another file has the path now, or may have. Handles that are open never read that one. A
+        draft that needs no byte of the old file goes on. Returns whether the path has no node any more."""
         node = self._by_path.get(path)
         if node is None or node.delivery is not None:
             return False  # a delivery compares the base itself
@@ -226,10 +226,10 @@ class Nodes:
             draft.lose_base()
         gone = draft is None or (draft.state is State.STALE and not lacks)
         if gone:
-            self.replaced(node)
+            self.on_name_taken(node)
         return gone
 
-    def replaced(self, node: Node) -> None:
+    def on_name_taken(self, node: Node) -> None:
         """Note that another file has the node's name. Open handles keep the node; later opens get a new
         one."""
         self._stale = [other for other in self._stale if other.handles] + [node]

@@ -211,9 +211,9 @@ class VehicleStore(RemoteStore, Protocol):
         """
         ...
 
-    async def settle(self, path: bytes) -> None:
-        """Return when no late copy of a request that concerned this name is to be feared any more: at once,
-        unless copies were seen to come late, or we repeated such a request (session.doubt: LateCopies)."""
+    async def let_rest(self, path: bytes) -> None:
+        """Wait until no late copy of a request can harm the next file of this name. Returns at once, unless
+        copies were seen to come late, or we repeated such a request (session.doubt: LateCopies)."""
         ...
 
     async def create_empty(self, path: bytes) -> None:
@@ -221,8 +221,8 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     async def remove(self, path: bytes, *, at_once: bool = False) -> None:
-        """Remove what is known to be a file. at_once: without `settle`, because the name is not used again: a
-        late copy of CreateFile could only leave an empty file there."""
+        """Remove what is known to be a file. at_once: without `let_rest`, because the name is not used again.
+        A late copy of CreateFile could only leave an empty file there."""
         ...
 
     async def make_directory(self, path: bytes) -> None:

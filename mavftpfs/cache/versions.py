@@ -354,8 +354,8 @@ class Version:
         if reader is not None:
             reader.close()
 
-    def replace(self, why: str) -> None:
-        """Become REPLACED, because another file has the path. Reads that wait get the error."""
+    def mark_replaced(self, why: str) -> None:
+        """Become REPLACED: another file has the path. Reads that wait get FileChanged with this reason."""
         self.kept, self._why = None, why
         self.close_reader()
         self.on_failed(FileChanged(why))

@@ -135,7 +135,7 @@ class Writeback:
                 made = node.draft is None
                 if made and node.handles:
                     # A program has a file open that others removed: it must not read the one made now.
-                    context.nodes.replaced(node)
+                    context.nodes.on_name_taken(node)
                     context.files.kill_all(path)
                     node = context.nodes.need(path)
                 if made:

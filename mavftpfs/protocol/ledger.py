@@ -55,7 +55,7 @@ class DuplicateDetector:
         if len(self._sent) > _MOST_REMEMBERED:
             del self._sent[next(iter(self._sent))]
 
-    def on_settled(self, request: Request, answered: int | None) -> None:
+    def on_over(self, request: Request, answered: int | None) -> None:
         """Note that a request is over. answered: the seq of the answer that came, if one did."""
         seqs = {request.seq + 1, *(request.aliases or ())}
         for seq in seqs:
@@ -234,7 +234,7 @@ class Ledger:
     def forget(self, request: Request, answered: int | None = None) -> None:
         """Take a request out of everything. answered: the seq of the answer that came, if one did."""
         if answered is None or request.sends > 1:
-            self.duplicates.on_settled(request, answered)
+            self.duplicates.on_over(request, answered)
         table = self._table
         table.pop(request.seq + 1, None)
         if request.aliases is not None:

@@ -63,7 +63,7 @@ class LateCopies:
         """CreateFile made, or emptied, the file of this name."""
         self._note(path.lower(), now, now, now)
 
-    def on_replaced(self, path: bytes) -> None:
+    def on_placed(self, path: bytes) -> None:
         """The name got its file by a rename: a copy of that finds nothing to rename."""
         self._names.pop(path.lower(), None)
 

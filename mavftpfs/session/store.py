@@ -3,8 +3,8 @@
 Did that change happen? A request whose answer was lost is sent again, may be carried out twice, and is then
 refused the second time (docs/servers.md 14.4). So after such a refusal, and after a silence, a listing tells
 whether the change happened. While there is doubt (session.doubt) the network may also have doubled a request
-that we sent once. Where copies of requests came late, names rest between two changes (LateCopies): `settle`
-is the one place that waits for that.
+that we sent once. Where copies of requests came late, names rest between two changes (LateCopies). Only
+`let_rest` waits for that.
 """
 
 from __future__ import annotations
@@ -95,12 +95,16 @@ _SECOND = {
 
 
 class Outcome(Enum):
-    """What a listing tells about a request."""
+    """What listings tell about a change that was asked for."""
 
     HAPPENED = "happened"
+    """It was carried out."""
     DID_NOT = "did not"
+    """It was not."""
     CONFLICT = "conflict"
+    """They fit neither. Something else has the new name, or both names of a rename are gone."""
     UNKNOWN = "unknown"
+    """They failed, or are incomplete."""
 
 
 Verdict = Callable[[], Awaitable[Outcome]]
@@ -261,7 +265,7 @@ class Store:
         """Write an `@` file (see VehicleStore)."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.settle(path)
+        await self.let_rest(path)
         try:
             async with self._opened(path, Opcode.CREATE_FILE) as session:
                 await self._write_in_order(session, Pieces(pieces, progress))
@@ -289,7 +293,7 @@ class Store:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.settle(path)
+        await self.let_rest(path)
         upload = Upload(path, source, self._scheduler)
         self._scheduler.add(upload, upload.run)
         return upload
@@ -298,12 +302,12 @@ class Store:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.settle(path)
+        await self.let_rest(path)
         async with self._opened(path, Opcode.CREATE_FILE):
             pass
 
-    async def settle(self, path: bytes) -> None:
-        """Wait until a late copy of an earlier request does this name no harm (session.doubt: LateCopies)."""
+    async def let_rest(self, path: bytes) -> None:
+        """See VehicleStore."""
         await trio.sleep(self._late.rest(path, self._clock()))
 
     async def remove(self, path: bytes, *, at_once: bool = False) -> None:
@@ -336,7 +340,7 @@ class Store:
             )
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
-            self._late.on_replaced(new)
+            self._late.on_placed(new)
 
     @asynccontextmanager
     async def _changing(
@@ -350,7 +354,7 @@ class Store:
         with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
-                    await self.settle(path)
+                    await self.let_rest(path)
                 # closing our session may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
                 try:

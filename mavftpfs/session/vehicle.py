@@ -80,11 +80,11 @@ class Identity:
         heard_at: when it was heard last.
     """
 
-    def __init__(self, on_doubt: Callable[[], None], on_settled: Callable[[bool], None]) -> None:
-        """on_doubt: it may have restarted, or be another one: it is to be asked. on_settled: called with
+    def __init__(self, on_doubt: Callable[[], None], on_trusted: Callable[[bool], None]) -> None:
+        """on_doubt: it may have restarted, or be another one: it is to be asked. on_trusted: called with
         whether it was a stranger meanwhile: it is trusted again."""
         self.standing = Standing.TRUSTED
-        self._on_doubt, self._on_settled = on_doubt, on_settled
+        self._on_doubt, self._on_trusted = on_doubt, on_trusted
         self._known: AutopilotVersion | None = None  # its id, once it was told
         # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
         self._strange = False
@@ -148,7 +148,7 @@ class Identity:
             return False
         if self._known is None and (version.uid or any(version.uid2)):
             self._known = version
-        self._settle()
+        self._trust()
         return True
 
     def unanswered(self) -> None:
@@ -160,19 +160,19 @@ class Identity:
             self._is_stranger()
         else:
             self._mute = True
-            self._settle()
+            self._trust()
 
     def _is_stranger(self) -> None:
         was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
         if was_trusted:  # nobody asks, and ours may come back without a silence
             self._on_doubt()
 
-    def _settle(self) -> None:
+    def _trust(self) -> None:
         if self.standing is Standing.TRUSTED:
             return
         strange = self._strange or self.standing is Standing.STRANGER
         self.standing, self._strange, self._moved = Standing.TRUSTED, False, False
-        self._on_settled(strange)
+        self._on_trusted(strange)
 
 
 def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
@@ -231,7 +231,7 @@ class Vehicle:
     _timed_out: bool = False
 
     def __post_init__(self) -> None:
-        self.identity = Identity(self.on_doubt, self._on_settled)
+        self.identity = Identity(self.on_doubt, self._on_trusted)
         self.may_write = self.write_armed
 
     @property
@@ -360,7 +360,7 @@ class Vehicle:
             self._timed_out = False
             self.on_heartbeat()
 
-    def _on_settled(self, was_stranger: bool) -> None:
+    def _on_trusted(self, was_stranger: bool) -> None:
         """It is ours again. Whether it restarted while another one told its boot time is not known."""
         if was_stranger:
             self._boot_ms = None

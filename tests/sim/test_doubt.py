@@ -57,7 +57,7 @@ def test_a_name_rests_where_copies_come_late() -> None:
         late.saw(seconds, 0.0)
         assert late.rest(b"/d/a", 0.0) == expected
     assert late.rest(b"/d/a", 9.0) == MOST_REST - 9.0
-    late.on_replaced(b"/d/a")
+    late.on_placed(b"/d/a")
     assert late.rest(b"/d/a", 0.0) == 0.0
     late.on_changed(b"/d/a", LASTS)
     assert late.rest(b"/d/a", LASTS) == MOST_REST
@@ -82,7 +82,7 @@ def test_a_name_whose_request_was_repeated_rests_on_any_link() -> None:
         late.on_changed(b"/d/a", 0.0)
         assert late.rest(b"/d/A", 0.0) == expected
     assert late.rest(b"/d/other", 0.0) == 0.0
-    late.on_replaced(b"/d/a")
+    late.on_placed(b"/d/a")
     assert late.rest(b"/d/a", 0.0) == 0.0
 
 

@@ -22,12 +22,12 @@ def standing(identity: Identity) -> Standing:
 
 
 class Watched(Identity):
-    """An identity that counts what it tells. doubts: questions wanted; settled: what on_settled was told."""
+    """An identity that counts what it tells. doubts: questions wanted; trusted: what on_trusted was told."""
 
     def __init__(self) -> None:
         self.doubts = 0
-        self.settled: list[bool] = []
-        super().__init__(self._count, self.settled.append)
+        self.trusted: list[bool] = []
+        super().__init__(self._count, self.trusted.append)
 
     def _count(self) -> None:
         self.doubts += 1
@@ -87,7 +87,7 @@ def test_a_silence_makes_it_doubtful_and_the_same_id_trusted() -> None:
     assert (identity.standing, identity.doubts) == (Standing.DOUBTED, 1)
     assert identity.told(version(1))
     assert standing(identity) is Standing.TRUSTED
-    assert identity.settled == [False]
+    assert identity.trusted == [False]
 
 
 def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
@@ -101,7 +101,7 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     assert standing(identity) is not Standing.TRUSTED
     assert identity.told(version(1))
     assert standing(identity) is Standing.TRUSTED
-    assert identity.settled == [True]
+    assert identity.trusted == [True]
 
 
 @pytest.mark.parametrize("silences", [False, True])
