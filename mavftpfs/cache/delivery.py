@@ -330,7 +330,7 @@ class Deliverer:
             else:
                 path = context.own.beside(node.path, Kind.NEW)
                 context.own.in_use.add(path)
-            sending = draft.begin(in_place=in_place, progress=self._throttle.on_acked)
+            sending = draft.begin(in_place=in_place, progress=partial(self._throttle.on_acked, draft))
             upload = await context.store.open_upload(path, sending)
         except BaseException:
             draft.give_up()

@@ -133,9 +133,9 @@ class Throttle:
 
         await together(try_it, look)
 
-    def on_acked(self, count: int) -> None:
-        """Note that bytes were ACKed: writers that wait look again."""
-        self._limit.meter.on_bytes(count, self._context.clock())
+    def on_acked(self, draft: Draft, count: int) -> None:
+        """Note that bytes of a draft were ACKed: writers that wait look again."""
+        self._limit.meter.on_bytes(count, self._context.clock(), draft)
         self.waiting.unpark_all()
 
     @property

@@ -51,7 +51,8 @@ SMALL_FILE = 64 * 1024
 
 
 class RateMeter:
-    """How many bytes per second come while some are wanted; pauses between requests are not counted.
+    """How many bytes per second come of one file after the other. Neither pauses count, nor the time between
+    two files: small files tell of round trips, and not of the link.
 
     Attributes:
         rate: bytes per second, None while too little was seen. shown: what people are told, which takes
@@ -66,15 +67,17 @@ class RateMeter:
         self.rate: float | None = None
         self.shown = Speed()
         self._last: float | None = None
+        self._file: object = None
         self._bytes = 0.0
         self._busy = 0.0
 
-    def on_bytes(self, count: int, now: float) -> None:
-        """Note that `count` bytes arrived."""
+    def on_bytes(self, count: int, now: float, file: object) -> None:
+        """Note that `count` bytes of a file arrived."""
         self.shown.on_bytes(count, now)
         elapsed = self.PAUSE if self._last is None else now - self._last
-        self._last = now
-        if elapsed >= self.PAUSE:
+        begins = file is not self._file
+        self._last, self._file = now, file
+        if begins or elapsed >= self.PAUSE:
             return
         self._bytes += count
         self._busy += elapsed
@@ -271,7 +274,7 @@ class Version:
         """Wake the reads whose bytes are all here; give more time to those that got some."""
         self.received += count
         self.received_at = self._cache.clock()
-        self._cache.meter.on_bytes(count, self.received_at)
+        self._cache.meter.on_bytes(count, self.received_at, self)
         for waiter in self._waiters:
             missing = self.missing(waiter.start, waiter.stop)
             if not missing:

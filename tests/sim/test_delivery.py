@@ -197,6 +197,24 @@ async def test_a_part_of_a_large_file_is_refused_where_it_would_be_sent_whole(he
     assert here.data(FILE) == OLD
 
 
+@pytest.mark.parametrize("writes", [False, True])
+async def test_small_files_before_it_are_no_reason_to_refuse_a_part_of_a_large_one(writes: bool) -> None:
+    """They tell of round trips. As a rate, that was so little that to send 300 kB in 3 s was EFBIG."""
+    few, some = content(300), content(300_000)
+    card = {b"/d/log": some} | {b"/d/%d" % number: few for number in range(40)}
+    async with rig("px4", card, link=LinkSettings(rate=300_000.0, delay=0.02)) as here:
+        tree = here.mount()
+        for number in range(40):
+            if writes:
+                await write_file(tree, b"/d/new%d" % number, few)
+            else:
+                await read_file(tree, b"/d/%d" % number)
+        file = await tree.open(b"/d/log", write=True)
+        await file.write(0, b"x")
+        await file.release()
+        assert here.data(b"/d/log") == b"x" + some[1:]
+
+
 @pytest.mark.parametrize("stale", [False, True], ids=["", "stale errno"])
 async def test_overwriting_in_place_needs_no_room_for_both_files(stale: bool) -> None:
     """Whether the card can rename is found out on an empty file then. ArduPilot's refusal may tell what an

@@ -7,6 +7,7 @@ from typing import cast
 import pytest
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.readahead import (
     FIRST_WINDOW,
     MAX_WINDOW,
@@ -20,6 +21,7 @@ from mavftpfs.shared.speed import Speed
 
 KIB = 1024
 BIG = 100 * 1024 * KIB
+LOG = "a file"
 
 
 def read(ahead: Readahead, start: int, size: int = 128 * KIB, limit: int = MAX_WINDOW) -> Plan:
@@ -91,7 +93,7 @@ def test_readahead_limits(streams: int, rate: float | None, limit: int, small: i
     cache = BlockCache(64 * 1024 * KIB, clock=lambda: 0.0, patience=1.0)
     if rate is not None:
         for step in range(4):
-            cache.meter.on_bytes(int(rate / 8), step / 8)
+            cache.meter.on_bytes(int(rate / 8), step / 8, LOG)
     assert cache.readahead_limits(streams) == (limit, small)
 
 
@@ -104,25 +106,34 @@ def test_the_rate_counts_only_the_time_between_bytes_that_follow_each_other() ->
     meter = RateMeter()
     assert meter.rate is None
     for second in (0, 100, 200):
-        meter.on_bytes(10**9, second)  # what came after a pause says nothing about the link
+        meter.on_bytes(10**9, second, LOG)  # what came after a pause says nothing about the link
         for step in range(1, 11):
-            meter.on_bytes(1000, second + step / 10)
+            meter.on_bytes(1000, second + step / 10, LOG)
+    assert meter.rate == pytest.approx(10_000)
+
+
+def test_the_time_between_two_files_is_not_counted() -> None:
+    """Small files tell of round trips: three chunks of each come at the speed of the link."""
+    meter = RateMeter()
+    for file in range(100):
+        for chunk in range(3):
+            meter.on_bytes(100, 0.5 * file + 0.01 * chunk, file)
     assert meter.rate == pytest.approx(10_000)
 
 
 def test_the_rate_follows_the_link() -> None:
     meter = RateMeter()
     for step in range(100):
-        meter.on_bytes(1000, step / 10)
+        meter.on_bytes(1000, step / 10, LOG)
     for step in range(100, 400):
-        meter.on_bytes(100, step / 10)
+        meter.on_bytes(100, step / 10, LOG)
     assert meter.rate == pytest.approx(1000, rel=0.1)
 
 
 def test_a_glimpse_is_not_a_rate() -> None:
     meter = RateMeter()
-    meter.on_bytes(1000, 0.0)
-    meter.on_bytes(1000, 0.1)
+    meter.on_bytes(1000, 0.0, LOG)
+    meter.on_bytes(1000, 0.1, LOG)
     assert meter.rate is None
 
 
@@ -163,9 +174,9 @@ class Clock:
 @pytest.mark.parametrize("rate", [1_000.0, 500_000.0, 20_000_000.0])
 def test_acked_bytes_are_measured_at_any_rate(rate: float) -> None:
     context, limit = Clock(), WriteLimit(None)
-    throttle = Throttle(cast(Context, context), limit)
+    throttle, draft = Throttle(cast(Context, context), limit), cast(Draft, LOG)
     while context.now < 4.0:
         context.now += 239 / rate
-        throttle.on_acked(239)
+        throttle.on_acked(draft, 239)
     assert limit.meter.rate == pytest.approx(rate, rel=0.02)
     assert throttle.speed == pytest.approx(rate, rel=0.1)
