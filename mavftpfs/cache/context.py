@@ -46,9 +46,9 @@ class Context:
     blocked: bool = False
 
     @property
-    def unfinished(self) -> Replacements:
-        """The replacements of files that are not finished."""
-        return self.nodes.unfinished
+    def replacements(self) -> Replacements:
+        """See Nodes."""
+        return self.nodes.replacements
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""

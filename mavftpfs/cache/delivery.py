@@ -143,7 +143,7 @@ class Deliverer:
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.base_limit or draft.unacked < START_AT or not may_pass(node):
             return  # of a file that only changes every byte is sent again: that waits for the close
-        if context.unfinished.is_unknown(node.path):
+        if context.replacements.is_unknown(node.path):
             return  # the next delivery finds out first
         try:
             with trio.CancelScope() as node.delivery:
@@ -191,7 +191,7 @@ class Deliverer:
             # Where a part was delivered meanwhile, the vehicle has neither the old file nor the new one.
             there: bool | None = None if node.delivered_since_open else False
             try:
-                if context.unfinished.is_unknown(node.path):
+                if context.replacements.is_unknown(node.path):
                     await self._end_unfinished(node, draft)
                     if not node.undelivered:
                         return True
@@ -232,7 +232,7 @@ class Deliverer:
         while True:
             in_place = store.traits.rename_works is False
             try:
-                if self._context.unfinished.is_unknown(node.path):
+                if self._context.replacements.is_unknown(node.path):
                     await self._end_unfinished(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
@@ -259,7 +259,7 @@ class Deliverer:
             As Directories.ask_entry, Verifier.check and Verifier.is_same.
         """
         context, path = self._context, node.path
-        there, record = await context.directories.ask_entry(path), context.unfinished.get(path)
+        there, record = await context.directories.ask_entry(path), context.replacements.get(path)
         if there is None and record is not None and record.aside is not None:
             with suppress(FtpNak):  # the cleaner was faster, or it is gone
                 await self._names.rename(record.aside, path, completes=True)
@@ -275,7 +275,7 @@ class Deliverer:
                     draft.base = record.sent
             else:
                 self._on_delivered(node, draft, crc32)
-        context.unfinished.end(path)
+        context.replacements.end(path)
 
     # --- sending
 
@@ -384,21 +384,21 @@ class Deliverer:
         Raises:
             As Names.rename and replace, and as _compare_again.
         """
-        unfinished, path = self._context.unfinished, node.path
+        replacements, path = self._context.replacements, node.path
         sent = Known(draft.size, crc32=crc32)
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.on(Event.COMMITS)
         try:
             if draft.base is None:
-                await self._names.forget_old(path)
+                await self._names.remove_aside(path)
                 await self._names.rename(attempt.path, path)
             else:
                 await self._names.replace(attempt.path, path)
         except BaseException as error:
             draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-            if unknown or unfinished.is_unknown(path):
-                unfinished.on_unknown(path).sent = sent
+            if unknown or replacements.is_unknown(path):
+                replacements.on_unknown(path).sent = sent
             else:
                 await self._names.discard(attempt.path)
             raise
@@ -422,7 +422,7 @@ class Deliverer:
             elif (unproven or attempt.upload.made_twice) and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
         except BaseException as error:
-            record = self._context.unfinished.on_unknown(path)
+            record = self._context.replacements.on_unknown(path)
             # If the name has no file, the old one gets it back.
             self._context.own.in_use.discard(record.aside or b"")
             if isinstance(error, VerificationFailed):
@@ -450,7 +450,7 @@ class Deliverer:
         context.files.on_changed(node.path)
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:
-        """Keep the error for the next close, and the bytes where they outlive this process."""
+        """Remember the error for the next close, and hold the bytes where they outlive this process."""
         known, node.error = node.error, error
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
@@ -459,4 +459,4 @@ class Deliverer:
         try:
             draft.content.persist(describe(node.path, draft, error, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
-            log.warning("%r is kept in memory only: %s", node.path, trouble)
+            log.warning("%r is held in memory only: %s", node.path, trouble)

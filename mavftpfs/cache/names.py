@@ -42,8 +42,8 @@ from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
-KEEP_OLD = 10.0
-"""Seconds for which the old file is kept when it was replaced in doubt."""
+LIES_ASIDE = 10.0
+"""Seconds for which the old file stays aside when it was replaced in doubt."""
 
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
 """Refusals that mean what they say. Others may mean that the server never renames over a file."""
@@ -242,11 +242,11 @@ class Names:
         Raises:
             As VehicleStore: then the name has to stay.
         """
-        await self.forget_old(path)
+        await self.remove_aside(path)
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
-        ended = self._context.unfinished.end(path)
-        needed = own.in_use | self._context.unfinished.asides()
+        ended = self._context.replacements.end(path)
+        needed = own.in_use | self._context.replacements.needed_asides()
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
             if reserved is None or reserved.owner != own.owner or left in needed:
@@ -256,27 +256,27 @@ class Names:
                     await self.remove_if_there(left)
                 except BaseException:
                     if ended is not None:
-                        self._context.unfinished.put(path, ended)
+                        self._context.replacements.put(path, ended)
                     raise
 
-    async def forget_old(self, path: bytes) -> None:
-        """Remove the old file that is kept for a name, if there is one: the name is about to change again."""
-        own, unfinished = self._context.own, self._context.unfinished
-        record = unfinished.get(path)
+    async def remove_aside(self, path: bytes) -> None:
+        """Remove the old file that still lies aside, if one does: the name is about to change again."""
+        own, replacements = self._context.own, self._context.replacements
+        record = replacements.get(path)
         if record is None or not record.placed:
             return
-        unfinished.end(path)
+        replacements.end(path)
         if record.aside in own.in_use:
             own.in_use.discard(record.aside)
             await self.remove_if_there(record.aside)
 
     # --- giving a verified file its name
 
-    async def replace(self, source: bytes, target: bytes, *, keep_old: bool = False) -> bytes | None:
+    async def replace(self, source: bytes, target: bytes, *, leave_aside: bool = False) -> bytes | None:
         """Rename over a file that exists.
 
-        keep_old: keep the old file, and return its reserved name, which is in `OwnNames.in_use`; None if the
-        old file was gone.
+        leave_aside: do not remove the old file. Return its reserved name, which is in `OwnNames.in_use`; None
+        if it was gone.
 
         One rename is enough where the server never leaves the name without a file. NuttX, which mounts
         storages at /fs/NAME, removes the old file first (servers.md 9).
@@ -286,7 +286,7 @@ class Names:
             has its name again, unless the replacement is unfinished.
         """
         traits = self._context.store.traits
-        if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
+        if not leave_aside and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
             try:
                 await self.rename(source, target, over=True)
                 traits.rename_replaces = True
@@ -297,18 +297,18 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        await self.forget_old(target)
+        await self.remove_aside(target)
         own = self._context.own
         aside = own.beside(target, Kind.OLD)
         own.in_use.add(aside)
         stays = False
         try:
             if await self._swap(source, target, aside):
-                stays = keep_old or await self._discard_old(target, aside)
+                stays = leave_aside or await self._discard_old(target, aside)
         finally:
             if not stays:
                 own.in_use.discard(aside)
-        return aside if stays and keep_old else None
+        return aside if stays and leave_aside else None
 
     def on_unknown(self, *paths: bytes) -> None:
         """Note that it is not known what these names are after an interrupted change: the listings and files
@@ -355,7 +355,7 @@ class Names:
         context, stays = self._context, self._context.store.in_doubt()
         if not stays:
             await self.discard(aside)
-        context.unfinished.put(target, Replacement(aside, placed=True, until=context.clock() + KEEP_OLD))
+        context.replacements.put(target, Replacement(aside, placed=True, until=context.clock() + LIES_ASIDE))
         context.retry_later()
         return stays
 
@@ -366,7 +366,7 @@ class Names:
         entry = context.directories.entry(path) or context.directories.entry(aside)
         if entry is not None:
             context.directories.put(path, entry)
-        context.unfinished.put(path, Replacement(aside, placed=placed))
+        context.replacements.put(path, Replacement(aside, placed=placed))
         context.retry_later()
         context.directories.expire(split(path)[0])
         log.warning("%r may lie under %r until the vehicle is heard again", path, aside)

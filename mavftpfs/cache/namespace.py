@@ -5,8 +5,8 @@ and targets are looked up in listings first. A change holds its paths alone (`pa
 delivers the drafts of what it moves.
 
 A program that has a file open reads on when the file loses its name. If the file was written here whole, its
-bytes are here. Else it is hidden: kept on the vehicle under a reserved name until its last handle is closed.
-Where the card cannot rename (LittleFS), the change of the name is refused (EBUSY).
+bytes are here. Else it is hidden: it stays on the vehicle under a reserved name until its last handle is
+closed. Where the card cannot rename (LittleFS), the change of the name is refused (EBUSY).
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class Namespace:
         entry = await context.directories.ask_entry(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # a file of others under its name is not to be removed
-            there &= draft.base is not None or draft.sent_in_place or context.unfinished.is_unknown(path)
+            there &= draft.base is not None or draft.sent_in_place or context.replacements.is_unknown(path)
         elif entry is None:
             raise NotFound(f"{path!r} does not exist")
         elif not there:
@@ -211,7 +211,7 @@ class Namespace:
         context.files.on_renamed(old, new)
         context.nodes.rename(old, new)
         context.own.follow_rename(old, new)
-        context.unfinished.follow_rename(old, new)
+        context.replacements.follow_rename(old, new)
         self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
@@ -225,13 +225,13 @@ class Namespace:
         if displaced is not None:
             await self._deliverer.abandon(displaced)
         await self._names.purge(old)
-        keep = displaced is not None and displaced.needs_card
+        needed = displaced is not None and displaced.needs_card
         try:
             async with self._looks_later(old, new):
                 if listed is not None and listed.kind is EntryKind.FILE:
-                    kept = await self._names.replace(old, new, keep_old=keep)
-                    if kept is not None and displaced is not None:
-                        await self._on_hidden(displaced, kept)
+                    aside = await self._names.replace(old, new, leave_aside=needed)
+                    if aside is not None and displaced is not None:
+                        await self._on_hidden(displaced, aside)
                 else:
                     if listed is not None:
                         await self._names.remove_directory(new)

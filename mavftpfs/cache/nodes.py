@@ -156,11 +156,11 @@ class Nodes:
     """All nodes that have a name, and those that are hidden.
 
     Attributes:
-        hidden: by their reserved names. unfinished: replacements of files that are not finished.
+        hidden: by their reserved names. replacements: the records of files that we replace.
     """
 
     def __init__(self) -> None:
-        self.unfinished = Replacements()
+        self.replacements = Replacements()
         self._by_path: dict[bytes, Node] = {}
         self.hidden: dict[bytes, Node] = {}
         self._stale: list[Node] = []
@@ -213,7 +213,7 @@ class Nodes:
         """Return whether we are changing what the vehicle has under a path, or a change may have happened in
         part."""
         node = self._by_path.get(path)
-        return self.unfinished.is_unknown(path) or (node is not None and node.changing)
+        return self.replacements.is_unknown(path) or (node is not None and node.changing)
 
     def on_replaced(self, path: bytes) -> bool:
         """Note that another file has the path now, or may have. Handles that are open never read that one. A

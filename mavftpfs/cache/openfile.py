@@ -70,7 +70,7 @@ class OpenFile:
         """Deliver, and close in any case: the last descriptor was closed. Twice is harmless.
 
         Raises:
-            As flush; what could not be delivered is kept.
+            As flush; what could not be delivered stays held.
         """
         self.close()
 
@@ -84,5 +84,5 @@ class OpenFile:
         return True
 
     def close(self) -> None:
-        """Close without delivering; what was not delivered is kept for later. Twice is harmless."""
+        """Close without delivering; what was not delivered stays held. Twice is harmless."""
         raise NotImplementedError

@@ -62,11 +62,11 @@ class Cleaner:
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """Clean up after a directory was listed. Raises no MavftpfsError: the listing is right in any
         case."""
-        unfinished = self._context.unfinished
-        targets = {record.aside: target for target, record in unfinished if record.aside is not None}
+        replacements = self._context.replacements
+        targets = {record.aside: target for target, record in replacements if record.aside is not None}
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
         if directory is self._context.directories.known(path):
-            for target, record in unfinished:
+            for target, record in replacements:
                 parent, name = split(target)
                 if parent == path and name in directory.entries and record.lacks_file:
                     self._on_found(target)
@@ -75,7 +75,7 @@ class Cleaner:
         self._busy.add(path)
         try:
             for left, ours in leftovers(path, reserved, self._is_dead)[:MAX_LEFTOVERS]:
-                if not self._context.blocked or left in unfinished.asides():
+                if not self._context.blocked or left in replacements.needed_asides():
                     await self._mend(left, ours, targets.get(left))
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
@@ -83,7 +83,7 @@ class Cleaner:
             self._busy.discard(path)
 
     async def finish(self, *, at_once: bool = False) -> None:
-        """End unfinished replacements. Names that may lack a file get theirs, and old files that were kept
+        """End unfinished replacements. Names that may lack a file get theirs, and old files that lay aside
         long enough are removed; all of them `at_once`. A listing of their directories does both.
 
         An old file that was removed at once can be there again only by a late copy of a request. So its
@@ -91,15 +91,15 @@ class Cleaner:
         """
         context, now = self._context, self._context.clock()
         directories = set()
-        for path, record in context.unfinished:
+        for path, record in context.replacements:
             if record.lacks_file and record.aside not in context.own.in_use:
                 directories.add(split(path)[0])
             elif record.aside is None and not self._waits_for_delivery(path):
-                context.unfinished.end(path)
+                context.replacements.end(path)
             elif record.placed and (at_once or record.until <= now):
                 context.own.in_use.discard(record.aside or b"")
                 if not context.store.in_doubt():
-                    context.unfinished.end(path)
+                    context.replacements.end(path)
                     continue
                 directories.add(split(path)[0])
                 record.until = now
@@ -109,21 +109,21 @@ class Cleaner:
             except MavftpfsError as error:
                 log.info("%r is mended at a later listing: %s", directory, error)
                 continue
-            for path, record in context.unfinished:
+            for path, record in context.replacements:
                 if split(path)[0] == directory and record.placed and record.until <= now:
-                    context.unfinished.end(path)
+                    context.replacements.end(path)
 
     # --- inside
 
     def _on_found(self, path: bytes) -> None:
         """Note that a name has a file. If a draft waits to be delivered there, its delivery compares that
         file; else nothing is unfinished any more."""
-        unfinished = self._context.unfinished
-        record = unfinished.get(path)
+        replacements = self._context.replacements
+        record = replacements.get(path)
         if record is not None and record.placed is None and self._waits_for_delivery(path):
             record.aside = None
         else:
-            unfinished.end(path)
+            replacements.end(path)
 
     def _waits_for_delivery(self, path: bytes) -> bool:
         """Return whether a draft of this path waits to be delivered."""

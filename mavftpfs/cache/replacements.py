@@ -1,4 +1,4 @@
-"""Replacements of files that are not finished. Layer: cache; pure.
+"""What is known of names whose files we replaced. Layer: cache; pure.
 
 A file is replaced by one rename, or by three requests: the old file moves aside, the new one gets the name,
 and the old one is removed. If they are interrupted, one record says what is known of the name. `names` or
@@ -47,7 +47,7 @@ class Replacement:
 
 
 class Replacements:
-    """The unfinished replacements of a mount, by path."""
+    """The records of a mount, by path: of unfinished replacements, and for some seconds of finished ones."""
 
     def __init__(self) -> None:
         self._records: dict[bytes, Replacement] = {}
@@ -84,8 +84,8 @@ class Replacements:
         """Remove the record of a path, and return it."""
         return self._records.pop(path, None)
 
-    def asides(self) -> set[bytes]:
-        """Return where files lie that may have to be moved back."""
+    def needed_asides(self) -> set[bytes]:
+        """Return the asides that must stay: a name may lack its file, and this is the old one."""
         return {record.aside for record in self._records.values() if record.lacks_file and record.aside}
 
     def follow_rename(self, old: bytes, new: bytes) -> None:

@@ -230,7 +230,7 @@ class Writeback:
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
-        if self._context.unfinished and self._context.store.why_lost() is None:
+        if self._context.replacements and self._context.store.why_lost() is None:
             await self.cleaner.finish(at_once=True)
 
     def recover_to(self, directory: Path) -> list[Path]:
@@ -265,7 +265,7 @@ class Writeback:
 
     def retry(self) -> None:
         """Deliver what no program writes any more: the vehicle is back, or may be written again."""
-        if self._context.unfinished or self.undelivered():
+        if self._context.replacements or self.undelivered():
             self._news.set()
             self._retry_later()
 
@@ -311,9 +311,9 @@ class Writeback:
         """End unfinished replacements, and deliver what no program writes: with growing pauses as long as
         that may help, because a link may fail and return between two heartbeats. When there are news of the
         vehicle, everything is tried at once, also what was refused."""
-        nodes, unfinished, (pause, longest) = self._context.nodes, self._context.unfinished, PAUSES
+        nodes, replacements, (pause, longest) = self._context.nodes, self._context.replacements, PAUSES
         try:
-            while self._news.is_set() or unfinished or any(n.undelivered and may_pass(n) for n in nodes):
+            while self._news.is_set() or replacements or any(n.undelivered and may_pass(n) for n in nodes):
                 with trio.move_on_after(pause):
                     await self._news.wait()
                 is_new, pause = self._news.is_set(), min(2 * pause, longest)

@@ -445,7 +445,7 @@ async def test_removing_a_torn_file_removes_it(torn: Rig, path: bytes) -> None:
     speak(torn)
     await tree.unlink(path)
     assert tree._writing is not None
-    assert not tree._writing._context.unfinished
+    assert not tree._writing._context.replacements
     await list_all(torn, tree)
     assert set(torn.files()) == {*FILES, FILE, OTHER} - {path}
 
@@ -473,14 +473,14 @@ async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: 
     """One that began before the interruption shows it because we said so."""
     tree = torn.mount()
     assert tree._writing is not None
-    own, unfinished = tree._writing._context.own, tree._writing._context.unfinished
+    own, replacements = tree._writing._context.own, tree._writing._context.replacements
     torn.take(FILE)
     aside = b"/d/" + Reserved(own.owner, Kind.OLD, b"sss", b"file.txt").name
-    unfinished.put(FILE, Replacement(aside, placed=False))
+    replacements.put(FILE, Replacement(aside, placed=False))
     now = trio.current_time()
     shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True)
     await tree._writing.cleaner.on_swept(b"/d", shown)
-    assert unfinished.asides()
+    assert replacements.needed_asides()
     torn.put(FILE, OLD)
     await tree.list(b"/d")
-    assert not unfinished
+    assert not replacements

@@ -21,33 +21,33 @@ FILE, ASIDE = b"/d/f", b"/d/.aside"
 def test_what_is_known_of_a_name(
     aside: bytes | None, placed: bool | None, is_unknown: bool, lacks_file: bool
 ) -> None:
-    unfinished = Replacements()
-    assert not unfinished.is_unknown(FILE)
-    unfinished.put(FILE, Replacement(aside, placed))
-    assert unfinished.is_unknown(FILE) == is_unknown
-    assert unfinished.asides() == ({aside} if lacks_file else set())
+    replacements = Replacements()
+    assert not replacements.is_unknown(FILE)
+    replacements.put(FILE, Replacement(aside, placed))
+    assert replacements.is_unknown(FILE) == is_unknown
+    assert replacements.needed_asides() == ({aside} if lacks_file else set())
 
 
 @pytest.mark.parametrize(("placed", "then"), [(None, None), (False, False), (True, None)])
 def test_that_the_new_file_is_not_there_stays_known(placed: bool | None, then: bool | None) -> None:
-    unfinished = Replacements()
-    unfinished.put(FILE, Replacement(ASIDE, placed, until=7.0))
-    unfinished.on_unknown(FILE)
-    record = unfinished.end(FILE)
+    replacements = Replacements()
+    replacements.put(FILE, Replacement(ASIDE, placed, until=7.0))
+    replacements.on_unknown(FILE)
+    record = replacements.end(FILE)
     assert record is not None
     assert (record.aside, record.placed) == (ASIDE, then)
-    assert not unfinished
+    assert not replacements
 
 
 def test_a_single_rename_was_interrupted() -> None:
-    unfinished = Replacements()
-    unfinished.on_unknown(FILE)
-    assert list(unfinished) == [(FILE, Replacement())]
+    replacements = Replacements()
+    replacements.on_unknown(FILE)
+    assert list(replacements) == [(FILE, Replacement())]
 
 
 def test_records_follow_the_directory() -> None:
-    unfinished = Replacements()
-    unfinished.put(FILE, Replacement(ASIDE, placed=False))
-    unfinished.follow_rename(b"/d", b"/e")
-    assert unfinished.get(FILE) is None
-    assert unfinished.get(b"/e/f") == Replacement(b"/e/.aside", placed=False)
+    replacements = Replacements()
+    replacements.put(FILE, Replacement(ASIDE, placed=False))
+    replacements.follow_rename(b"/d", b"/e")
+    assert replacements.get(FILE) is None
+    assert replacements.get(b"/e/f") == Replacement(b"/e/.aside", placed=False)
