@@ -63,32 +63,41 @@ class Names:
     async def size(self, path: bytes) -> int | None:
         """Return the size of a file on the vehicle, asked just now; None if there is none.
 
-        Opening a file takes the server's one session. Where OpenFileWO empties files, an upload that gives
-        way for that loses all it sent. There the directory is listed instead.
-
         Raises:
             As VehicleStore.stat_size.
         """
-        context = self._context
-        beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
-        if beside and context.store.traits.wo_truncates:
-            entry = await context.directories.ask_entry(path)
+        if self._opening_waits(path):
+            entry = await self._context.directories.ask_entry(path)
             if entry is not None:
                 return entry.size
         try:
-            return await context.store.stat_size(path)
+            return await self._context.store.stat_size(path)
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
             return None
 
-    async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
-        """Return whether a name is free, in every spelling that the card takes for it: it is opened now.
+    def _opening_waits(self, path: bytes) -> bool:
+        """Return whether to open a file would wait for the end of another one's upload. It takes the server's
+        one session, and where OpenFileWO empties files no upload gives way. There a directory is listed."""
+        context = self._context
+        beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
+        return beside and bool(context.store.traits.wo_truncates)
 
-        perhaps_directory: it may be another spelling of a directory, which does not open either.
+    async def is_free(self, path: bytes) -> bool:
+        """Return whether a name is free, asked just now.
 
         Raises:
             As VehicleStore.stat_size.
+        """
+        if self._opening_waits(path):
+            return await self._context.directories.ask_entry(path) is None
+        return await self._opens_nothing(path)
+
+    async def _opens_nothing(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
+        """Return whether a name is free in every spelling that the card takes for it: it is opened.
+
+        perhaps_directory: it may be another spelling of a directory, which does not open either.
         """
         try:
             await self._context.store.stat_size(path)
@@ -106,7 +115,7 @@ class Names:
         that differs only in that, the new name is opened to find out.
 
         Raises:
-            AlreadyExists. Else as entry and is_free.
+            AlreadyExists. Else as entry and VehicleStore.stat_size.
         """
         parent, name = split(path)
         entries = (await self._context.directories.get(parent)).entries
@@ -116,7 +125,7 @@ class Names:
                 alike.add(entry.kind)
         if not alike or name in entries:
             return
-        if not await self.is_free(path, perhaps_directory=EntryKind.DIRECTORY in alike):
+        if not await self._opens_nothing(path, perhaps_directory=EntryKind.DIRECTORY in alike):
             raise AlreadyExists(f"{path!r} is the name of another file on this card")
 
     async def require_empty(self, path: bytes) -> None:

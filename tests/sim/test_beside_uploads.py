@@ -18,7 +18,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import Armed, FtpNak, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.rigs import Rig
+from tests.support.rigs import Rig, rig, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import (
     MemorySink,
@@ -451,3 +451,18 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
         assert source.rollbacks == 0
         assert listed > 10
     assert here.data(b"/d/new") == data
+
+
+@pytest.mark.parametrize("replaces", [False, True])
+async def test_a_close_does_not_wait_for_another_upload_that_gives_no_way(replaces: bool) -> None:
+    """Whether its name is still free, or the size under it, is asked of a listing there."""
+    old = {b"/d/one": b"old", b"/d/two": b"old"} if replaces else {b"/d": None}
+    async with rig("mavsdk", old, link=LinkSettings(rate=5_760.0, delay=0.05)) as here:
+        tree = here.mount(verify="size")
+        here.connection.store.traits.wo_truncates = True
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(write_file, tree, b"/d/one", content(100_000, 1))
+            await trio.sleep(8)
+            nursery.start_soon(write_file, tree, b"/d/two", content(400_000, 2))
+        assert here.data(b"/d/one") == content(100_000, 1)
+        assert here.data(b"/d/two") == content(400_000, 2)
