@@ -169,7 +169,7 @@ class Deliverer:
             node.draft.give_up()
         try:
             await attempt.upload.end()
-            if not attempt.in_place and attempt.upload.begun:
+            if not attempt.in_place and attempt.upload.may_exist:
                 await self._names.discard(attempt.path)
         finally:
             self._context.own.in_use.discard(attempt.path)

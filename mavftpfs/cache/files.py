@@ -8,8 +8,8 @@ At open it is decided whether the version in the cache is still the vehicle's fi
   without an mtime prove nothing.
 
 While a program has a file open, its session is closed and opened again: after losses, restarts, and turns of
-other users. Then size and mtime are compared (`Files.compare`). A file that is equal, or larger, is the same,
-because logs grow. For another file readers get FileChanged. The open reply tells the size. Where
+other users. Then size and mtime are compared (`Files.require_same`). A file that is equal, or larger, is the
+same, because logs grow. For another file readers get FileChanged. The open reply tells the size. Where
 listings tell mtimes, a listing that began after the reopening tells the mtime. After a restart of the vehicle
 nothing is proven.
 
@@ -131,7 +131,7 @@ class Files:
         """Return the version to serve, and whether it was served before."""
         entry, fresh = found.entry, self._clock() < found.directory.fresh_until
         version = self._newest.get(path)
-        if version is not None and self._still_right(version, found, fresh):
+        if version is not None and self._may_serve(version, found, fresh):
             self._newest.move_to_end(path)
             return version, True
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
@@ -148,8 +148,9 @@ class Files:
     def _version(self, path: bytes, size: int = 0, mtime: int | None = None) -> Version:
         return Version(self.cache, path, size, mtime, on_doubt=self._on_doubt)
 
-    def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
-        """Return whether a version is proven to be the vehicle's file now."""
+    def _may_serve(self, version: Version, found: Found, fresh: bool) -> bool:
+        """Return whether a version is proven to be the vehicle's file now. If a listing shows another one,
+        the version is killed."""
         listed_at = found.directory.listed_at
         answer = compare(replace(version.known, at_open=True), Listed(found.entry))
         if answer is Sameness.OTHER and listed_at > version.proven_at:
@@ -244,17 +245,17 @@ class Files:
 
     # --- is it the same file?
 
-    async def compare(self, version: Version, *, now: bool) -> None:
-        """Compare a version with a listing, if the server opened its file again and listings tell times.
+    async def require_same(self, version: Version, *, now: bool) -> None:
+        """Check that the path still has this version. A listing is asked for only if it can tell more.
 
         now: even if a listing was asked for just before to compare it.
 
         Raises:
-            FileChanged: it is another one. Else as RemoteStore.list_directory.
+            FileChanged: another file has the path. Else as RemoteStore.list_directory.
         """
         soon = not now and self._clock() < version.compare_after
         if not (soon or self._is_sure(version) or self._nodes.is_changing(version.path)):
-            await self._compare(version)
+            await self._ask_and_compare(version)
         version.require_not_replaced()
 
     def _is_sure(self, version: Version) -> bool:
@@ -263,7 +264,8 @@ class Files:
         timed = self._directories.tells_times or version.mtime is not None
         return version.current or not (timed or version.known.restarted)
 
-    async def _compare(self, version: Version) -> None:
+    async def _ask_and_compare(self, version: Version) -> None:
+        """Compare a version with a listing that began after its file was opened on the vehicle."""
         path = version.path
         try:
             directory = await self._directories.ask(split(path)[0], began=version.opened_at)
@@ -275,9 +277,9 @@ class Files:
                 return  # it is compared under its new name, by the next read
         took = directory.ended_at - directory.listed_at
         version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
-        self._compare_listed(version, directory)
+        self._compare_with(version, directory)
 
-    def _compare_listed(self, version: Version, directory: Directory) -> None:
+    def _compare_with(self, version: Version, directory: Directory) -> None:
         """Compare a version with a listing that began after its last proof."""
         entry = directory.entries.get(split(version.path)[1])
         answer = compare(version.known, Listed(entry, directory.complete))
@@ -301,7 +303,7 @@ class Files:
                 and directory.listed_at > version.proven_at
                 and not self._nodes.is_changing(version.path)
             ):
-                self._compare_listed(version, directory)
+                self._compare_with(version, directory)
 
     def kill(self, version: Version) -> None:
         """Make a version REPLACED, and with the newest one of a path all older ones."""
@@ -465,7 +467,7 @@ class VersionHandle(OpenFile):
                     break
                 pieces.append(piece)
             else:
-                await files.compare(version, now=stop == self.size)
+                await files.require_same(version, now=stop == self.size)
                 if version.doubts == doubts:
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
             if version.doubts != doubts:

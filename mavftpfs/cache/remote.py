@@ -133,8 +133,8 @@ class Upload(Protocol):
     """A remote file being written; survives reopening of the server's session."""
 
     @property
-    def begun(self) -> bool:
-        """Whether CreateFile may have been sent."""
+    def may_exist(self) -> bool:
+        """Whether CreateFile may have been sent, so that the file may be there."""
         ...
 
     @property

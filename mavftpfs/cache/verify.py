@@ -98,7 +98,7 @@ class Verifier:
             with suppress(FtpNak, RequestTimeout, Armed):
                 told = Summed(await context.store.crc32(path, size=base.size))
                 answer = compare(base, told)
-                if answer is not Sameness.UNPROVEN:
+                if answer is not Sameness.UNDECIDED:
                     return answer is Sameness.SAME
         if timed:
             return True

@@ -68,7 +68,7 @@ class FileStream(SessionUser):
             self._wants.add(self._sink.missing(start, stop), demand=demand)
         if self.waiting_since is None and not self._wants.demand.empty:
             self.waiting_since = self._scheduler.clock()
-            self._scheduler.renew(self)
+            self._scheduler.limit_wait(self)
         self._wanted.set()
         self._server.wake()
 

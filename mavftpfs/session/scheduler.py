@@ -266,13 +266,14 @@ class Scheduler:
             turn.granted.end(error)
         self.server.wake()
 
-    def renew(self, user: SessionUser) -> None:
-        """A caller begins to wait for it now, and waits as long as any; its place in the queue stays."""
+    def limit_wait(self, user: SessionUser) -> None:
+        """A caller begins to wait for this user: if it is queued, its turn comes within `op_deadline` from
+        now, or it gets an error. Its place in the queue stays."""
         if user in self._queue:
             self._limit(self._queue[user])
 
     def _limit(self, turn: Turn) -> None:
-        """From now on it waits as long as any. Without a caller it waits without limit."""
+        """Let it wait for `_longest_wait` from now on; without limit if no caller waits for its user."""
         turn.limit.deadline = trio.current_time() + self._longest_wait if turn.user.awaited else inf
 
     @asynccontextmanager

@@ -42,12 +42,12 @@ STARVE = 1.5
 """Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
 
 BRIEF_STARVE = 0.05
-"""The same where it can be interrupted and another user waits: a program that writes fast gives more sooner.
-"""
+"""STARVE for an upload that can be interrupted, while another user waits. A program that writes fast gives
+more sooner."""
 
 TRICKLE = 10.0
-"""Seconds after which the same is true of an upload that cannot be interrupted: else a log that is written
-now and then would keep the session for ever."""
+"""Seconds with its file open after which BRIEF_STARVE holds for an upload that cannot be interrupted, too.
+Else a log that is written now and then would keep the session for ever."""
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
@@ -75,13 +75,13 @@ class Upload(SessionUser):
     """Implements cache.remote.Upload. Nothing is sent before the source has something.
 
     Attributes:
-        begun, made_twice: see cache.remote.Upload.
+        may_exist, made_twice: see cache.remote.Upload.
     """
 
     def __init__(self, path: bytes, source: SendBuffer, scheduler: Scheduler) -> None:
         super().__init__(path, writing=True)
         self._source = source
-        self.begun = self.made_twice = False
+        self.may_exist = self.made_twice = False
         self._scheduler = scheduler
         self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
@@ -117,7 +117,7 @@ class Upload(SessionUser):
         first, finisher = not self.awaited, Future()
         self._finishers.append(finisher)
         if first:
-            self._scheduler.renew(self)
+            self._scheduler.limit_wait(self)
         self.wake()
         try:
             await finisher.wait()
@@ -270,8 +270,8 @@ class Upload(SessionUser):
             if session is not None:
                 return session
         source.start_over()
-        self.made_twice |= self.begun
-        self.begun = True  # what is there from now on may be ours
+        self.made_twice |= self.may_exist
+        self.may_exist = True
         try:
             session = await turn.open(self.path, Opcode.CREATE_FILE)
         except FtpNak as nak:

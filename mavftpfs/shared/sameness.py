@@ -22,8 +22,8 @@ class Sameness(Enum):
     """All that was told agrees."""
     GREW = "grew"
     """It is the same file, and bytes were appended to it: logs grow."""
-    UNPROVEN = "unproven"
-    """Nothing contradicts, but nothing proves it. Something else can tell more."""
+    UNDECIDED = "undecided"
+    """Nothing contradicts, but nothing proves it. The caller asks for more, or trusts what it knew before."""
     OTHER = "other"
     """Another file has the name, or none has it."""
 
@@ -87,14 +87,14 @@ def _by_open(known: Known, seen: Opened) -> Sameness:
     if seen.size < known.size:
         return Sameness.OTHER
     if known.restarted or known.mtime is not None:
-        return Sameness.UNPROVEN  # a listing tells more
+        return Sameness.UNDECIDED  # a listing tells more
     return Sameness.SAME if seen.size == known.size else Sameness.GREW
 
 
 def _by_listing(known: Known, seen: Listed) -> Sameness:
     entry = seen.entry
     if entry is None:
-        return Sameness.OTHER if seen.complete else Sameness.UNPROVEN
+        return Sameness.OTHER if seen.complete else Sameness.UNDECIDED
     if entry.kind is not EntryKind.FILE or entry.size < known.size:
         return Sameness.OTHER
     if entry.size > known.size:
@@ -103,14 +103,14 @@ def _by_listing(known: Known, seen: Listed) -> Sameness:
     if timed and known.mtime != entry.mtime:
         return Sameness.OTHER
     if known.ours or (known.at_open and not timed):
-        return Sameness.UNPROVEN
+        return Sameness.UNDECIDED
     return Sameness.SAME
 
 
 def _by_crc32(known: Known, seen: Summed) -> Sameness:
     if known.crc32 is None:
-        return Sameness.UNPROVEN
+        return Sameness.UNDECIDED
     if known.crc32 != seen.crc32:
         return Sameness.OTHER
     # A CRC32 starts with 0, so zeros before the first other byte do not change it (docs/servers.md 10).
-    return Sameness.SAME if seen.crc32 else Sameness.UNPROVEN
+    return Sameness.SAME if seen.crc32 else Sameness.UNDECIDED

@@ -150,15 +150,15 @@ async def test_a_read_whose_bytes_fell_into_doubt_leaves_the_reader_of_another_r
 ) -> None:
     async with opened("px4") as (_, _, handle):
         files, version = handle._handle._files, handle._handle._version  # type: ignore[attr-defined]
-        readers, compare = [], files.compare
+        readers, require_same = [], files.require_same
 
         async def doubt_comes(*args: object, **kwargs: object) -> None:
-            monkeypatch.setattr(files, "compare", compare)
+            monkeypatch.setattr(files, "require_same", require_same)
             version.on_suspect("doubt")
             await handle.read(STEP, STEP)  # opens the file anew
             readers.append(version.reader)
 
-        monkeypatch.setattr(files, "compare", doubt_comes)
+        monkeypatch.setattr(files, "require_same", doubt_comes)
         assert await handle.read(0, STEP) == OLD[:STEP]
         assert version.reader is readers[0]
 
