@@ -74,7 +74,7 @@ class OpenFile:
         """
         self.close()
 
-    async def give_up(self) -> bool | None:
+    async def take_back(self) -> bool | None:
         """Close, and take back bytes that are not on the vehicle: none of them is sent from now on.
 
         Returns whether the vehicle has the file as it was written. None: that is not known, or another handle

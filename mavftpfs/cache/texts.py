@@ -493,7 +493,7 @@ class TextHandle(OpenFile, Generic[B]):
     async def release(self) -> None:
         """Drop the text, saved or not: the program that closed it was told."""
 
-    async def give_up(self) -> bool:
+    async def take_back(self) -> bool:
         """Drop the text; return whether the vehicle has it."""
         return not self._changed and self._error is None
 

@@ -380,7 +380,7 @@ class Tree:
             self._local.follow_rename(source, target)
 
     async def withdraw(self, path: bytes) -> bool | None:
-        """Take back what was written to an open file; see OpenFile.give_up. None also if it is not open."""
+        """Take back what was written to an open file; see OpenFile.take_back. None also if it is not open."""
         return await self._writing.withdraw(self._remote(path))
 
     def undelivered(self) -> Sequence[bytes]:

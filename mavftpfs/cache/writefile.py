@@ -224,8 +224,8 @@ class WriteFile(ReadFile):
         if draft is not None and (draft.size > 0 or self._node.error is not None):
             await self._parts.deliverer.deliver(self._node)
 
-    async def give_up(self) -> bool | None:
-        """See OpenFile.give_up. May take as long as a request that is not answered."""
+    async def take_back(self) -> bool | None:
+        """See OpenFile.take_back. May take as long as a request that is not answered."""
         try:
             return await self._parts.deliverer.withdraw(self._node)
         finally:

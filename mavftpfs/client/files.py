@@ -60,7 +60,7 @@ class File(Protocol):
     async def release(self) -> None:
         """Deliver what was written, and close in any case."""
 
-    async def give_up(self) -> bool | None:
+    async def take_back(self) -> bool | None:
         """Close, and take back what is not on the card: nothing of it is sent from now on.
 
         Returns whether the card has what was written, None if that is not known.
@@ -166,7 +166,7 @@ class Writing:
         """Close the file without delivering it. whole: all of it was written; else what was delivered is a
         part."""
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
-            there = await self._file.give_up()
+            there = await self._file.take_back()
             # A fork closes a copy of a mount's descriptor, which delivers what was written until then.
             self.there = None if there and not whole else there
 

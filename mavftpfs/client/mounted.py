@@ -149,7 +149,7 @@ class MountedFile:
             with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
                 await _call(self.path, os.close, fd)
 
-    async def give_up(self) -> bool | None:
+    async def take_back(self) -> bool | None:
         """Make the mount take back what it has not delivered, before a close makes it try again."""
         there: bool | None = None
         try:

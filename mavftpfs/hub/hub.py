@@ -365,7 +365,7 @@ class Hub:
                 pieces = await link.receive()
             frames: list[tuple[Place, Frame]] = []
             if pieces is None:
-                frames = inlet.give_up(link.sender(-1))
+                frames = inlet.on_silence(link.sender(-1))
             elif not pieces:
                 inlet.reset()
                 self._tell_reopened(side)

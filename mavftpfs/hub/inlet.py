@@ -28,10 +28,10 @@ class Inlet:
         place = Place(self._side, address)
         return [(place, frame) for frame in self._splitter(address).feed(piece)]
 
-    def give_up(self, address: NetAddress | None) -> list[tuple[Place, Frame]]:
+    def on_silence(self, address: NetAddress | None) -> list[tuple[Place, Frame]]:
         """The stream fell silent within a frame. Return what is found in the rest."""
         place = Place(self._side, address)
-        return [(place, frame) for frame in self._splitter(address).give_up()]
+        return [(place, frame) for frame in self._splitter(address).on_silence()]
 
     def reset(self) -> None:
         """Forget half frames: the link was reopened."""

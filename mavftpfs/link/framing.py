@@ -13,7 +13,7 @@ heartbeats must not be taken for live ones. The verdict depends on the bytes alo
 split. At most one frame waits for its rest.
 
 A damaged length makes the search wait for up to 280 bytes, which on a link with nothing but heartbeats takes
-many seconds. So the reader of a stream says when it fell silent (`give_up`): frames come in one piece.
+many seconds. So the reader of a stream says when it fell silent (`on_silence`): frames come in one piece.
 
 A datagram ends what it holds; a frame cut at its end is kept in case a serial bridge split it, and dropped
 when the next datagram begins with a frame of its own.
@@ -175,7 +175,7 @@ class FrameBuffer(Generic[FoundT]):
         self._tail = b""
         self.waiting = False
 
-    def give_up(self) -> list[FoundT]:
+    def on_silence(self) -> list[FoundT]:
         """The stream fell silent within a frame, so that was no frame, unless it only lacked the byte behind
         it. Return what is found in the rest."""
         out: list[FoundT] = []

@@ -399,14 +399,14 @@ async def _leave(connection: Connection, serving: _Task) -> None:
     with trio.move_on_after(most):
         async with trio.open_nursery() as nursery:
 
-            async def give_up() -> None:
+            async def stop_in_silence() -> None:
                 await trio.sleep(least)
                 silence = connection.vehicle.silence  # each heartbeat begins it anew
                 while (left := SILENT_ON_EXIT - silence(connection.clock())) > 0:  # noqa: ASYNC110
                     await trio.sleep(left)
                 nursery.cancel_scope.cancel()
 
-            nursery.start_soon(give_up)
+            nursery.start_soon(stop_in_silence)
             serving.scope.cancel()
             await serving.ended.wait()
             await connection.scheduler.close()

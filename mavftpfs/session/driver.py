@@ -102,7 +102,7 @@ class Driver:
             if scope.cancelled_caught:
                 self.engine.on_deadline(now)
                 if self.framer.waiting and now >= self._heard_at + QUIET:
-                    self._handle(self.framer.give_up(), now, self.link.sender(-1))
+                    self._handle(self.framer.on_silence(), now, self.link.sender(-1))
             elif not chunks:  # the link was reopened
                 self.framer.reset()
                 if self.link.seat is not None:

@@ -331,7 +331,7 @@ async def test_what_a_client_takes_back_from_a_mount_never_comes(field: Field) -
     for file in (old, new):
         with pytest.raises(MavftpfsError):
             await file.fsync()
-        assert await file.give_up() is False
+        assert await file.take_back() is False
     vehicle.resume()
     wait_until("the vehicle is heard again", lambda: mount.status()["link"]["state"] != "lost")
     assert mount.status()["held"]["files"] == 0

@@ -69,7 +69,7 @@ class FakeFile:
         finally:
             self.closed = True
 
-    async def give_up(self) -> bool | None:
+    async def take_back(self) -> bool | None:
         self.closed = True
         if self.made:
             del self.tree.files[self.path]

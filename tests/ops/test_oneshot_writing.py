@@ -301,11 +301,11 @@ async def test_by_a_mount_what_is_there_is_said_of_the_file_and_not_of_what_is_w
         if name == fails:
             raise error
 
-    async def give_up(file: FakeFile) -> bool:
+    async def take_back(file: FakeFile) -> bool:
         file.tree.files[file.path] = file.content
         return True
 
-    monkeypatch.setattr(FakeFile, "give_up", give_up)
+    monkeypatch.setattr(FakeFile, "take_back", take_back)
     tree.on_call = fail
     session = session_of(tree, mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))

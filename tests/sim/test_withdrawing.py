@@ -50,7 +50,7 @@ async def test_what_could_not_be_delivered_never_comes(
     await file.write(0, NEW)
     with pytest.raises(MavftpfsError):
         await file.fsync()
-    there = await file.give_up()
+    there = await file.take_back()
     here.faults.cut_after(None)
     await trio.sleep(LONG)
     await tree.list(b"/d")
@@ -73,7 +73,7 @@ async def test_an_interrupted_name_is_looked_at(here: Rig, tree: Tree, path: byt
     with pytest.raises(MavftpfsError):
         await file.fsync()
     here.faults.cut_after(None)
-    there = await file.give_up()
+    there = await file.take_back()
     await trio.sleep(LONG)
     await tree.list(b"/d")
     assert there is (here.files().get(path) == NEW)
@@ -86,8 +86,8 @@ async def test_it_is_what_it_was_for_everybody(here: Rig, tree: Tree) -> None:
     reader = await tree.open(FILE)
     await file.write(0, NEW)
     await fresh.write(0, NEW)
-    assert await file.give_up() is False
-    assert await fresh.give_up() is False
+    assert await file.take_back() is False
+    assert await fresh.take_back() is False
     assert await read_file(tree, FILE) == OLD
     with pytest.raises(NotFound):
         await tree.stat(FRESH)
@@ -99,7 +99,7 @@ async def test_what_is_there_is_there(here: Rig, tree: Tree) -> None:
     file = await opened(tree, FRESH)
     await file.write(0, NEW)
     await file.fsync()
-    assert await file.give_up() is True
+    assert await file.take_back() is True
     assert here.data(FRESH) == NEW
 
 
@@ -108,7 +108,7 @@ async def test_what_others_write_too_is_theirs(here: Rig, tree: Tree) -> None:
     other = await tree.open(FRESH, write=True)
     await file.write(0, b"ours")
     await other.write(4, b"theirs")
-    assert await file.give_up() is None
+    assert await file.take_back() is None
     await other.release()
     assert here.data(FRESH) == b"ourstheirs"
 
@@ -123,7 +123,7 @@ async def test_a_listing_does_not_wait_because_its_requests_came_late(here: Rig,
     await file.write(0, NEW)
     with pytest.raises(MavftpfsError):
         await file.fsync()
-    await file.give_up()
+    await file.take_back()
     here.server.handle = handle  # type: ignore[method-assign]
     for wire, source, _ in held:
         handle(wire, source, trio.current_time())

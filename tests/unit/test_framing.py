@@ -243,17 +243,17 @@ def test_one_flipped_bit_in_a_length_hides_what_follows_only_until_given_up() ->
     framer, chunk = Framer(US, stream=True), ftp(bytes(range(100)) + bytes(151))
     assert feed(framer, damaged(1, heartbeat()) + heartbeat() + chunk) == []
     assert framer.waiting
-    assert framer.give_up() == [HEARTBEAT, FtpRun(DRONE, US, [bytes(range(100)) + bytes(151)])]
+    assert framer.on_silence() == [HEARTBEAT, FtpRun(DRONE, US, [bytes(range(100)) + bytes(151)])]
     assert not framer.waiting
     assert feed(framer, heartbeat()) == [HEARTBEAT]
-    assert framer.give_up() == []
+    assert framer.on_silence() == []
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 12, 20])
 def test_a_frame_that_never_ends_is_dropped(cut: int) -> None:
     framer = Framer(US, stream=True)
     feed(framer, heartbeat()[:cut])
-    assert framer.give_up() == []
+    assert framer.on_silence() == []
     assert not framer.waiting
     assert feed(framer, heartbeat()) == [HEARTBEAT]
 

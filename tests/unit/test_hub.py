@@ -89,9 +89,9 @@ def test_what_a_stream_ended_in_counts_when_it_falls_silent() -> None:
     unknown = foreign(TWO, 777)
     assert splitter.feed(unknown) == []
     assert splitter.waiting
-    assert [frame.data for frame in splitter.give_up()] == [unknown]
+    assert [frame.data for frame in splitter.on_silence()] == [unknown]
     assert splitter.feed(b"\xfd\xff\x00") == []
-    assert splitter.give_up() == []
+    assert splitter.on_silence() == []
     assert not splitter.waiting
 
 
