@@ -2,7 +2,7 @@
 
 There is no stat on the wire (servers.md 14.30): everything known of a path comes from its parent's listing. A
 listing is fresh for a while. A name that a fresh and complete listing lacks does not exist. Expired listings
-are kept, and served while the vehicle is lost.
+are remembered, and served while the vehicle is lost.
 
 A listing takes many requests. It may show a change that we make meanwhile, or not. So a listing under way is
 a `Sweep`, which notes each of our changes, and a noted change beats what the sweep saw. Entries behind a

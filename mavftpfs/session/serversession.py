@@ -214,7 +214,7 @@ class ServerSession:
                 be open from before could not be closed.
         """
         await self.close_quietly()
-        await self._close_what_may_be_ours()
+        await self._close_maybe_open()
         try:
             await self._open_past_others(path, opcode)
         finally:
@@ -225,7 +225,15 @@ class ServerSession:
         return self.session
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> None:
-        """Open, by one remedy after the other while that is refused because a session is taken."""
+        """Open. While that is refused because the session is taken, try one remedy after the other.
+
+        | the refusal | may an open of ours have been carried out? | `maybe_open` | then |
+        |---|---|---|---|
+        | one of _OPEN_TAKEN | yes | stays: the first remedy closes it | a remedy |
+        | one of _OPEN_TAKEN | no | is cleared | a remedy |
+        | FAIL, perhaps of an ArduPilot | yes | stays: the first remedy closes it | a remedy |
+        | any other | - | is cleared | it is raised |
+        """
         remedies, resent = _Remedies(), False
         while True:
             asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
@@ -240,9 +248,8 @@ class ServerSession:
                 await self.driver.run(operation)
             except FtpNak as nak:
                 resent |= nak.retransmitted
-                ours = self._may_be_ours(nak)
-                # ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost;
-                # else it is a plain failure.
+                ours = self._may_have_opened(nak)
+                # ArduPilot says FAIL, too, if the session is open under our id.
                 taken = nak.code in _OPEN_TAKEN or (nak.code == NakCode.FAIL and ours and echoes is not False)
                 if not ours or not taken:
                     self.maybe_open.clear()
@@ -269,10 +276,10 @@ class ServerSession:
         if self.session.writing:
             self.wrote_at = self.session.opened_at
 
-    def _may_be_ours(self, nak: FtpNak) -> bool:
-        """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or a late
-        copy of an older open came."""
-        return nak.retransmitted or (self.doubt.is_active() and not self._others_heard())
+    def _may_have_opened(self, nak: FtpNak) -> bool:
+        """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or
+        a late copy of an older open came."""
+        return nak.retransmitted or (self.doubt.is_active() and not self._another_client_heard())
 
     # --- closing
 
@@ -312,11 +319,11 @@ class ServerSession:
             await self.close(TERMINATE_LIMIT)
 
     async def close_maybe_open(self) -> None:
-        """Close what may still be open by our doing; after a failure it may be open as before."""
+        """Close what may be open by our doing. Where that fails it may be open as before."""
         with suppress(MavftpfsError):
-            await self._close_what_may_be_ours()
+            await self._close_maybe_open()
 
-    async def _close_what_may_be_ours(self) -> bool:
+    async def _close_maybe_open(self) -> bool:
         """Close what may be open by our doing, but not what another client may own; return whether something
         was closed, or was not there.
 
@@ -419,7 +426,7 @@ class ServerSession:
         for seconds in left.silences:
             if await self.driver.be_silent(seconds):
                 return
-        if not left.resets or self._others_heard():
+        if not left.resets or self._another_client_heard():
             raise SessionBusy("the vehicle's only FTP session is in use by another client") from nak
         left.resets -= 1
         session = self.engine.home_session
@@ -429,7 +436,7 @@ class ServerSession:
         if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno
             await self._try(ListDirectory(b"/", False))
             return True
-        return self._may_be_ours(nak) and await self._close_what_may_be_ours()
+        return self._may_have_opened(nak) and await self._close_maybe_open()
 
     async def _try(self, operation: Operation) -> None:
         """Run a remedy whose refusal changes nothing.
@@ -444,7 +451,7 @@ class ServerSession:
         except MavftpfsError:
             pass
 
-    def _others_heard(self) -> bool:
+    def _another_client_heard(self) -> bool:
         return self.vehicle.foreign_client(self.clock())
 
 
