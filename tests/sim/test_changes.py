@@ -6,7 +6,7 @@ ours is open where a name changes is asserted in every test with a Rig (support/
 
 from __future__ import annotations
 
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from typing import Literal
 
 import pytest
@@ -17,6 +17,7 @@ from mavftpfs.cache.pathlocks import SLACK
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, crc32
 from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.store import Store
 from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -185,6 +186,28 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing() -> No
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(here.faults.requests)
+
+
+@pytest.mark.parametrize(
+    ("opcode", "change"),
+    [
+        (Opcode.REMOVE_FILE, lambda store: store.remove(D + b"/a")),
+        (Opcode.REMOVE_DIRECTORY, lambda store: store.remove_directory(D + b"/empty")),
+        (Opcode.RENAME, lambda store: store.rename(D + b"/a", D + b"/c")),
+        (Opcode.CREATE_DIRECTORY, lambda store: store.make_directory(D + b"/new")),
+    ],
+)
+async def test_in_doubt_a_refusal_may_answer_the_networks_copy_of_the_request(
+    opcode: Opcode, change: Callable[[Store], Awaitable[None]]
+) -> None:
+    """The first was carried out, and its answer is lost. (PX4 and ArduPilot send that answer once more.)"""
+    here = made("mavsdk")
+    async with here.connected() as connection:
+        connection.scheduler.doubt.raise_it("for the test")
+        here.faults.repeat(1)
+        here.faults.lose_reply_to(opcode)
+        await change(connection.store)
+        assert here.faults.requests.count(opcode) == 2
 
 
 async def test_changes_that_concern_one_another_take_turns() -> None:
