@@ -412,27 +412,27 @@ def recover(args: Args) -> int:
     """List what did not reach a vehicle, or put it where it belonged."""
     base = recovered_directory()
     if args.source is None:
-        _list_kept(recovering.kept_below(base), as_json=args.json)
+        _list_recovered(recovering.recovered_below(base), as_json=args.json)
         return ExitCode.OK
-    wanted = recovering.kept_below(base) if args.all else recovering.chosen(args.names, base)
+    wanted = recovering.recovered_below(base) if args.all else recovering.chosen(args.names, base)
     if args.all and not wanted:
-        _list_kept(wanted, as_json=False)
+        _list_recovered(wanted, as_json=False)
         return ExitCode.OK
     if not wanted:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
     bar = Progress()
 
-    def tell(kept: recovering.Kept, there_already: bool) -> None:
+    def tell(copy: recovering.Recovered, there_already: bool) -> None:
         how = "was there already" if there_already else "is on the vehicle now, verified"
-        print(f"{_name(kept.path or b'')} {how}; the copy here is removed", flush=True)
+        print(f"{_name(copy.path or b'')} {how}; the copy here is removed", flush=True)
 
-    async def work(session: Session) -> list[recovering.Kept]:
+    async def work(session: Session) -> list[recovering.Recovered]:
         async with noting_losses(session, bar):
             return await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
     with shown(bar):
         others = with_session(args, work, writing=True)
-    for vehicle, count in Counter(kept.vehicle for kept in others).items():
+    for vehicle, count in Counter(copy.vehicle for copy in others).items():
         say(
             f"{count} file(s) of {vehicle} stay here: this is another vehicle; "
             "give theirs as SOURCE, or name a file and --force"
@@ -440,22 +440,22 @@ def recover(args: Args) -> int:
     return ExitCode.INCOMPLETE if others else ExitCode.OK
 
 
-def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
-    """Print what was kept by directory, and what still lies where a killed mount left it."""
+def _list_recovered(found: Sequence[recovering.Recovered], *, as_json: bool) -> None:
+    """Print the recovered files by directory, and what still lies where a killed mount left it."""
     if as_json:
-        print(json.dumps([kept.described() for kept in found], indent=2))
+        print(json.dumps([copy.described() for copy in found], indent=2))
         return
     directory = None
-    for kept in found:
-        if kept.file.parent != directory:
-            directory = kept.file.parent
+    for copy in found:
+        if copy.file.parent != directory:
+            directory = copy.file.parent
             print(f"{directory}:")
-        belongs = "?" if kept.path is None else _name(kept.path)
-        belongs += f" on {kept.vehicle}" if kept.vehicle else ""
-        at = kept.facts.get("at")
+        belongs = "?" if copy.path is None else _name(copy.path)
+        belongs += f" on {copy.vehicle}" if copy.vehicle else ""
+        at = copy.facts.get("at")
         when = f", {datetime.fromtimestamp(at):%Y-%m-%d %H:%M}" if isinstance(at, int | float) else ""
-        reason = kept.hindrance or kept.facts.get("error") or ""
-        line = f"  {printable(kept.file.name)} for {belongs}, {readable_size(kept.size)}{when}"
+        reason = copy.hindrance or copy.facts.get("error") or ""
+        line = f"  {printable(copy.file.name)} for {belongs}, {readable_size(copy.size)}{when}"
         print(printable(f"{line}: {reason}" if reason else line))
     left = left_by_killed_mounts_line()
     if left:

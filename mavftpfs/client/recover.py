@@ -36,8 +36,8 @@ _TICK = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """A file that did not reach the vehicle.
+class Recovered:
+    """The copy here of a file that did not reach the vehicle.
 
     facts: what was written down about it, as JSON holds it. named: a person named this file itself.
     """
@@ -101,7 +101,7 @@ def _vehicle_text(facts: Mapping[str, Any]) -> str:
 # -- what there is --------------------------------------------------------------------------------
 
 
-def kept_below(base: Path) -> list[Kept]:
+def recovered_below(base: Path) -> list[Recovered]:
     """Return all files in the recovery directories, the oldest directory first.
 
     Raises:
@@ -113,10 +113,10 @@ def kept_below(base: Path) -> list[Kept]:
         return []
     except OSError as exc:
         raise UsageError(f"{base}: {exc.strerror}") from exc
-    return [kept for directory in directories for kept in kept_in(directory)]
+    return [copy for directory in directories for copy in recovered_in(directory)]
 
 
-def kept_in(directory: Path) -> list[Kept]:
+def recovered_in(directory: Path) -> list[Recovered]:
     """Return the files in one recovery directory.
 
     Raises:
@@ -127,7 +127,7 @@ def kept_in(directory: Path) -> list[Kept]:
     except OSError as exc:
         raise UsageError(f"{directory}: {exc.strerror}") from exc
     files = {path for path in paths if not (path.suffix == ".json" and path.with_suffix("") in paths)}
-    return [Kept(path, _read_facts(Path(f"{path}.json"))) for path in sorted(files)]
+    return [Recovered(path, _read_facts(Path(f"{path}.json"))) for path in sorted(files)]
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
@@ -139,21 +139,23 @@ def _read_facts(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def chosen(names: Sequence[str], base: Path) -> list[Kept]:
+def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
     """Return the files that a person named: by their paths, or by a directory for all that is in it.
 
     Raises:
         UsageError: there is no such file.
     """
-    found: list[Kept] = []
+    found: list[Recovered] = []
     for name in names:
         path = Path(name) if os.path.exists(name) else base / name
         if path.is_dir():
-            found += kept_in(path)
+            found += recovered_in(path)
             continue
         if not path.is_file():
             raise UsageError(f"{name} is nothing that was kept; `mavftpfs recover` lists what is")
-        found += [replace(kept, named=True) for kept in kept_in(path.parent) if kept.file.name == path.name]
+        found += [
+            replace(copy, named=True) for copy in recovered_in(path.parent) if copy.file.name == path.name
+        ]
     return found
 
 
@@ -162,12 +164,12 @@ def chosen(names: Sequence[str], base: Path) -> list[Kept]:
 
 async def put_back(
     session: Session,
-    wanted: Sequence[Kept],
+    wanted: Sequence[Recovered],
     progress: Progress,
-    tell: Callable[[Kept, bool], None],
+    tell: Callable[[Recovered, bool], None],
     *,
     force: bool,
-) -> list[Kept]:
+) -> list[Recovered]:
     """Put files where they belonged. Once it is proven that the vehicle has a file, the copy here is removed.
 
     tell: called for each file, with whether it was there already. force: also replace a file that is not the
@@ -179,58 +181,58 @@ async def put_back(
         UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
     """
     others = await _of_others(session, wanted, force=force)
-    wanted = [kept for kept in wanted if kept not in others]
-    for kept in wanted:
-        if kept.hindrance:
+    wanted = [copy for copy in wanted if copy not in others]
+    for copy in wanted:
+        if copy.hindrance:
             raise UsageError(
-                f"{kept.file}: {kept.hindrance}; look at it, use `mavftpfs put`, and delete it here"
+                f"{copy.file}: {copy.hindrance}; look at it, use `mavftpfs put`, and delete it here"
             )
-    progress.plan(len(wanted), sum(kept.size for kept in wanted))
-    for kept in wanted:
-        path = _in_session(session, kept)
-        there_already = await _is_there(session, path, kept, force=force)
+    progress.plan(len(wanted), sum(copy.size for copy in wanted))
+    for copy in wanted:
+        path = _in_session(session, copy)
+        there_already = await _is_there(session, path, copy, force=force)
         if not there_already:
-            await put_file(session, kept.file, path, progress)
-            if await _differs(session, path, kept):
-                raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
-        _forget(kept)
-        tell(kept, there_already)
+            await put_file(session, copy.file, path, progress)
+            if await _differs(session, path, copy):
+                raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {copy.file}")
+        _forget(copy)
+        tell(copy, there_already)
     return others
 
 
-async def _of_others(session: Session, wanted: Sequence[Kept], *, force: bool) -> list[Kept]:
+async def _of_others(session: Session, wanted: Sequence[Recovered], *, force: bool) -> list[Recovered]:
     """Return the files that are of another vehicle. force: but not those that a person named.
 
     Raises:
         UsageError: a person named one of them.
     """
-    if not any(kept.facts.get("uid") for kept in wanted):
+    if not any(copy.facts.get("uid") for copy in wanted):
         return []
     vehicle = (await session.status())["vehicle"]
     with trio.move_on_after(VERSION_PATIENCE):
         while vehicle["firmware"] is None:  # it is told together with the unique id
             await trio.sleep(_TICK)
             vehicle = (await session.status())["vehicle"]
-    others = [kept for kept in wanted if kept.is_of_another(vehicle) and not (kept.named and force)]
-    for kept in others:
-        if kept.named:
+    others = [copy for copy in wanted if copy.is_of_another(vehicle) and not (copy.named and force)]
+    for copy in others:
+        if copy.named:
             here = _vehicle_text(vehicle)
             raise UsageError(
-                f"{kept.file} is of {kept.vehicle}, and this is {here}; --force puts it here all the same"
+                f"{copy.file} is of {copy.vehicle}, and this is {here}; --force puts it here all the same"
             )
     return others
 
 
-def _in_session(session: Session, kept: Kept) -> bytes:
+def _in_session(session: Session, copy: Recovered) -> bytes:
     """Return the path of a file below the session's root."""
-    assert kept.path is not None
+    assert copy.path is not None
     root = session.root.rstrip(b"/")
-    if not kept.path.startswith(root + b"/"):
-        raise UsageError(f"{name_text(kept.path)} does not lie below {name_text(session.root)}")
-    return kept.path[len(root) :]
+    if not copy.path.startswith(root + b"/"):
+        raise UsageError(f"{name_text(copy.path)} does not lie below {name_text(session.root)}")
+    return copy.path[len(root) :]
 
 
-async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -> bool:
+async def _is_there(session: Session, path: bytes, copy: Recovered, *, force: bool) -> bool:
     """Return whether the vehicle has the file with exactly these bytes.
 
     Raises:
@@ -242,9 +244,9 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
         return False
     if found.kind is not EntryKind.FILE:
         raise UsageError(f"{name_text(path)} is a directory on the vehicle")
-    if found.size == kept.size and await _differs(session, path, kept) is False:
+    if found.size == copy.size and await _differs(session, path, copy) is False:
         return True
-    before = kept.facts.get("size_on_vehicle")
+    before = copy.facts.get("size_on_vehicle")
     if found.size not in (before, 0) and not force:  # an empty one holds nothing to lose
         known = "nothing" if before is None else f"{before} bytes"
         raise UsageError(
@@ -254,19 +256,19 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
     return False
 
 
-async def _differs(session: Session, path: bytes, kept: Kept) -> bool | None:
+async def _differs(session: Session, path: bytes, copy: Recovered) -> bool | None:
     """Compare with the vehicle's checksum; None where there is none."""
     try:
-        return await session.files.crc32(path) != await local_crc32(kept.file)
+        return await session.files.crc32(path) != await local_crc32(copy.file)
     except NO_CHECKSUM:
         return None
 
 
-def _forget(kept: Kept) -> None:
+def _forget(copy: Recovered) -> None:
     """Remove a copy and its description, and the directory with the last one."""
-    directory = kept.file.parent
-    kept.file.unlink()
-    kept.file.with_name(f"{kept.file.name}.json").unlink(missing_ok=True)
-    if not kept_in(directory):
+    directory = copy.file.parent
+    copy.file.unlink()
+    copy.file.with_name(f"{copy.file.name}.json").unlink(missing_ok=True)
+    if not recovered_in(directory):
         with suppress(OSError):
             directory.rmdir()

@@ -229,9 +229,9 @@ class ServerSession:
 
         | the refusal | may an open of ours have been carried out? | `maybe_open` | then |
         |---|---|---|---|
-        | one of _OPEN_TAKEN | yes | stays: the first remedy closes it | a remedy |
+        | one of _OPEN_TAKEN | yes | stays: a remedy may close it | a remedy |
         | one of _OPEN_TAKEN | no | is cleared | a remedy |
-        | FAIL, perhaps of an ArduPilot | yes | stays: the first remedy closes it | a remedy |
+        | FAIL, perhaps of an ArduPilot | yes | stays: a remedy may close it | a remedy |
         | any other | - | is cleared | it is raised |
         """
         remedies, resent = _Remedies(), False
