@@ -160,12 +160,12 @@ class Watch:
                 try:
                     mounted = await target.mounted()
                     if mounted is not None:
-                        self._settled("link")
+                        self._forget_complaint("link")
                         await self.serve(MountContact(mounted))
                         continue
                     assert target.spec is not None
                     async with opened(target.spec, target.options) as link:
-                        self._settled("link")
+                        self._forget_complaint("link")
                         await self.run_on(link, target.spec, target.options, target.sinks)
                 except (LinkError, RequestTimeout) as exc:
                     self._complain("link", str(exc))
@@ -260,7 +260,7 @@ class Watch:
             failed = True
             self._complain(f"logs of {system}", f"vehicle {system}: {named(path, error)}")
         if not failed:
-            self._settled(f"logs of {system}")
+            self._forget_complaint(f"logs of {system}")
         self._logs[system] = {log.remote: log for log in new}
         self._policy.looked(system, [Log(log.remote, log.size) for log in new], trio.current_time())
         if failed:
@@ -310,8 +310,8 @@ class Watch:
             self._complain(wanted.name, f"vehicle {system}: {named(wanted.name, exc)}; it is tried again")
             self._policy.failed(system, log, trio.current_time())
         else:
-            self._settled("local")
-            self._settled(wanted.name)
+            self._forget_complaint("local")
+            self._forget_complaint(wanted.name)
         finally:
             self._progress.end(wanted.size)
             self._progress.plan(0, 0)
@@ -350,7 +350,7 @@ class Watch:
                 needed = f"{readable_size(missing + SPARE)} are needed, {readable_size(free)} are free"
                 self._complain("local", f"{self._local} is full: {needed}; waiting for room")
                 return False
-        self._settled("local")
+        self._forget_complaint("local")
         return True
 
     # --- what is handed on
@@ -388,7 +388,7 @@ class Watch:
             self._complaints[about] = line
             self._say(line)
 
-    def _settled(self, about: str) -> None:
+    def _forget_complaint(self, about: str) -> None:
         """Forget the last line about something, because it is over."""
         self._complaints.pop(about, None)
 

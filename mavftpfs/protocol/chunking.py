@@ -81,7 +81,7 @@ class ChunkSize:
             if not self._answered:  # before that the whole link may have been away
                 self._lost, self._since = 0, max(self._since, sent_at)
             self._answered += count
-            self._settle(now)
+            self._judge_losses(now)
 
     def on_lost(self, size: int, sent_at: float, now: float) -> bool:
         """Note that a request for `size` bytes, sent then, is to be repeated; return whether its bytes go out
@@ -93,10 +93,11 @@ class ChunkSize:
             self._shortest_lost = min(self._shortest_lost, size)
             self._lost += 1
             self._short_next = False  # a short one is next, also where there is one request at a time
-            self._settle(now)
+            self._judge_losses(now)
         return size > self._least and (self.trying or size > self.size)
 
-    def _settle(self, now: float) -> None:
+    def _judge_losses(self, now: float) -> None:
+        """Try short chunks if long ones are lost; use short ones once they proved to come through."""
         seconds = now - self._first_lost_at
         if seconds < SUSPICIOUS_SECONDS:
             return

@@ -224,7 +224,7 @@ class Pacer:
             self.rate *= _CAREFUL / _BOLD
             self._raise, self._failed_once = _CAREFUL, False
         else:
-            self._settle(answers, loss, now)
+            self._hold_rate(answers, loss, now)
 
     def _accept(self, answers: float, loss: float) -> None:
         self._best, self._failed_once = answers, False
@@ -245,7 +245,8 @@ class Pacer:
     def _is_overflow(self, loss: float) -> bool:
         return loss - self._usual_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
 
-    def _settle(self, answers: float, loss: float, now: float) -> None:
+    def _hold_rate(self, answers: float, loss: float, now: float) -> None:
+        """Hold the best rate for a while, because the last raise brought nothing."""
         best = max(answers, self._best)
         overflowed = self._is_overflow(loss)
         self.rate = best / (1.0 - self._usual_loss) * (_SHARE_TAKEN if overflowed else 1.0)
@@ -257,7 +258,7 @@ class Pacer:
             self._raise = _BOLD
 
     def _watch(self, answers: float, loss: float) -> None:
-        """While the rate is kept, begin again if too few answers come. Another sender may have come, the
+        """While the rate is held, begin again if too few answers come. Another sender may have come, the
         server or the link may be slower, or the way longer. Only a start with few requests tells which."""
         expected = (self.rate or 0.0) * (1.0 - loss)
         if loss <= self._usual_loss + _ALARMING_LOSS and answers >= _SHORT * expected:
