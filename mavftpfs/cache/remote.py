@@ -81,7 +81,7 @@ class RemoteStore(Protocol):
         that is under way may go on when the vehicle is back."""
         ...
 
-    def others_heard(self) -> bool:
+    def another_client_heard(self) -> bool:
         """Return whether another FTP client was heard lately."""
         ...
 

@@ -153,7 +153,7 @@ class VirtualTrees:
             return
         if asked_for:
             await self._probing.run(None, self._probe_once)
-        elif not self._store.others_heard() and self._clock() >= self._probe_at:
+        elif not self._store.another_client_heard() and self._clock() >= self._probe_at:
             self._probe_at = self._clock() + PROBE_PAUSE
             with (
                 suppress(RequestTimeout, LinkError, SessionBusy),

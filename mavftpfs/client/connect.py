@@ -246,7 +246,7 @@ async def with_tree(
 
             def notice() -> str:
                 left = rescue(spool, rescue_for) if spool is not None and rescue_for is not None else ""
-                return "; ".join(filter(None, (others_heard(connection, options), left)))
+                return "; ".join(filter(None, (other_vehicles_heard(connection, options), left)))
 
             tree = Tree(
                 connection.store,
@@ -268,7 +268,7 @@ async def with_tree(
                     spool.discard()
 
 
-def others_heard(connection: Connection, options: Options) -> str:
+def other_vehicles_heard(connection: Connection, options: Options) -> str:
     """Return a line on other vehicles that are heard, if the first one was taken because it came first; else
     ""."""
     vehicle = connection.vehicle

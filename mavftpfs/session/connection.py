@@ -124,7 +124,7 @@ class Connection:
             own,
             write_armed=options.when_armed == "ok",
             on_reboot=self._on_reboot,
-            on_foreign=self._on_foreign,
+            on_another_client=self._on_another_client,
             on_heartbeat=self._on_heartbeat,
             on_armed=self._on_armed,
             on_refusal=partial(self._tell, "arming refused"),
@@ -202,7 +202,7 @@ class Connection:
                 "state": self._link_state(now),
                 "rtt": self.engine.rtt,
                 "loss": round(self.engine.flow.loss, 4),
-                "other_ftp_client": self.vehicle.foreign_client(now),
+                "other_ftp_client": self.vehicle.another_client_heard(now),
                 "received_bytes": link.stats.received_bytes,
                 "sent_bytes": link.stats.sent_bytes,
                 "requests": stats.requests,
@@ -249,9 +249,9 @@ class Connection:
         self.scheduler.on_reboot()
         self._tell("reboot")
 
-    def _on_foreign(self, payload: bytes, newcomer: bool) -> None:
+    def _on_another_client(self, payload: bytes, newcomer: bool) -> None:
         self.engine.flow.alone = False
-        self.scheduler.on_foreign(payload, newcomer=newcomer)
+        self.scheduler.on_another_client(payload, newcomer=newcomer)
 
     def _on_unexplained(self, reply: Payload, late: float) -> None:
         self.scheduler.on_unexplained(reply, late)
@@ -299,7 +299,7 @@ class Connection:
         while True:
             if kind != "none":
                 driver.send(driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID))
-            self.engine.flow.alone = not self.vehicle.foreign_client(self.clock())
+            self.engine.flow.alone = not self.vehicle.another_client_heard(self.clock())
             await trio.sleep(HEARTBEAT_PERIOD)
             if not self.was_lost and self.vehicle.lost(self.clock()):
                 self.was_lost = True

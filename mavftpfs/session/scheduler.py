@@ -410,7 +410,7 @@ class Scheduler:
 
     # --- news
 
-    def on_foreign(self, payload: bytes, *, newcomer: bool) -> None:
+    def on_another_client(self, payload: bytes, *, newcomer: bool) -> None:
         """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
         been missed."""
         now, engine = self.clock(), self._driver.engine

@@ -452,7 +452,7 @@ class ServerSession:
             pass
 
     def _another_client_heard(self) -> bool:
-        return self.vehicle.foreign_client(self.clock())
+        return self.vehicle.another_client_heard(self.clock())
 
 
 def _lost() -> SessionLost:

@@ -246,9 +246,9 @@ class Store:
 
     # --- changing
 
-    def others_heard(self) -> bool:
+    def another_client_heard(self) -> bool:
         """Return whether another FTP client was heard lately."""
-        return self._vehicle.foreign_client(self._clock())
+        return self._vehicle.another_client_heard(self._clock())
 
     def address(self) -> tuple[int, int]:
         """Return system and component id, of an autopilot where nothing was heard yet."""

@@ -365,7 +365,7 @@ class Upload(SessionUser):
             stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
             # After a silence the session may be gone (servers.md 14.9): the answer to Terminate tells. Where
             # closing costs the whole file, it is closed only if another client was heard.
-            closes = self._keeps_content or self._vehicle.foreign_client(clock())
+            closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
             if stalled and stop is None:
                 stop = Stop.YIELD

@@ -38,7 +38,7 @@ from mavftpfs.shared.readable import autopilot_name
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
 
-FOREIGN_MEMORY = 10.0
+CLIENT_MEMORY = 10.0
 """Seconds for which an FTP client that was heard counts as present."""
 
 ABSENCE = 2.5
@@ -191,8 +191,8 @@ class Vehicle:
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
-    own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
-    another client's, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
+    own: our address; replies to anyone else are another FTP client's. on_another_client: called with each
+    payload of its, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
     on_double: somebody else uses our address. on_doubt: see Identity.
 
     Attributes:
@@ -205,7 +205,7 @@ class Vehicle:
     own: Address
     write_armed: bool = False
     on_reboot: Callable[[], None] = lambda: None
-    on_foreign: Callable[[bytes, bool], None] = lambda payload, newcomer: None
+    on_another_client: Callable[[bytes, bool], None] = lambda payload, newcomer: None
     on_heartbeat: Callable[[], None] = lambda: None
     on_armed: Callable[[bool], None] = lambda armed: None
     on_refusal: Callable[[], None] = lambda: None
@@ -216,7 +216,7 @@ class Vehicle:
     heartbeat_at: float | None = None
     version: AutopilotVersion | None = None
     storage: StorageInformation | None = None
-    foreign_at: float | None = None
+    another_client_at: float | None = None
     reboots: int = 0
     refusals: int = 0
     identity: Identity = field(init=False)
@@ -284,9 +284,9 @@ class Vehicle:
         silent = not self.identity.heard_since(now - SILENCE_LIMIT)
         return _SILENT if silent or self.lost(now) else None
 
-    def foreign_client(self, now: float) -> bool:
+    def another_client_heard(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
-        return self.foreign_at is not None and now - self.foreign_at < FOREIGN_MEMORY
+        return self.another_client_at is not None and now - self.another_client_at < CLIENT_MEMORY
 
     @property
     def tells_boot_time(self) -> bool:
@@ -312,7 +312,7 @@ class Vehicle:
             case Heartbeat():
                 self._on_heartbeat(message, now)
             case FtpRun():
-                self._on_foreign_ftp(message, now)
+                self._on_ftp_of_another_client(message, now)
             case _ if self.address is None or message.source.system != self.address.system:
                 return
             case AutopilotVersion() if message.source == self.address:
@@ -377,7 +377,7 @@ class Vehicle:
             self.may_write = self.write_armed or not armed
             self.on_armed(armed)
 
-    def _on_foreign_ftp(self, run: FtpRun, now: float) -> None:
+    def _on_ftp_of_another_client(self, run: FtpRun, now: float) -> None:
         if self.address is None or run.source == self.own:
             return
         for payload in run.payloads:
@@ -386,9 +386,9 @@ class Vehicle:
             else:
                 theirs = run.target.system in (0, self.address.system)
             if theirs:
-                newcomer = not self.foreign_client(now)
-                self.foreign_at = now
-                self.on_foreign(payload, newcomer)
+                newcomer = not self.another_client_heard(now)
+                self.another_client_at = now
+                self.on_another_client(payload, newcomer)
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
         before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000

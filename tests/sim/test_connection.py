@@ -221,10 +221,10 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(monkeypatch: pytest
 async def test_another_vehicle_that_is_heard_is_said(target: int) -> None:
     options = Options(target_system=target)
     async with Rig("px4", {b"/d": None}).connected() as connection:
-        assert compose.others_heard(connection, options) == ""
+        assert compose.other_vehicles_heard(connection, options) == ""
         other, station = Address(2, 1), Address(255, 190)
         heard = connection.vehicle.heard
         heard[other] = Heartbeat(other, 2, 3, armed=False)
         heard[station] = Heartbeat(station, MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, armed=False)
         said = "this is 1/1; 2/1 (ArduPilot quadrotor, disarmed) is heard, too: -o target_system=2, or -o all"
-        assert compose.others_heard(connection, options) == ("" if target else said)
+        assert compose.other_vehicles_heard(connection, options) == ("" if target else said)

@@ -240,7 +240,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await trio.sleep(pause)
         here.another_asks(Opcode.NONE)
         await trio.sleep(0.5)
-        assert connection.vehicle.foreign_at is not None
+        assert connection.vehicle.another_client_at is not None
         assert bool(sink.suspicions) is doubted
         await trio.sleep(11)
         connection.scheduler.doubt.raise_it("once more")
@@ -338,5 +338,5 @@ async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(p
         nursery.start_soon(rival)
         got = first + bytes(await file.read(1000, 299_000))
         assert got == content(300_000)
-        assert here.connection.vehicle.foreign_at is not None
+        assert here.connection.vehicle.another_client_at is not None
         file.close()
