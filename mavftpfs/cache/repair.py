@@ -66,10 +66,12 @@ class Cleaner:
         targets = {record.aside: target for target, record in replacements if record.aside is not None}
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
         if directory is self._context.directories.known(path):
+            here = {join(path, name) for name in directory.entries}
             for target, record in replacements:
-                parent, name = split(target)
-                if parent == path and name in directory.entries and record.lacks_file:
-                    self._on_found(target)
+                if split(target)[0] == path and record.lacks_file:
+                    lost = directory.complete and record.aside not in here
+                    if target in here or lost:
+                        self._on_nothing_to_mend(target)
         if path in self._busy or not reserved:
             return
         self._busy.add(path)
@@ -115,15 +117,14 @@ class Cleaner:
 
     # --- inside
 
-    def _on_found(self, path: bytes) -> None:
-        """Note that a name has a file. If a draft waits to be delivered there, its delivery compares that
-        file; else nothing is unfinished any more."""
-        replacements = self._context.replacements
-        record = replacements.get(path)
-        if record is not None and record.placed is None and self._waits_for_delivery(path):
+    def _on_nothing_to_mend(self, path: bytes) -> None:
+        """Note that a name has a file, or that the old file is gone, too. If a draft waits to be delivered
+        there, its delivery looks at that; else nothing is unfinished any more."""
+        record = self._context.replacements.get(path)
+        if record is not None and self._waits_for_delivery(path):
             record.aside = None
         else:
-            replacements.end(path)
+            self._context.replacements.end(path)
 
     def _waits_for_delivery(self, path: bytes) -> bool:
         """Return whether a draft of this path waits to be delivered."""
@@ -156,7 +157,7 @@ class Cleaner:
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
             await self._names.rename(left, target, completes=known_target is not None)
             if known_target is not None:
-                self._on_found(known_target)
+                self._on_nothing_to_mend(known_target)
 
     async def _exists(self, path: bytes) -> bool:
         """Return whether the vehicle has a file of this name.

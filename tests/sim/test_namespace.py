@@ -435,6 +435,36 @@ async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(torn: Rig
     assert torn.count(*LISTS) == listings
 
 
+@pytest.mark.parametrize("drafted", [False, True])
+async def test_a_torn_name_whose_old_file_others_removed_is_not_looked_for_without_end(
+    torn: Rig, drafted: bool
+) -> None:
+    """A draft of it becomes a new file."""
+    tree = torn.mount()
+    if drafted:
+        await tree.list(b"/d")
+        file = await tree.open(FILE, write=True)
+        await file.write(5, b"more")
+        fall_silent(torn)
+        with pytest.raises(RequestTimeout):
+            await file.fsync()
+    else:
+        await tear(torn, tree)
+    for path in torn.litter():
+        torn.take(path)
+    speak(torn)
+    await trio.sleep(2 * PAUSES[0] + 8)
+    listings = torn.count(*LISTS)
+    await trio.sleep(100)
+    assert torn.count(*LISTS) == listings
+    if drafted:
+        await file.release()
+        assert torn.data(FILE) == OLD[:5] + b"more" + OLD[9:]
+    else:
+        with pytest.raises(NotFound):
+            await tree.stat(FILE)
+
+
 @pytest.mark.parametrize("path", [FILE, LONG])
 async def test_removing_a_torn_file_removes_it(torn: Rig, path: bytes) -> None:
     tree = torn.mount()
