@@ -73,8 +73,9 @@ async def require_base_there(context: Context, draft: Draft) -> None:
         FileChanged: one of them took the name away, so the draft is stale. Else as Directories.ask_entry.
     """
     for path in list(draft.taken_if_gone):
-        if await context.directories.ask_entry(path) is None:
-            draft.lose_base()
+        gone = await context.directories.ask_entry(path) is None
+        if gone and path in draft.taken_if_gone:  # else it was emptied, or the name went otherwise, meanwhile
+            draft.lose_base(though_rewritten=True)
             raise FileChanged(f"{path!r} is gone: what was changed here is another file by now")
         draft.taken_if_gone.discard(path)
 

@@ -224,7 +224,7 @@ class Draft:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        if size == self.size:
+        if size == self.size and self.state is not State.STALE:
             return
         if size > self.size:
             self.on(Event.CHANGED)
@@ -285,9 +285,12 @@ class Draft:
         self.sent_in_place = False
         self.content.mark_unneeded()
 
-    def lose_base(self) -> None:
-        """Note that others replaced the base. That changes nothing if no byte of the base was to stay."""
-        if self.base_limit and self.state is not State.STALE:
+    def lose_base(self, *, though_rewritten: bool = False) -> None:
+        """Note that others replaced the base. That changes nothing if no byte of the base was to stay, unless
+        `though_rewritten`: another file that got the name by a change of ours may be its only copy.
+        """
+        kept = self.base_limit or self.state is State.CLEAN  # CLEAN: also an empty base
+        if (kept or though_rewritten) and self.state is not State.STALE:
             self.give_up()
             self.on(Event.REPLACED)
 
@@ -300,6 +303,8 @@ class Draft:
         after = TRANSITIONS[self.state].get(event)
         if after is None:
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
+        if self.state is State.STALE:  # it was emptied, so whatever has the name is to be replaced
+            self.taken_if_gone.clear()
         self.state = after
         if after is not State.SENDING:
             self.sending = None

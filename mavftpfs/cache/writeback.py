@@ -129,9 +129,11 @@ class Writeback:
         require_writable(path)
         require_listable(path)
         async with self._context.paths.hold(path, shared=True):
-            if await self._context.entry(path) is None:
+            context, node = self._context, self._context.nodes.get(path)
+            drafted = node is not None and node.draft is not None  # it is shown, stale or not
+            if not drafted and await context.entry(path) is None:
                 await self._names.require_new(path)
-                context, node = self._context, self._context.nodes.need(path)
+                node = context.nodes.need(path)
                 made = node.draft is None
                 if made and node.handles:
                     # A program has a file open that others removed: it must not read the one made now.

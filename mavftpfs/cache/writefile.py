@@ -254,7 +254,7 @@ class WriteFile(ReadFile):
         if node.removed or size:
             node.require_not_stale()
         assert node.draft is not None
-        if size == node.draft.size:
+        if size == node.draft.size and node.draft.state is not State.STALE:
             return
         if size:
             self._parts.throttle.require_sendable(node.draft, size)

@@ -325,6 +325,40 @@ async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(
             assert here.files() == {FILE: b"new", NEW: OLD[::-1]}
 
 
+@pytest.mark.parametrize("data", [b"new", b""])
+@pytest.mark.parametrize("opcode", [Opcode.RENAME, Opcode.REMOVE_FILE])
+async def test_after_that_refusal_the_name_can_be_written_anew(opcode: Opcode, data: bytes) -> None:
+    """It is a copy that begins anew: by O_TRUNC, and through the library by what makes files, too."""
+    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, data)
+        here.faults.at(opcode, lambda: fall_silent(here))
+        with pytest.raises(OutcomeUnknown):
+            await (tree.rename(NEW, FILE) if opcode is Opcode.RENAME else tree.unlink(FILE))
+        speak(here)
+        with pytest.raises(FileChanged):
+            await file.release()
+        await write_file(tree, FILE, b"again")
+        assert here.data(FILE) == b"again"
+
+
+@pytest.mark.holds("promise 1")
+async def test_who_opened_an_empty_file_does_not_write_over_what_got_its_name_unnoticed() -> None:
+    async with rig("px4", {FILE: b"", NEW: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        silence(here, carried_out=True, nth=1)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        assert await read_file(tree, FILE) == OLD
+        with pytest.raises(FileChanged):
+            await file.write(0, b"more")
+        await file.release()
+        assert here.files() == {FILE: OLD}
+
+
 @pytest.mark.holds("promise 1")
 async def test_a_checksum_is_asked_for_again_after_a_rename_without_an_answer() -> None:
     """Two files may have one size and time."""
