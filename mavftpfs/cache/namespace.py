@@ -157,11 +157,11 @@ class Namespace:
         else:
             context.require_idle(path)
         await self._names.purge(path)
-        async with self._looks_later(path):
-            if there and node is not None and node.needs_card:
-                await self._hide(node)
-                return
-            if there:
+        if there:
+            async with self._looks_later(path):
+                if node is not None and node.needs_card:
+                    await self._hide(node)
+                    return
                 await self._names.remove_if_there(path)
                 context.files.on_changed(path)
         if node is not None:

@@ -325,6 +325,24 @@ async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(
             assert here.files() == {FILE: b"new", NEW: OLD[::-1]}
 
 
+async def test_a_new_file_that_was_never_sent_says_nothing_of_an_earlier_rename() -> None:
+    """To remove it no request goes out, so none was answered."""
+    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, b"new")
+        silence(here, carried_out=True, nth=1)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(NEW, FILE)
+        speak(here)
+        again = await tree.create(NEW, exclusive=True)
+        await again.write(0, b"again")
+        await tree.unlink(NEW)
+        with pytest.raises(FileChanged):
+            await file.release()
+        assert here.files() == {FILE: OLD[::-1]}
+
+
 @pytest.mark.parametrize("data", [b"new", b""])
 @pytest.mark.parametrize("opcode", [Opcode.RENAME, Opcode.REMOVE_FILE])
 async def test_after_that_refusal_the_name_can_be_written_anew(opcode: Opcode, data: bytes) -> None:
