@@ -62,8 +62,8 @@ class Engine:
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
         on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
             explains, and with the seconds since its request went out (0 where that is not known).
-        on_late: called with each ACK that nothing waits for any more, of a request that was repeated or a
-            WriteFile that was cancelled, and with the time at which that went out first.
+        on_late: called with each ACK that nothing waits for any more, of a request that was repeated, or
+            whose operation was cancelled, and with the time at which that went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -183,7 +183,7 @@ class Engine:
                 self.flow.on_spurious()
             self._on_answers(request, 1, now)
             op = request.op
-            if op is self._ledger.ghost and reply.req_opcode == Opcode.WRITE_FILE:
+            if op is self._ledger.ghost:
                 self._on_late(reply, request.first_sent)
             op.on_reply(request, reply, now)
             if op.done:

@@ -437,14 +437,16 @@ class Scheduler:
             self.server.abandon()
 
     def on_late(self, reply: Payload, sent_at: float) -> None:
-        """An ACK came that nothing waits for any more: its request was repeated, or is a WriteFile that was
-        cancelled. sent_at: when it went out first. An open may have put its file in the place of the present
-        one; a WriteFile may have put its bytes into a later file."""
+        """An ACK came that nothing waits for any more: its request was repeated, or its operation cancelled.
+        sent_at: when it went out first. An open of an earlier file may have put that in the place of the
+        present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later one.
+        """
         server = self.server
+        earlier = sent_at < server.opening_at
         if reply.req_opcode in OPENING:
-            if server.session is None or server.session.seq != reply.seq:
+            if earlier or (server.session is None and not server.maybe_open):
                 self.on_unexplained(reply, self.clock() - sent_at)
-        elif reply.req_opcode == Opcode.WRITE_FILE and sent_at < server.wrote_at:
+        elif reply.req_opcode == Opcode.WRITE_FILE and earlier:
             self.doubt.raise_it("a WriteFile came after its file was closed", reads=False)
 
     def _on_reads_doubted(self, reason: str) -> None:

@@ -150,7 +150,7 @@ class ServerSession:
         writes it now.
         maybe_open: files that may be open over there by our doing, by session id: a request was not answered
         yet, or never, or the session is not believed any more.
-        wrote_at: when the last file was opened for writing.
+        opening_at: when the last open went out.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
         changed: where tasks park until something more is closed.
     """
@@ -171,7 +171,7 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
-        self.wrote_at = -inf
+        self.opening_at = -inf
         self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
@@ -244,6 +244,7 @@ class ServerSession:
                 self.maybe_open[asked] = path
             if not echoes:
                 self.maybe_open[0] = path
+            self.opening_at = self.clock()
             try:
                 await self.driver.run(operation)
             except FtpNak as nak:
@@ -273,8 +274,6 @@ class ServerSession:
             resent=resent or operation.retransmitted,
         )
         self.engine.session = self.session.id
-        if self.session.writing:
-            self.wrote_at = self.session.opened_at
 
     def _may_have_opened(self, nak: FtpNak) -> bool:
         """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or

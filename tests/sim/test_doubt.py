@@ -520,6 +520,22 @@ async def test_an_open_that_we_repeated_comes_late(
                 assert await rigs.read_file(tree, name) == data
 
 
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("lateness", [0.03, 0.04, 0.07])
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk", "ardupilot5"])
+async def test_an_open_whose_caller_was_cancelled_comes_late(profile: str, lateness: float) -> None:
+    """Before it would have been repeated. ArduPilot refuses the next open then."""
+    files = {b"/d/one": content(20_000, 1), b"/d/two": content(20_000, 2)}
+    async with rig(profile, files, link=LinkSettings(delay=0.01)) as here:
+        connection = here.connection
+        await connection.store.stat_size(path(profile, "one"))
+        came = come_late(here, lateness, Opcode.OPEN_FILE_RO)
+        with trio.move_on_after(0.002):
+            await connection.store.stat_size(path(profile, "one"))
+        await read_or_doubt(connection, path(profile, "two"), files[b"/d/two"])
+        assert came.is_set()
+
+
 @pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("profile", ["px4", "px4-2026", "mavsdk"])
 async def test_a_write_that_we_repeated_comes_into_the_last_round_trip_of_the_next_file(profile: str) -> None:
