@@ -341,8 +341,12 @@ class Upload(SessionUser):
                 if error is None:
                     assert stop is not None
                     return stop
-                if not is_blocked(error) or (blocked and not transfer.acked_bytes):
+                if not is_blocked(error):
                     raise error
+                if blocked and not transfer.acked_bytes:
+                    # Another client's path requests take no turns: the next turns try again.
+                    another = self._vehicle.another_client_heard(self._clock())
+                    raise SessionLost(f"beside another FTP client: {error}") if another else error
                 # From now on path operations take turns with uploads: first those under way end.
                 blocked = gate.shut = traits.paths_block_writes = True
         finally:

@@ -453,6 +453,21 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
     assert here.data(b"/d/new") == data
 
 
+@pytest.mark.holds("promise 7")
+async def test_a_client_that_lists_beside_an_upload_on_nuttx_does_not_pass_for_a_protected_file() -> None:
+    """Its requests for paths take no turns with the upload, which is refused each time that it goes on."""
+    data = content(40_000)
+    here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.1))
+    here.card.add_directory(b"/etc")
+    async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+        nursery.start_soon(copy, tree, b"new", data)
+        await trio.sleep(0.5)
+        for _ in range(13):  # an answer each, one after the other
+            here.another_asks(Opcode.LIST_DIRECTORY, b"/etc")
+            await trio.sleep(0.2)
+    assert here.data(b"/d/new") == data
+
+
 @pytest.mark.parametrize("replaces", [False, True])
 async def test_a_close_does_not_wait_for_another_upload_that_gives_no_way(replaces: bool) -> None:
     """Whether its name is still free, or the size under it, is asked of a listing there."""
