@@ -361,7 +361,7 @@ class Upload(SessionUser):
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
         """Return the reason to let go; None if the transfer ended by itself."""
         server, gate, clock = self._server, self._server.path_gate, self._clock
-        fed_at, let_in_at = clock(), -inf
+        fed_at, let_in_at, shut_for = clock(), -inf, 0.0
         while not transfer.done:
             server.require_open(session)
             if not transfer.starved:
@@ -379,12 +379,14 @@ class Upload(SessionUser):
                     return stop
             elif transfer.paused and transfer.idle:
                 paths_turn = max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0))
-                if gate.waiting and clock() - let_in_at >= 2.0 * paths_turn:
-                    let_in_at = clock()
+                # Beside a long listing or checksum others go in, too, each time after twice the wait.
+                # Else one might always be inside, and nothing would be written.
+                if gate.waiting and clock() - let_in_at >= (shut_for if gate.inside else inf):
+                    let_in_at, shut_for = clock(), 2.0 * max(shut_for, paths_turn)
                     await gate.let_in(paths_turn)
-                if not gate.inside:  # a long listing or checksum: others go in, too, and may have the session
+                if not gate.inside:
                     await self._unblock()
-                    transfer.paused, let_in_at = False, -inf
+                    transfer.paused, let_in_at, shut_for = False, -inf, 0.0
             self._driver.kick()
             await server.sleep(BRIEF_STARVE if transfer.starved else _OFTEN)
         return None

@@ -453,6 +453,30 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
     assert here.data(b"/d/new") == data
 
 
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("count", [1, 2])
+async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_turn(count: int) -> None:
+    """Also where one of them is always under way."""
+    directories = [b"/l%d" % number for number in range(count)]
+    files = {name + b"/a_long_name_of_a_log_%d.ulg" % i: b"" for name in directories for i in range(100)}
+    here = Rig("px4-nuttx", {b"/d": None, **files}, LinkSettings(rate=5_000.0, delay=0.1))
+    data = content(4_000)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        connection.engine.traits.paths_block_writes = True
+
+        async def list_for_ever(directory: bytes) -> None:
+            while True:
+                await connection.store.list_directory(here.root + directory)
+
+        for directory in directories:
+            nursery.start_soon(list_for_ever, directory)
+        await trio.sleep(1.0)
+        with trio.fail_after(90):
+            await put(connection, path("px4-nuttx", "new"), data)
+        nursery.cancel_scope.cancel()
+    assert here.data(b"/d/new") == data
+
+
 @pytest.mark.holds("promise 7")
 async def test_a_client_that_lists_beside_an_upload_on_nuttx_does_not_pass_for_a_protected_file() -> None:
     """Its requests for paths take no turns with the upload, which is refused each time that it goes on."""
