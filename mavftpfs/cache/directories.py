@@ -101,6 +101,17 @@ class Directory:
         """Return the best known size of a listed name in bytes."""
         return self.sizes.get(name, self.entries[name].size)
 
+    def has(self, path: bytes) -> DirEntry | None:
+        """Return the entry of a path that lies in it, None if there is none.
+
+        Raises:
+            ListingIncomplete: it shows none, and proves nothing.
+        """
+        entry = self.entries.get(split(path)[1])
+        if entry is None and not self.complete:
+            raise ListingIncomplete(f"{path!r} is not in what is known of its directory", [])
+        return entry
+
 
 @dataclass(frozen=True, slots=True)
 class Found:
@@ -289,11 +300,8 @@ class Directories:
         """
         if path.count(b"/") > MAX_DEPTH:
             raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
-        parent, name = split(path)
-        directory = await self.get(parent)
-        entry = directory.entries.get(name)
-        if entry is None and not directory.complete:
-            raise ListingIncomplete(f"{path!r} is not in what is known of its directory", [])
+        directory = await self.get(split(path)[0])
+        entry = directory.has(path)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
@@ -303,14 +311,14 @@ class Directories:
         `within` seconds ago; longer where listings take long (LOOK_FACTOR).
 
         Raises:
-            As ask, but None where its directory is gone.
+            As ask, but None where its directory is gone. ListingIncomplete: see Directory.has.
         """
-        parent, name = split(path)
+        parent, _ = split(path)
         known, began = self.known(parent), None
         if known is not None and within:
             began = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
         try:
-            return (await self.ask(parent, began=began)).entries.get(name)
+            return (await self.ask(parent, began=began)).has(path)
         except (NotFound, NotADirectory):
             return None
 

@@ -11,7 +11,15 @@ import pytest
 import trio
 
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, MavftpfsError, NotFound
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    FtpNak,
+    ListingIncomplete,
+    MavftpfsError,
+    NotFound,
+    OutcomeUnknown,
+)
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.replies import ack, nak
 from tests.support.rigs import Rig, read_file, rig
@@ -72,6 +80,26 @@ async def test_a_name_that_an_incomplete_listing_lacks_is_an_error_and_not_absen
         with pytest.raises(ListingIncomplete):
             await tree.stat(b"/d/" + lacking)
         assert tree.negative_valid_for(b"/d/" + lacking) == 0
+
+
+async def test_a_name_that_an_incomplete_listing_lacks_does_not_count_as_removed() -> None:
+    """A rename was not answered, and did not happen: the change of the other file stays."""
+    async with rig(files={F: b"before all"} | SIXTY, options=ConnectOptions(op_deadline=5.0)) as here:
+        tree = here.mount()
+        file = await tree.open(F, write=True)
+        await file.write(0, b"B")
+        here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), drop=True)
+        with pytest.raises(OutcomeUnknown):
+            await tree.rename(b"/d/file_59", F)
+        here.faults.cut_after(None)
+        FirstPageAgain(here, 60)
+        with pytest.raises(ListingIncomplete):
+            await file.fsync()
+        with pytest.raises(ListingIncomplete):
+            await tree.unlink(b"/d/file_58")
+        here.server.change = None
+        await file.release()
+        assert here.data(F) == b"Before all"
 
 
 @pytest.mark.parametrize("profile", KINDS)
