@@ -196,11 +196,10 @@ class Deliverer:
                     if not node.undelivered:
                         return True
                 await self.abandon(node)
-                if draft.sent_in_place:  # part of it may have the name
-                    if draft.base is None:
-                        await self._names.remove_if_there(node.path)
-                    else:
-                        there = None
+                if draft.base is not None:
+                    there = None if draft.sent_in_place else there
+                elif draft.sent_in_place or await self._is_empty_in_place(node.path):
+                    await self._names.remove_if_there(node.path)  # it is a part of ours
             except MavftpfsError as error:
                 log.info("%r is taken back, but nobody knows what has its name: %s", node.path, error)
                 there = None
@@ -245,7 +244,8 @@ class Deliverer:
                 log.warning("%s; sending it again", error)
                 await trio.sleep(RESEND_PAUSE)
             except MavftpfsError as error:
-                if not isinstance(error, PASSING) or not draft.size:
+                unsent = in_place and not draft.sent_in_place  # others may take the name meanwhile
+                if unsent or not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
                 if in_place or store.traits.rename_works is not False:
                     raise
@@ -371,12 +371,20 @@ class Deliverer:
             Names.is_free and Verifier.is_same.
         """
         await base.require_base_there(self._context, draft)
+        path = node.path
         if draft.base is not None and draft.base_limit:
-            if not await self.verifier.is_same(node.path, draft.base):
+            if not await self.verifier.is_same(path, draft.base):
                 draft.lose_base()
-                raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")
-        elif draft.base is None and not draft.sent_in_place and not await self._names.is_free(node.path):
-            raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
+                raise FileChanged(f"others changed {path!r} on the vehicle while it was changed here")
+        elif draft.base is None and not draft.sent_in_place:
+            free = await self._names.is_free(path) or await self._is_empty_in_place(path)
+            if not free:
+                raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
+
+    async def _is_empty_in_place(self, path: bytes) -> bool:
+        """Return whether files are sent under their own names, and an empty one is there: a CreateFile of
+        ours that was not answered may have made it, and else there is nothing to lose."""
+        return self._context.store.traits.rename_works is False and await self._names.size(path) == 0
 
     async def _commit(self, node: Node, draft: Draft, attempt: Attempt, crc32: int | None) -> None:
         """Rename what was sent and verified into place. crc32: as the vehicle told it, if it did.

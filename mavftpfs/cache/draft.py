@@ -125,7 +125,8 @@ class Draft:
             name away.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
-        sent_in_place: the file may exist under its own name because of us (cards that cannot rename).
+        sent_in_place: under its own name the card has bytes of it, or an old file that we may have emptied
+            (cards that cannot rename).
     """
 
     def __init__(self, content: Content, base: Known | None) -> None:
@@ -255,9 +256,10 @@ class Draft:
         """Start to send a whole draft to an empty file. in_place: under the file's own name, so the old
         content there does not count from now on. progress: see SendBuffer."""
         self.on(Event.BEGUN)
-        if in_place:
+        if in_place and self.base is not None:
             self.sent_in_place, self.base_limit = True, 0
-        self.sending = SendBuffer(self.local_bytes, self.size, progress)
+        read = self._bytes_in_place if in_place else self.local_bytes
+        self.sending = SendBuffer(read, self.size, progress)
         return self.sending
 
     def give_up(self) -> None:
@@ -319,6 +321,11 @@ class Draft:
             assert self.whole
 
     # --- inside
+
+    def _bytes_in_place(self, start: int, stop: int) -> bytes:
+        """Return bytes that are about to be sent under the file's own name: it was made by us."""
+        self.sent_in_place = True
+        return self.local_bytes(start, stop)
 
     def _tell_changed(self, start: int, stop: int) -> None:
         if self.sending is not None:

@@ -87,7 +87,9 @@ class Node:
     @property
     def changing(self) -> bool:
         """Whether we are changing the file that has its name on the vehicle (see Nodes.is_changing)."""
-        draft = self.draft
+        draft, attempt = self.draft, self.attempt
+        if attempt is not None and attempt.in_place:
+            return True
         return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
 
     @asynccontextmanager

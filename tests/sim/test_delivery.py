@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import json
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from random import Random
 
@@ -21,6 +21,7 @@ from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
+    AlreadyExists,
     Armed,
     FileChanged,
     FileTooLarge,
@@ -245,6 +246,33 @@ async def test_overwriting_in_place_that_failed_goes_on_later() -> None:
             await file.flush()
             assert here.data(FILE) == b"%d" % number * 700
             await file.release()
+
+
+@pytest.mark.parametrize("then", ["others", "later", "removed", "taken back"])
+@pytest.mark.parametrize("carried_out", [False, True])
+async def test_a_new_file_of_which_it_is_not_known_whether_it_was_made_in_place(
+    carried_out: bool, then: str
+) -> None:
+    """No byte of ours was sent: what others put there stays. An empty file is nothing that could be lost."""
+    async with rig("littlefs", {FILE: OLD}, options=ConnectOptions(op_deadline=5.0)) as here:
+        tree = here.mount()
+        await write_file(tree, OTHER, content(70_000))  # finds out that it cannot rename
+        file = await tree.create(FRESH, exclusive=True)
+        await file.write(0, NEW)
+        here.faults.at(Opcode.CREATE_FILE, lambda: here.faults.cut_after(0), drop=not carried_out)
+        with pytest.raises(RequestTimeout):
+            await file.fsync()
+        if then == "others":
+            here.put(FRESH, OLD)
+        here.faults.cut_after(None)
+        if then == "removed":
+            await tree.unlink(FRESH)
+        if then == "taken back":
+            assert await file.take_back() is False
+        with pytest.raises(AlreadyExists) if then == "others" else nullcontext():
+            await file.release()
+        await trio.sleep(100)
+        assert here.files().get(FRESH) == {"others": OLD, "later": NEW}.get(then)
 
 
 @pytest.mark.holds("promise 3")
