@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mavftpfs.cli.report import time_left
-from mavftpfs.client.progress import WAITING, Progress
+from mavftpfs.client.progress import Progress
 from mavftpfs.shared.readable import printable, readable_size
 
 _REFRESH = 5
@@ -28,7 +28,7 @@ def totals(progress: Progress) -> str:
     parts = [f"{progress.files_done}/{progress.files} files"] if progress.files > 1 else []
     parts.append(f"{readable_size(progress.done)} of {readable_size(progress.total)}")
     if progress.lost:
-        return ", ".join([*parts, WAITING])
+        return ", ".join([*parts, "waiting for the vehicle"])
     if progress.rate is not None:
         parts.append(f"{readable_size(progress.rate)}/s")
     if progress.time_left is not None and progress.done < progress.total:

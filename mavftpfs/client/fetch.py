@@ -272,7 +272,6 @@ class Fetcher:
             except (VehicleLost, RequestTimeout) as exc:
                 if not await self.session.lost():
                     raise
-                self.progress.wait()
                 if not await self.session.returned():
                     raise VehicleLost("the vehicle is silent") from exc
         raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")

@@ -16,8 +16,6 @@ from mavftpfs.client.files import Session
 from mavftpfs.shared.errors import LinkError
 from mavftpfs.shared.speed import Speed
 
-WAITING = "waiting for the vehicle"
-
 
 class Progress:
     """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is. untouched: under the name of
@@ -53,10 +51,6 @@ class Progress:
     def check(self) -> None:
         """Note that all bytes moved, and are being compared."""
         self.state = "checking"
-
-    def wait(self) -> None:
-        """Note that the vehicle is lost."""
-        self.state = WAITING
 
     def end(self, planned: int) -> None:
         """Note that the file is done, or failed; `planned`: its bytes in the plan."""

@@ -31,7 +31,7 @@ def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it
     progress.begin("/a", 1_000_000)
     move(progress, clock, 6)
     assert totals(progress) == "60.0 kB of 1.0 MB, 10.0 kB/s, 1 min 34 s left"
-    progress.wait()
+    progress.check()
     progress.lost = True
     assert totals(progress) == "60.0 kB of 1.0 MB, waiting for the vehicle"
     assert current(progress, 80) == "/a"
