@@ -33,7 +33,9 @@ class LateCopies:
     A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
     CreateFile that comes even later empties the file, which is found when it is compared again under its
     final name. Without this rest a link that delivers all requests twice could make an empty file under the
-    old name, by the copy of CreateFile, and put it under the final name, by the copy of the rename.
+    old name, by the copy of CreateFile, and put it under the final name, by the copy of the rename. Where
+    nothing can be renamed the file has its final name at once, and rests after any CreateFile of ours that
+    was repeated.
 
     Names that differ by case alone count as one, as on many cards.
     """
@@ -55,8 +57,8 @@ class LateCopies:
         self._note(path.lower(), now, now + LEAST_REST, now)
 
     def on_repeated(self, path: bytes, seconds: float, now: float) -> None:
-        """A request that may have taken the file of this name away was sent more than once, and answered so
-        many seconds after the first time."""
+        """A request that may have taken the file of this name away, or emptied it, was sent more than once,
+        and answered so many seconds after the first time."""
         self._note(path.lower(), now, now, now + max(LEAST_REST, min(MOST_REST, 2 * seconds)))
 
     def on_made(self, path: bytes, now: float) -> None:

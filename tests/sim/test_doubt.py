@@ -314,6 +314,20 @@ async def test_a_create_that_we_repeated_comes_after_the_file_was_compared() -> 
 
 
 @pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("lateness", [0.2, 0.4, 0.8])
+async def test_nor_does_it_empty_a_file_that_has_its_final_name_at_once(lateness: float) -> None:
+    """The card cannot rename, so nothing would compare the file again."""
+    async with rig("littlefs", {b"/d/k": b"x"}, link=LinkSettings(delay=0.01)) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/first", content(300, 1))  # that is known from now on
+        came = come_late(here, lateness, Opcode.CREATE_FILE)
+        await write_file(tree, b"/d/new", content(300, 2))
+        await came.wait()
+        await trio.sleep(READY)
+        assert here.data(b"/d/new") == content(300, 2)
+
+
+@pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("verify", ["auto", "none"])
 @pytest.mark.parametrize("after", [Opcode.CALC_FILE_CRC32, Opcode.OPEN_FILE_RO, Opcode.TERMINATE_SESSION])
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
