@@ -46,8 +46,7 @@ ABSENCE = 2.5
 starts faster. (A cable that is moved reopens the link, which is told.)"""
 
 MOST_UNANSWERED = 20
-"""Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
-tell their id only once. From then on it is asked as before, but believed meanwhile."""
+"""Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one."""
 
 _REPLACED = "another vehicle answers in place of the one that was mounted"
 _SILENT = "the vehicle is silent; waiting for its heartbeat"
@@ -88,9 +87,6 @@ class Identity:
         self._known: AutopilotVersion | None = None  # its id, once it was told
         # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
         self._strange = False
-        # It told its id once, and then left MOST_UNANSWERED questions unanswered. Without that memory each
-        # silence would hold all requests back for so long.
-        self._mute = False
         # It answers from another network address. If it does not tell its id there, it is a stranger: else
         # any sender that keeps silent about its id could take the vehicle's place (promise 1).
         self._moved = False
@@ -133,8 +129,7 @@ class Identity:
 
     def doubt(self) -> None:
         """It may be another one since now: it restarted, or was silent."""
-        tells = self._known is not None and not self._mute
-        if tells and self.standing is not Standing.DOUBTED:
+        if self._known is not None and self.standing is not Standing.DOUBTED:
             self._strange |= self.standing is Standing.STRANGER
             self.standing = Standing.DOUBTED
             self._unanswered = 0
@@ -142,7 +137,6 @@ class Identity:
 
     def told(self, version: AutopilotVersion) -> bool:
         """It told its id; return whether that is the same as ever."""
-        self._mute = False
         if self._known is not None and is_another(self._known, version):
             self._is_stranger()
             return False
@@ -156,10 +150,9 @@ class Identity:
         self._unanswered += 1
         if self._unanswered < MOST_UNANSWERED or self.standing is not Standing.DOUBTED:
             return
-        if self._moved and self._known is not None and not self._mute:
+        if self._moved and self._known is not None:
             self._is_stranger()
         else:
-            self._mute = True
             self._trust()
 
     def _is_stranger(self) -> None:

@@ -387,20 +387,3 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(monkeypatch:
             assert await read_file(connection, b"/f") == OURS
             assert connection.status()["link"]["address"] == "10.0.0.2:14550"
         nursery.cancel_scope.cancel()
-
-
-@pytest.mark.holds("fault another vehicle")
-async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Between two heartbeats another one could have come, each time."""
-    scene = Scene("px4", LinkSettings(delay=0.02))
-    async with scene.mounted() as tree:
-        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
-        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 4.0)
-        await trio.sleep(120.0)
-        start = trio.current_time()
-        for _ in range(10):
-            assert await read_through(tree, FILE) == OUR_FILE
-            await trio.sleep(5.0)
-        assert trio.current_time() - start < 120.0

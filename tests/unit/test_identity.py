@@ -118,22 +118,11 @@ def test_a_vehicle_that_is_heard_but_tells_no_id_is_believed_in_the_end(silences
     assert standing(identity) is Standing.TRUSTED
 
 
-def mute() -> Watched:
-    """Return a vehicle's identity that was told once, and never again."""
+def test_another_id_is_a_strangers_however_silent_it_falls_and_is_asked_for_again() -> None:
     identity = Watched()
     identity.told(version(1))
-    identity.doubt()
-    for _ in range(MOST_UNANSWERED):
+    assert not identity.told(version(2))
+    assert identity.doubts == 1
+    for _ in range(2 * MOST_UNANSWERED):
         identity.unanswered()
-    return identity
-
-
-def test_another_id_is_a_strangers_however_silent_it_falls_and_is_asked_for_again() -> None:
-    for identity in (mute(), Watched()):
-        identity.told(version(1))
-        doubts = identity.doubts
-        assert not identity.told(version(2))
-        assert identity.doubts == doubts + 1
-        for _ in range(2 * MOST_UNANSWERED):
-            identity.unanswered()
-        assert standing(identity) is Standing.STRANGER
+    assert standing(identity) is Standing.STRANGER
