@@ -8,10 +8,7 @@ a vehicle that reboots is not an error.
 
 from __future__ import annotations
 
-import errno
 import socket
-import struct
-import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -27,11 +24,6 @@ MAX_DATAGRAMS = 256
 _SOCKET_BUFFER = 1 << 20
 _OUTBOX_LIMIT = 64 * 1024
 _LARGEST = 65535
-_UDP_SEGMENT = 103
-"""linux/udp.h: one call sends many datagrams. A call for each is a tenth of what a chunk costs."""
-
-_MOST_SEGMENTS = 40
-_NO_SEGMENTS = frozenset((errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP, errno.ENOPROTOOPT))
 
 
 class UdpLink(SocketLink):
@@ -50,14 +42,10 @@ class UdpLink(SocketLink):
         self._senders: list[NetAddress] = []
         # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
-        self._segments = sys.platform == "linux"
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
-        datagrams: Sequence[bytes] = list(pack(frames))
-        if self._segments and len(datagrams) > 1 and not self._closed:
-            datagrams = self._send_together(datagrams)
-        for datagram in datagrams:
+        for datagram in pack(frames):
             if self._outbox.size or not self._write(datagram):
                 self._keep(datagram)
 
@@ -100,24 +88,6 @@ class UdpLink(SocketLink):
             self._peer = senders[-1]
         return pieces
 
-    def _send_together(self, datagrams: Sequence[bytes]) -> Sequence[bytes]:
-        """Hand runs of equal datagrams to the kernel in one call each; return what has to go one by one."""
-        while self._peer is not None and not self._outbox.size:
-            run = equal_run(datagrams)
-            if run < 2:
-                break
-            size = len(datagrams[0])
-            try:
-                self._sock.sendmsg(datagrams[:run], _segment_size(size), 0, self._peer)
-            except OSError as error:
-                # Not every way out can cut them (checksums, MTU); anything else is found out one by one.
-                self._segments = error.errno not in _NO_SEGMENTS
-                break
-            self.stats.writes += run
-            self.stats.sent_bytes += sum(map(len, datagrams[:run]))
-            datagrams = datagrams[run:]
-        return datagrams
-
     def _write(self, item: bytes) -> int:
         if self._peer is None or self._closed:
             self.stats.dropped_sends += 1
@@ -132,22 +102,6 @@ class UdpLink(SocketLink):
         self.stats.writes += 1
         self.stats.sent_bytes += sent
         return sent
-
-
-def equal_run(datagrams: Sequence[bytes]) -> int:
-    """Return how many of the first datagrams may go in one call: all of one size, the last may be shorter."""
-    if not datagrams:
-        return 0
-    size, run = len(datagrams[0]), 1
-    while run < min(len(datagrams), _MOST_SEGMENTS):
-        if len(datagrams[run]) != size:
-            return run + (len(datagrams[run]) < size)
-        run += 1
-    return run
-
-
-def _segment_size(size: int) -> list[tuple[int, int, bytes]]:
-    return [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", size))]
 
 
 @asynccontextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 import tty
@@ -14,13 +13,12 @@ from contextlib import (
     contextmanager,
 )
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trio
 import trio.testing
 
-from mavftpfs.link.base import MAX_DATAGRAM, Link, pack
+from mavftpfs.link.base import MAX_DATAGRAM, Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.opening import open_link
@@ -85,47 +83,6 @@ async def test_frames_are_packed_below_the_limit() -> None:
         assert [len(d) for d in datagrams] == [5 * 266, 5 * 266, 2 * 266]
         assert max(map(len, datagrams)) <= MAX_DATAGRAM
         assert (link.stats.writes, link.stats.sent_bytes) == (3, 12 * 266)
-
-
-class CountingSocket(socket.socket):
-    """Counts calls; refuses to cut what it is given, where `refusal` is set."""
-
-    refusal = 0
-    together = 0
-    alone = 0
-
-    def sendmsg(self, *args: Any) -> int:
-        self.together += 1
-        if self.refusal:
-            raise OSError(self.refusal, os.strerror(self.refusal))
-        return super().sendmsg(*args)
-
-    def sendto(self, *args: Any) -> int:
-        self.alone += 1
-        return super().sendto(*args)
-
-
-SIZES = [266] * 450 + [280] * 10 + [100] + [266] * 9 + [70, 266, 40]
-
-
-@pytest.mark.parametrize(
-    ("refusal", "calls"), [(0, 10), (errno.EIO, 1), (errno.EINVAL, 1), (errno.EAGAIN, 2), (errno.ENOBUFS, 2)]
-)
-async def test_many_datagrams_go_in_one_call_where_the_kernel_can_cut_them(refusal: int, calls: int) -> None:
-    frames = [bytes([n % 251]) * size for n, size in enumerate(SIZES)]
-    expected = list(pack(frames))
-    with udp_socket() as peer, CountingSocket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        sock.setblocking(False)
-        sock.refusal = refusal
-        link = UdpLink(sock, "test", peer.getsockname())
-        for _ in range(2):
-            link.send_nowait(frames)
-            assert [peer.recv(65535) for _ in expected] == expected
-        assert sock.together == calls
-        assert sock.alone == (2 * len(expected) if refusal else 0)
-        assert link.stats.writes == 2 * len(expected)
-        assert link.stats.sent_bytes == 2 * sum(SIZES)
 
 
 async def test_answers_the_latest_sender_until_told_whom() -> None:
