@@ -27,8 +27,6 @@ ALL = 0
 BEATS = -1
 """The focus of a client that wants only heartbeats."""
 
-BEAT_PERIOD = 0.5
-"""Seconds between two heartbeats of one sender that clients with another vehicle get."""
 _MOST_PLANS = 4096
 
 
@@ -63,7 +61,6 @@ class Router:
         self.senders = Senders()
         self.armed: dict[int, bool] = {}
         self._sides: dict[int, _Side] = {}
-        self._beats: dict[Address, float] = {}
         self._plans: dict[tuple[Place, Address, Address, bool], tuple[Place, ...]] = {}
 
     # -- sides
@@ -98,18 +95,18 @@ class Router:
             return ()
         if belief is Belief.SECOND:
             # Each client judges by unique ids which of two vehicles is the mounted one.
-            return tuple(self._to_clients(frame, place, now))
+            return tuple(self._to_clients(frame, place))
         if belief is Belief.NEW:
             self._plans.clear()
-        if frame.id == HEARTBEAT_ID:  # how often clients get them depends on the time
+        if frame.id == HEARTBEAT_ID:  # where it goes depends on what it says
             self._note_armed(frame, place)
-            return (*self._out(frame, place), *self._to_clients(frame, place, now))
+            return (*self._out(frame, place), *self._to_clients(frame, place))
         key = (place, frame.source, frame.target, frame.id == FTP_MESSAGE_ID)
         plan = self._plans.get(key)
         if plan is None:
             if len(self._plans) >= _MOST_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = (*self._out(frame, place), *self._to_clients(frame, place, now))
+            plan = self._plans[key] = (*self._out(frame, place), *self._to_clients(frame, place))
         return plan
 
     def _note_armed(self, frame: Frame, place: Place) -> None:
@@ -138,29 +135,23 @@ class Router:
     def _way_to(self, place: Place) -> Place:
         return Place(place.side, None) if self._sides[place.side].fixed else place
 
-    def _to_clients(self, frame: Frame, place: Place, now: float) -> Iterator[Place]:
+    def _to_clients(self, frame: Frame, place: Place) -> Iterator[Place]:
         """Yield the clients that a frame concerns."""
         kind = self._sides[place.side].kind
-        due = frame.id == HEARTBEAT_ID and self._is_due(frame, kind, now)
+        for_all = frame.id == HEARTBEAT_ID and _is_for_all_clients(frame, kind)
         for number, side in self._sides.items():
             if (
                 side.kind is Kind.CLIENT
                 and number != place.side
-                and (due or _concerns(side.focus, frame, kind))
+                and (for_all or _concerns(side.focus, frame, kind))
             ):
                 yield Place(number, None)
 
-    def _is_due(self, frame: Frame, kind: Kind, now: float) -> bool:
-        """Return whether a heartbeat is told to all clients: they hear of vehicles, which are on the port,
-        and of ground stations. Not of each other, and not of each heartbeat of other vehicles."""
-        if kind is Kind.CLIENT or (kind is Kind.ENDPOINT and armed_by(frame) is not None):
-            return False
-        if now - self._beats.get(frame.source, float("-inf")) < BEAT_PERIOD:
-            return False
-        if len(self._beats) >= _MOST_PLANS:
-            self._beats.clear()
-        self._beats[frame.source] = now
-        return True
+
+def _is_for_all_clients(beat: Frame, origin: Kind) -> bool:
+    """Return whether a heartbeat is told to all clients: they hear of vehicles, which are on the port, and of
+    ground stations. Not of each other."""
+    return origin is Kind.PORT or (origin is Kind.ENDPOINT and armed_by(beat) is None)
 
 
 def _concerns(focus: int, frame: Frame, origin: Kind) -> bool:
