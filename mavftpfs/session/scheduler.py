@@ -441,12 +441,13 @@ class Scheduler:
         sent_at: when it went out first. An open of an earlier file may have put that in the place of the
         present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later one.
         """
-        server = self.server
-        earlier = sent_at < server.opening_at
+        if sent_at >= self.server.opening_at:
+            return  # it is the open that is closed next, or a WriteFile to the last file
+        session = self.server.session
         if reply.req_opcode in OPENING:
-            if earlier or (server.session is None and not server.maybe_open):
+            if session is None or session.seq != reply.seq:
                 self.on_unexplained(reply, self.clock() - sent_at)
-        elif reply.req_opcode == Opcode.WRITE_FILE and earlier:
+        elif reply.req_opcode == Opcode.WRITE_FILE:
             self.doubt.raise_it("a WriteFile came after its file was closed", reads=False)
 
     def _on_reads_doubted(self, reason: str) -> None:

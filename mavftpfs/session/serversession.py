@@ -150,7 +150,7 @@ class ServerSession:
         writes it now.
         maybe_open: files that may be open over there by our doing, by session id: a request was not answered
         yet, or never, or the session is not believed any more.
-        opening_at: when the last open went out.
+        opening_at: when the last open went out; once its ACK came: when that was.
         path_gate: what asks the server for a path passes it. others: other clients of this server.
         changed: where tasks park until something more is closed.
     """
@@ -278,7 +278,7 @@ class ServerSession:
             seq=operation.reply.seq,
             resent=resent or operation.retransmitted,
         )
-        self.engine.session = self.session.id
+        self.engine.session, self.opening_at = self.session.id, self.session.opened_at
 
     def _may_have_opened(self, nak: FtpNak) -> bool:
         """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or

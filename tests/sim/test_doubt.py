@@ -327,6 +327,17 @@ async def test_nor_does_it_empty_a_file_that_has_its_final_name_at_once(lateness
         assert here.data(b"/d/new") == content(300, 2)
 
 
+@pytest.mark.parametrize("profile", ["ardupilot5", "littlefs"])
+async def test_a_create_that_we_repeated_is_answered_together_with_the_terminate(profile: str) -> None:
+    """It left its file open, and the next open was refused as if nothing of ours were there."""
+    async with rig(profile, {b"/d/k": b"x"}, link=LinkSettings(delay=0.01)) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        come_late(here, 0.17, Opcode.CREATE_FILE)
+        await write_file(tree, b"/d/new", content(300, 2))
+        assert here.data(b"/d/new") == content(300, 2)
+
+
 @pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("verify", ["auto", "none"])
 @pytest.mark.parametrize("after", [Opcode.CALC_FILE_CRC32, Opcode.OPEN_FILE_RO, Opcode.TERMINATE_SESSION])
