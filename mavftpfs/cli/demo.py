@@ -8,6 +8,7 @@ one on the vehicle's card.
 
 from __future__ import annotations
 
+import argparse
 import os
 import random
 import shutil
@@ -303,7 +304,7 @@ def take_tour(tour: Tour, stack: ExitStack) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must not stop the cleaning up
 
 
-def run() -> int:
+def demo(args: argparse.Namespace) -> int:
     """Run the demo and return its exit code: 0 only if all comparisons held."""
     console = Console()
     for number in (signal.SIGTERM, signal.SIGHUP):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import os
 import signal
 import sys
@@ -444,37 +445,11 @@ def _install(args: argparse.Namespace) -> int:
     return run(args, whole_parser())
 
 
-def _sim(args: argparse.Namespace) -> int:
-    from mavftpfs.sim.endpoints import run
-
-    return run(args)
-
-
-def _demo(args: argparse.Namespace) -> int:
-    from mavftpfs.cli.demo import run
-
-    return run()
-
-
-def _hub(args: argparse.Namespace) -> int:
-    from mavftpfs.cli.ports import hub
-
-    return hub(args)
-
-
-def _param(args: argparse.Namespace) -> int:
-    from mavftpfs.cli.param import param
-
-    return param(args)
-
-
-def _verb(name: str) -> Run:
-    """Return the command of that name without a mount."""
+def _later(module: str, name: str) -> Run:
+    """Return a command of a module that is imported when the command runs."""
 
     def run(args: argparse.Namespace) -> int:
-        from mavftpfs.cli import verbs
-
-        command: Run = getattr(verbs, name)
+        command: Run = getattr(importlib.import_module(f"mavftpfs.{module}"), name)
         return command(args)
 
     return run
@@ -484,21 +459,21 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "mount": (_mount_parser, commands.mount),
     "umount": (_umount_parser, commands.umount),
     "status": (_status_parser, commands.status),
-    "param": (_param_parser, _param),
-    "sync": (_sync_parser, _verb("sync")),
-    "scan": (_scan_parser, _verb("scan")),
-    "ls": (_ls_parser, _verb("ls")),
-    "get": (_get_parser, _verb("get")),
-    "cat": (_cat_parser, _verb("cat")),
-    "put": (_put_parser, _verb("put")),
-    "rm": (_rm_parser, _verb("rm")),
-    "mkdir": (_mkdir_parser, _verb("mkdir")),
-    "rmdir": (_rmdir_parser, _verb("rmdir")),
-    "mv": (_mv_parser, _verb("mv")),
-    "crc": (_crc_parser, _verb("crc")),
-    "hub": (_hub_parser, _hub),
-    "recover": (_recover_parser, _verb("recover")),
-    "sim": (_sim_parser, _sim),
-    "demo": (_demo_parser, _demo),
+    "param": (_param_parser, _later("cli.param", "param")),
+    "sync": (_sync_parser, _later("cli.verbs", "sync")),
+    "scan": (_scan_parser, _later("cli.verbs", "scan")),
+    "ls": (_ls_parser, _later("cli.verbs", "ls")),
+    "get": (_get_parser, _later("cli.verbs", "get")),
+    "cat": (_cat_parser, _later("cli.verbs", "cat")),
+    "put": (_put_parser, _later("cli.verbs", "put")),
+    "rm": (_rm_parser, _later("cli.verbs", "rm")),
+    "mkdir": (_mkdir_parser, _later("cli.verbs", "mkdir")),
+    "rmdir": (_rmdir_parser, _later("cli.verbs", "rmdir")),
+    "mv": (_mv_parser, _later("cli.verbs", "mv")),
+    "crc": (_crc_parser, _later("cli.verbs", "crc")),
+    "hub": (_hub_parser, _later("cli.ports", "hub")),
+    "recover": (_recover_parser, _later("cli.verbs", "recover")),
+    "sim": (_sim_parser, _later("sim.endpoints", "run")),
+    "demo": (_demo_parser, _later("cli.demo", "demo")),
     "install": (_install_parser, _install),
 }
