@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -139,15 +139,8 @@ class Drone:
     @property
     def params(self) -> Params:
         """The vehicle's parameters, a mapping: `drone.params["MPC_XY_CRUISE"] = 4.5`."""
-        return Params(self.get_params, self.set_params)
-
-    def get_params(self) -> dict[str, int | float]:
-        """Return all parameters, in the vehicle's order."""
-        return self._loop.call(self._drone.get_params)
-
-    def set_params(self, values: Mapping[str, int | float]) -> None:
-        """Set parameters; each is read back."""
-        self._loop.call(self._drone.set_params, values)
+        call, drone = self._loop.call, self._drone
+        return Params(partial(call, drone.get_params), partial(call, drone.set_params))
 
     # --- changing names
 

@@ -314,7 +314,7 @@ def test_parameters(field: Field, profile: str) -> None:
         assert drone.params[other] == before[other] + 1
         for bad in ({"NO_SUCH": 1}, {name: "much"}, {name: True}):
             with pytest.raises(ValueError, match=r"NO_SUCH|is a number"):
-                drone.set_params(bad)  # type: ignore[arg-type]
+                drone.params.update(bad)  # type: ignore[arg-type]
         with pytest.raises(OSError, match=r"fit|whole"):
             drone.params[other] = 0.5
         with pytest.raises(KeyError):
