@@ -265,12 +265,8 @@ class WriteTransfer(Operation):
 
     def _written(self, request: Request, data: bytes) -> int:
         """Return how many bytes an ACK stands for (servers.md 8: only PX4 says, and may write less)."""
-        traits = self.port.traits
         if len(data) != _COUNT_SIZE:
-            if traits.write_ack_counts is None:
-                traits.write_ack_counts = False
             return request.size
-        traits.write_ack_counts = True
         count = int.from_bytes(data, "little")
         if count == self.chunks.most == request.size:
             self._usual = data

@@ -166,8 +166,8 @@ class Traits:
             then every reply echoes the request's session, and it is checked.
         several_sessions: it answered us while another client had a session (ArduPilot, generation B).
         queue_limit: the most requests that may be in flight; None where no limit is known.
-        write_ack_counts: WriteFile ACKs say how many bytes were written.
-        write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
+        write_ack_offset: WriteFile ACKs say where bytes were written (MAVSDK's say 0), and are believed only
+            if that is the place.
         paths_block_writes: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
         lists_times: it answers opcode 16. time_silences: how often it did not answer that, and then answered
         opcode 3.
@@ -179,7 +179,6 @@ class Traits:
     ack_carries_own_session: bool | None = None
     several_sessions: bool = False
     queue_limit: int | None = None
-    write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None
     paths_block_writes: bool = False
     lists_times: bool | None = None

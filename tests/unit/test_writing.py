@@ -81,7 +81,6 @@ def test_a_short_write_sends_the_rest() -> None:
     assert (rest.offset, rest.data) == (100, CONTENT[100:239])
     engine.receive(ack(rest, count(139)), 0.2)
     assert source.acked.covers(0, 239)
-    assert engine.traits.write_ack_counts is True
 
 
 @pytest.mark.holds("rule 14.23")
@@ -91,7 +90,6 @@ def test_an_ack_without_a_count_is_for_all() -> None:
     [first] = sent(engine, 0.0)
     engine.receive(ack(first), 0.1)
     assert source.acked.covers(0, 5)
-    assert engine.traits.write_ack_counts is False
 
 
 def test_an_ack_of_another_place_is_not_believed_where_acks_tell_the_place() -> None:
