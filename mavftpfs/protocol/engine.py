@@ -304,10 +304,6 @@ class Engine:
         urgent = op.urgent
         in_flight = len(ledger.flying) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
-        if room <= 0 and urgent and in_flight < self.flow.most_beside:
-            # A window that shrank may be full of requests that get no answer. Urgent ones pass those, too.
-            others = sum(other.sent and other.urgent for other in self._ops)
-            room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room
         while left > 0:
             again = ledger.take_again(op, now) if ledger.again else None

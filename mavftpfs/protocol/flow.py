@@ -212,11 +212,6 @@ class Flow:
             return inf
         return self._tokens_at + (1.0 - self._tokens) / self._pace + 1e-6
 
-    @property
-    def most_beside(self) -> int:
-        """How many may be in flight for the sake of metadata; 0 where a server takes only a few."""
-        return 0 if self._pacer is not None else self.cap
-
     # --- what happens
 
     def on_sent(self, count: int, now: float) -> None:

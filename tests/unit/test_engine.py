@@ -397,20 +397,6 @@ def test_metadata_goes_first_and_has_a_slot_of_its_own() -> None:
     assert engine.in_flight == 5
 
 
-@pytest.mark.holds("promise 7")
-def test_metadata_does_not_wait_for_what_a_wider_window_sent() -> None:
-    """All answers were lost in a pause of the server: a Terminate went out 3 s later, when the last of these
-    was given up, which each silence put off."""
-    engine = make()
-    transfer, _ = reading(engine)
-    assert len(sent(engine, 0.0)) == 8
-    engine.remove(transfer)
-    engine.flow.on_silence()
-    assert engine.flow.window < 8
-    engine.start(mkdir(), 0.1)
-    assert [request.opcode for request in sent(engine, 0.1)] == [Opcode.CREATE_DIRECTORY]
-
-
 def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     engine = make(limit=4)
     transfer, sink = reading(engine)
