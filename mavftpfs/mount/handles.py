@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.shared.model import ROOT, EntryKind
+from mavftpfs.shared.model import ROOT, EntryKind, rename_keys
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,10 +240,9 @@ class InodeTable:
         if old == new:
             return
         self.unlink(new)
-        for path in self._subtree(old):
-            inode = self._by_path.pop(path)
-            inode.path = new + path[len(old) :]
-            self._by_path[inode.path] = inode
+        rename_keys(self._by_path, old, new)
+        for path, inode in self._by_path.items():
+            inode.path = path
 
     def check_invariants(self) -> None:
         """Assert what the module's docstring promises (for tests)."""
@@ -255,10 +254,6 @@ class InodeTable:
             assert inode.ino == ino
             assert inode.lookups > 0 or ino == ROOT_INO
             assert inode.path is None or self._by_path[inode.path] is inode
-
-    def _subtree(self, path: bytes) -> list[bytes]:
-        prefix = path if path.endswith(b"/") else path + b"/"
-        return [known for known in self._by_path if known == path or known.startswith(prefix)]
 
     def _free_number(self, path: bytes) -> int:
         digest = hashlib.blake2b(path, digest_size=8).digest()
@@ -348,6 +343,4 @@ class UserAttributeTable:
     def move(self, old: bytes, new: bytes) -> None:
         """The path, and everything below it, has another name."""
         self.drop(new)
-        prefix = old + b"/"
-        for path in [known for known in self._kept if known == old or known.startswith(prefix)]:
-            self._kept[new + path[len(old) :]] = self._kept.pop(path)
+        rename_keys(self._kept, old, new)
