@@ -59,8 +59,8 @@ class Crowd:
 
     async def beat(self, address: tuple[str, int] | None, pause: float = 0.1, armed: bool = False) -> None:
         """Send heartbeats in the autopilot's name, for ever. address: None for where the vehicle is then."""
-        for seq in range(1 << 20):
-            self.link.intrude(address or self.link.address, heartbeat(seq, armed=armed))
+        while True:
+            self.link.intrude(address or self.link.address, heartbeat(armed=armed))
             await trio.sleep(pause)
 
 

@@ -1,23 +1,22 @@
 """A vehicle whose answers can be changed, over any link, and frames for forgers.
 
 `LyingServer` is a simulated server with two hooks; each `Rig` has one. `LyingVehicle` runs one in a thread
-and speaks UDP or TCP, as a vehicle of the mount tier does. `frame`, `heartbeat` and `ftp` build MAVLink by
-hand, for a socket that pretends to be the vehicle.
+and speaks UDP or TCP, as a vehicle of the mount tier does. `heartbeat` and `ftp` make frames for a socket
+that pretends to be the vehicle.
 """
 
 from __future__ import annotations
 
 import random
-import struct
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 import trio
-from fastcrc import crc16
 
 from mavftpfs.link.addresses import NetAddress
+from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload, decode_request
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
@@ -28,9 +27,6 @@ from mavftpfs.sim.vehicle import FtpServer, SimVehicle
 from tests.support.memory import MemoryLink
 from tests.support.replies import decode_reply
 
-_FTP = (110, 84)
-_HEARTBEAT = (0, 50)
-_ACTIVE = 4
 _VEHICLE = Address(1, 1)
 
 Change = Callable[[Payload, Payload], Iterable[Payload]]
@@ -195,20 +191,11 @@ class LyingVehicle:
                 await self._endpoint.run()
 
 
-def frame(seq: int, source: Address, message: tuple[int, int], body: bytes) -> bytes:
-    """Return an unsigned MAVLink 2 frame; message: its id and its extra CRC byte."""
-    number, extra = message
-    body = body.rstrip(b"\0") or b"\0"
-    head = struct.pack("<BBBBBB", len(body), 0, 0, seq & 0xFF, *source) + number.to_bytes(3, "little")
-    return b"\xfd" + head + body + struct.pack("<H", crc16.mcrf4xx(head + body + bytes([extra])))
-
-
-def heartbeat(seq: int = 0, source: Address = _VEHICLE, *, armed: bool = False) -> bytes:
+def heartbeat(source: Address = _VEHICLE, *, armed: bool = False) -> bytes:
     """Return the heartbeat of a PX4 quadrotor."""
-    mode = 0x41 | (0x80 if armed else 0)
-    return frame(seq, source, _HEARTBEAT, struct.pack("<IBBBBB", 0, 2, 12, mode, _ACTIVE, 3))
+    return Framer(source, stream=False).encode_heartbeat(2, 12, 0x80 if armed else 0)
 
 
-def ftp(payload: bytes, target: Address, seq: int = 0, source: Address = _VEHICLE) -> bytes:
-    """Return a FILE_TRANSFER_PROTOCOL frame with a payload of 251 bytes."""
-    return frame(seq, source, _FTP, bytes([0, *target]) + payload)
+def ftp(payload: bytes, target: Address) -> bytes:
+    """Return a FILE_TRANSFER_PROTOCOL frame of the vehicle with a payload of 251 bytes."""
+    return Framer(_VEHICLE, stream=False).encode_ftp(target, payload)
