@@ -38,9 +38,9 @@ from mavftpfs.link.hublink import (
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.rendezvous import Door
-from mavftpfs.link.samelink import leads_back, same_link
+from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
-from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError
 
 log = logging.getLogger("mavftpfs.hub")
 
@@ -311,11 +311,9 @@ class Hub:
             if text in self._endpoints:
                 continue
             spec = parse_source(text)
-            if leads_back(spec, self.spec):
-                raise UsageError(f"forward={text} is SOURCE itself")
             self._sides += 1
             endpoint = self._endpoints[text] = _Endpoint(self._sides, text, spec)
-            self.router.add(endpoint.side, Kind.ENDPOINT, fixed=endpoint.spec.kind is not LinkKind.UDP_IN)
+            self.router.add(endpoint.side, Kind.ENDPOINT, fixed=spec.kind is not LinkKind.UDP_IN)
             if patient:
                 nursery.start_soon(self._serve_endpoint, endpoint, True)
                 continue
