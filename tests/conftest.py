@@ -89,11 +89,11 @@ def nobody_waits_in_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Assert that no task that has the session waits for a path, a node or memory for reads: a task that has
     one of these may wait for the session."""
     schedulers: weakref.WeakSet[Scheduler] = weakref.WeakSet()
-    hold = Scheduler._hold
+    set_holder = Scheduler._set_holder
 
     def noting(one: Scheduler, turn: Turn | None) -> None:
         schedulers.add(one)
-        hold(one, turn)
+        set_holder(one, turn)
 
     def guarded(wait: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(wait)
@@ -104,7 +104,7 @@ def nobody_waits_in_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 
         return waiting
 
-    monkeypatch.setattr(Scheduler, "_hold", noting)
+    monkeypatch.setattr(Scheduler, "_set_holder", noting)
     for owner, name in ((PathLocks, "hold"), (trio.Lock, "acquire"), (trio.Semaphore, "acquire")):
         monkeypatch.setattr(owner, name, guarded(getattr(owner, name)))
 

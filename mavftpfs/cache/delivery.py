@@ -1,9 +1,9 @@
 """Delivers drafts: sends each one, verifies it, and renames it into place. Layer: cache.
 
-`deliver` returns when the vehicle has the file, verified (promise 2), else it raises the reason. Undelivered
-bytes stay held, and the next call goes on with them. During a delivery no program writes the file
-(`Node.lock`), so the verified bytes are the sent bytes. `push` begins the upload while a program still
-writes.
+`deliver` returns when the vehicle has the file, verified (promise 2), or when none is wanted any more. Else
+it raises the reason. Undelivered bytes stay held, and the next call goes on with them. During a delivery no
+program writes the file (`Node.lock`), so the verified bytes are the sent bytes. `push` begins the upload
+while a program still writes.
 
 There is one way to the card: the whole file is sent under a reserved name, verified there, and renamed into
 place. In doubt it is then compared once more. A card that cannot rename gets the file under its own name.
@@ -86,8 +86,8 @@ class Deliverer:
         self.verifier = Verifier(context, names)
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
-        """Bring a node's file to the vehicle, and verify it. `wanted` is asked before each round; a round
-        that began is finished.
+        """Bring a node's file to the vehicle, and verify it, if it is to be delivered at all. `wanted` is
+        asked before each round; a round that began is finished.
 
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileChanged, AlreadyExists,
@@ -143,7 +143,7 @@ class Deliverer:
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.base_limit or draft.unacked < START_AT or not may_pass(node):
             return  # of a file that only changes every byte is sent again: that waits for the close
-        if context.replacements.is_unknown(node.path):
+        if context.replacements.is_unfinished(node.path):
             return  # the next delivery finds out first
         try:
             with trio.CancelScope() as node.delivery:
@@ -191,7 +191,7 @@ class Deliverer:
             # Where a part was delivered meanwhile, the vehicle has neither the old file nor the new one.
             there: bool | None = None if node.delivered_since_open else False
             try:
-                if context.replacements.is_unknown(node.path):
+                if context.replacements.is_unfinished(node.path):
                     await self._end_unfinished(node, draft)
                     if not node.undelivered:
                         return True
@@ -231,7 +231,7 @@ class Deliverer:
         while True:
             in_place = store.traits.rename_works is False
             try:
-                if self._context.replacements.is_unknown(node.path):
+                if self._context.replacements.is_unfinished(node.path):
                     await self._end_unfinished(node, draft)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
@@ -259,9 +259,10 @@ class Deliverer:
             As Directories.ask_entry, Verifier.check and Verifier.is_same.
         """
         context, path = self._context, node.path
-        there, record = await context.directories.ask_entry(path), context.replacements.get(path)
+        there = await context.directories.ask_entry(path)
+        record = context.replacements.get(path)  # as that listing left it: the cleaner may have ended it
         if there is None and record is not None and record.aside is not None:
-            with suppress(FtpNak):  # the cleaner was faster, or it is gone
+            with suppress(FtpNak):  # the cleaner was faster, or it is gone: the draft becomes a new file
                 await self._names.rename(record.aside, path, completes=True)
                 record.placed = False
             there = await context.directories.ask_entry(path)
@@ -405,8 +406,8 @@ class Deliverer:
         except BaseException as error:
             draft.on(Event.NOT_PLACED)
             unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-            if unknown or replacements.is_unknown(path):
-                replacements.on_unknown(path).sent = sent
+            if unknown or replacements.is_unfinished(path):
+                replacements.on_interrupted(path).sent = sent
             else:
                 await self._names.discard(attempt.path)
             raise
@@ -430,8 +431,8 @@ class Deliverer:
             elif (unproven or attempt.upload.made_twice) and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
         except BaseException as error:
-            record = self._context.replacements.on_unknown(path)
-            # If the name has no file, the old one gets it back.
+            record = self._context.replacements.on_interrupted(path)
+            # From now on the cleaner may give the old file its name back.
             self._context.own.in_use.discard(record.aside or b"")
             if isinstance(error, VerificationFailed):
                 draft.not_confirmed()

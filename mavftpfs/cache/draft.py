@@ -29,11 +29,10 @@ STEP = 64 * 1024
 class State(Enum):
     """How far the vehicle has a draft.
 
-    CLEAN: it has all of it. DIRTY: it does not, and nothing is under way. SENDING: a new file is written
-    under a reserved name, or under its own if the card cannot rename. COMMITTING: that file is verified and
-    being renamed into place. STALE: the base is another file now.
-
-    After interrupted renames it is DIRTY although the vehicle may have it: `replacements` tells.
+    CLEAN: it has all of it. DIRTY: it lacks some, or may lack it after interrupted renames (`replacements`
+    tells), and nothing is under way. SENDING: a new file is written under a reserved name, or under its own
+    if the card cannot rename. COMMITTING: that file is verified and being renamed into place. STALE: the base
+    is another file now.
     """
 
     CLEAN = "clean"
@@ -120,7 +119,8 @@ class Draft:
         content: keeps what is held.
         size: bytes, as programs see it.
         base: what is known of the file on the vehicle, None if there is none.
-        base_limit: below this, bytes that are not held are the base's.
+        base_limit: below this, bytes that are not held are the base's. 0: nothing of the base stays, so the
+            file is replaced whatever it has become.
         taken_if_gone: if one of these paths is gone, a change of names that was not answered took the base's
             name away.
         state: see State.

@@ -149,7 +149,7 @@ class Namespace:
         entry = await context.directories.ask_entry(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # a file of others under its name is not to be removed, if it holds something
-            ours = draft.base is not None or draft.sent_in_place or context.replacements.is_unknown(path)
+            ours = draft.base is not None or draft.sent_in_place or context.replacements.is_unfinished(path)
             there &= ours or (entry is not None and not entry.size)
         elif entry is None:
             raise NotFound(f"{path!r} does not exist")

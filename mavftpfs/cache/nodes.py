@@ -215,11 +215,11 @@ class Nodes:
         """Return whether we are changing what the vehicle has under a path, or a change may have happened in
         part."""
         node = self._by_path.get(path)
-        return self.replacements.is_unknown(path) or (node is not None and node.changing)
+        return self.replacements.is_unfinished(path) or (node is not None and node.changing)
 
     def on_replaced(self, path: bytes) -> bool:
         """Note that another file has the path now, or may have. Handles that are open never read that one. A
-        draft that needs no byte of the old file goes on. Returns whether the path has no node any more."""
+        draft that needs no byte of the old file goes on. Returns whether this took the node away."""
         node = self._by_path.get(path)
         if node is None or node.delivery is not None:
             return False  # a delivery compares the base itself

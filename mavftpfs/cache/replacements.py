@@ -68,13 +68,14 @@ class Replacements:
         """Note what is known of a path from now on."""
         self._records[path] = record
 
-    def is_unknown(self, path: bytes) -> bool:
-        """Return whether it is not known which file has the name."""
+    def is_unfinished(self, path: bytes) -> bool:
+        """Return whether it was interrupted: a listing is to tell which file has the name."""
         record = self._records.get(path)
         return record is not None and record.placed is not True
 
-    def on_unknown(self, path: bytes) -> Replacement:
-        """Note that it is not known whether the new file has the name; return the record."""
+    def on_interrupted(self, path: bytes) -> Replacement:
+        """Note that it is not known whether the new file has the name; return the record. One that says that
+        the new file was not placed stays so."""
         record = self._records.setdefault(path, Replacement())
         if record.placed:
             record.placed, record.until = None, inf

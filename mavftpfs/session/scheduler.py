@@ -46,7 +46,7 @@ TURN_TRIPS = 10.0
 LONG_WAIT = 3.0
 LONG_WAIT_TRIPS = 20.0
 """Seconds, and round trips, of waiting after which a heavy user is not passed over any more. Opening the file
-of an upload again takes up to four round trips."""
+of an upload again takes up to four round trips, and the first time in a mount five."""
 
 RELIEF = 0.5
 """Seconds for which a user that had waited so long keeps its turn."""
@@ -97,7 +97,8 @@ class SessionUser:
     Attributes:
         path: of the file it uses.
         waiting_since: since when it wants more than readahead; None if it does not. A caller waits for that
-            (`awaited`), or none does: uploads in the background. The user sets it; it ends with the turn.
+            (`awaited`), or none does: uploads in the background. The user sets it; `Scheduler.turn` clears
+            it, however it ends.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -234,11 +235,11 @@ class Scheduler:
         self.holder: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
-        self._longest_wait = 1.02 * op_deadline  # if no request is answered, that is news before
+        self._longest_wait = 1.02 * op_deadline  # the time-out of a request comes first, and says more
         self._queue: dict[SessionUser, Turn] = {}
         self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
-        self._used_at = clock()
+        self._used_at = clock()  # end of the last turn, or the janitor's last try
         self._touched_at = -inf
 
     # --- turns
@@ -302,10 +303,10 @@ class Scheduler:
             if self._queue.get(user) is turn:
                 del self._queue[user]
             if self.holder is turn:
-                self._hold(None)
+                self._set_holder(None)
             turn.given_back.set()
 
-    def _hold(self, turn: Turn | None) -> None:
+    def _set_holder(self, turn: Turn | None) -> None:
         self.holder = turn
         self.server.changed.unpark_all()
 
@@ -488,7 +489,7 @@ class Scheduler:
         """Give a user the session, and wait until it is given back. If the vehicle answered meanwhile, the
         users in the queue may wait longer: it is not silent."""
         turn, began = self._queue.pop(user), self.clock()
-        self._hold(turn)
+        self._set_holder(turn)
         turn.granted.end()
         await turn.given_back.wait()
         self._used_at = self.clock()

@@ -217,7 +217,7 @@ class ServerSession:
         await self._close_maybe_open()
         began = self.clock()
         try:
-            await self._open_past_others(path, opcode)
+            await self._open_with_remedies(path, opcode)
         finally:
             if opcode == Opcode.CREATE_FILE:
                 late, now = self.doubt.late, self.clock()
@@ -229,7 +229,7 @@ class ServerSession:
             raise _lost()
         return self.session
 
-    async def _open_past_others(self, path: bytes, opcode: Opcode) -> None:
+    async def _open_with_remedies(self, path: bytes, opcode: Opcode) -> None:
         """Open. While that is refused because the session is taken, try one remedy after the other.
 
         | the refusal | may an open of ours have been carried out? | `maybe_open` | then |

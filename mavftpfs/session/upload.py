@@ -64,7 +64,7 @@ class Stop(Enum):
     """Why an upload lets go of the session."""
 
     STARVED = "starved"
-    """Everything that the source has is ACKed."""
+    """All that may be sent now is ACKed. While the file grows, a last part of a chunk waits."""
     YIELD = "yield"
     """It goes on in a later turn."""
     ARMED = "armed"
@@ -89,7 +89,7 @@ class Upload(SessionUser):
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
-        self._until_finish = False  # nothing is sent before the next `finish`: refused, or all would go again
+        self._waits_for_finish = False  # until then nothing is sent: refused, or all would go again
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
         self._retry_at = 0.0  # not to be touched before
@@ -97,7 +97,7 @@ class Upload(SessionUser):
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
         self._losses = 0  # of the session, without progress
         self._furthest = 0  # in the file, when the session was lost the last time
-        self._was_refused = False  # its file could not be opened again, or no size was told
+        self._cannot_resume = False  # its file was not opened again, or was empty then, or no size was told
 
     # --- the owner's side
 
@@ -113,7 +113,7 @@ class Upload(SessionUser):
         if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._until_finish, self._losses, self._retry_at = False, 0, 0.0
+        self._waits_for_finish, self._losses, self._retry_at = False, 0, 0.0
         first, finisher = not self.awaited, Future()
         self._finishers.append(finisher)
         if first:
@@ -186,7 +186,7 @@ class Upload(SessionUser):
     def _due_in(self) -> float:
         """Return in how many seconds it wants a turn, unless it is woken before. While the vehicle is armed
         it wants none, so that no reader makes way for it."""
-        wanted = self.awaited or (not self._until_finish and self._has_work())
+        wanted = self.awaited or (not self._waits_for_finish and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
         return self._retry_at - self._clock()
@@ -194,13 +194,13 @@ class Upload(SessionUser):
     def _has_work(self) -> bool:
         """Whether there is something to send or to close. An empty file has to be made, too, once."""
         source = self._source
-        return source.has_more() or not source.acked.empty or (self.awaited and not source.closed)
+        return source.has_more() or not source.acked.empty or (self.awaited and not source.has_checkpoint)
 
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in all `finish`, and try again later; after a refusal only at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
-        self._until_finish = isinstance(error, REFUSALS)
+        self._waits_for_finish = isinstance(error, REFUSALS)
         self._retry_at = self._clock() + RETRY_AFTER
 
     async def _use(self, turn: Turn) -> None:
@@ -208,10 +208,11 @@ class Upload(SessionUser):
         began = self._clock()
         try:
             try:
-                stop = await self._write(turn, await self._open(turn))
+                session = await self._open(turn)
+                stop = await self._write(turn, session)
                 # All that was given by now is in the file that is closed next; what comes later is not.
                 finishers = list(self._finishers)
-                await self._close(stop)
+                await self._close(session, stop)
             finally:
                 self._end_transfer()
             if stop is Stop.STARVED:
@@ -248,7 +249,7 @@ class Upload(SessionUser):
     @property
     def _may_interrupt(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
-        to_tell = self._engine.traits.wo_truncates is None and not self._was_refused
+        to_tell = self._engine.traits.wo_truncates is None and not self._cannot_resume
         return self._keeps_content or (to_tell and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
@@ -258,14 +259,14 @@ class Upload(SessionUser):
         for finisher in finishers:
             finisher.end()
         self._losses = 0
-        self._until_finish = self._source.closed and not self._may_interrupt
+        self._waits_for_finish = self._source.has_checkpoint and not self._may_interrupt
 
     # --- opening
 
     async def _open(self, turn: Turn) -> OpenSession:
         """Open the upload's file: to go on with it where that is possible, else to begin it."""
         source = self._source
-        if source.closed and self._may_interrupt:
+        if source.has_checkpoint and self._may_interrupt:
             session = await self._reopen(turn)
             if session is not None:
                 return session
@@ -295,11 +296,11 @@ class Upload(SessionUser):
                 if size is not None:
                     traits.wo_truncates = size < reached
                 if not self._keeps_content:
-                    self._was_refused = True
+                    self._cannot_resume = True
                     return None
                 session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
         except FtpNak:  # the file is gone, or this server opens none like that
-            self._was_refused = True
+            self._cannot_resume = True
             return None
         if session.size is None or session.size >= reached:
             return session
@@ -309,8 +310,10 @@ class Upload(SessionUser):
     # --- writing
 
     async def _write(self, turn: Turn, session: OpenSession) -> Stop:
-        """Write until there is a reason to stop. The session is open then. A trailing transfer still waits
-        for its answers: `_close` ends it.
+        """Write until there is a reason to stop. The session is open then.
+
+        A transfer is trailing when all its requests are out and none will be repeated: Terminate may follow
+        before their answers. It still waits for these, and `_close` ends it.
 
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
@@ -445,13 +448,14 @@ class Upload(SessionUser):
 
     # --- letting go
 
-    async def _close(self, stop: Stop) -> None:
+    async def _close(self, session: OpenSession, stop: Stop) -> None:
         """Close the file, and judge by that what of it is written.
 
         A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). But that
         restart raises doubt, so the file is compared; and `_reopen` compares its size.
         """
         transfer = self._transfer  # if any, its last requests are on their way
+        self._server.require_open(session)
         try:
             ours = await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
         except RequestTimeout as error:

@@ -27,8 +27,7 @@ class SendBuffer:
     Attributes:
         todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
             bytes ACKed before it was last closed. All other bytes are on their way.
-        closed: a Terminate was ACKed since the file was begun, so the card has the proven bytes; the file may
-            be open again.
+        has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
         reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
@@ -42,7 +41,7 @@ class SendBuffer:
         self.todo = ExtentSet([(0, size)])
         self.acked = ExtentSet()
         self.proven = ExtentSet()
-        self.closed = self.overtaken = self.growing = False
+        self.has_checkpoint = self.overtaken = self.growing = False
         self._progress = progress
         self._read = read
         self._handed_out = 0  # one past the highest byte
@@ -102,7 +101,7 @@ class SendBuffer:
 
     def check_point(self) -> None:
         """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
-        self.closed = True
+        self.has_checkpoint = True
         for start, stop in self.acked:
             self.proven.add(start, stop)
         self.acked = ExtentSet()
@@ -115,7 +114,7 @@ class SendBuffer:
 
     def start_over(self) -> None:
         """The file is made anew: all of it is sent."""
-        self.closed, self.reached = False, 0
+        self.has_checkpoint, self.reached = False, 0
         self.acked, self.proven = ExtentSet(), ExtentSet()
         self.todo = ExtentSet([(0, self.size)])
 

@@ -10,7 +10,7 @@ FILE, ASIDE = b"/d/f", b"/d/.aside"
 
 
 @pytest.mark.parametrize(
-    ("aside", "placed", "is_unknown", "lacks_file"),
+    ("aside", "placed", "is_unfinished", "lacks_file"),
     [
         (None, None, True, False),
         (ASIDE, None, True, True),
@@ -19,12 +19,12 @@ FILE, ASIDE = b"/d/f", b"/d/.aside"
     ],
 )
 def test_what_is_known_of_a_name(
-    aside: bytes | None, placed: bool | None, is_unknown: bool, lacks_file: bool
+    aside: bytes | None, placed: bool | None, is_unfinished: bool, lacks_file: bool
 ) -> None:
     replacements = Replacements()
-    assert not replacements.is_unknown(FILE)
+    assert not replacements.is_unfinished(FILE)
     replacements.put(FILE, Replacement(aside, placed))
-    assert replacements.is_unknown(FILE) == is_unknown
+    assert replacements.is_unfinished(FILE) == is_unfinished
     assert replacements.needed_asides() == ({aside} if lacks_file else set())
 
 
@@ -32,7 +32,7 @@ def test_what_is_known_of_a_name(
 def test_that_the_new_file_is_not_there_stays_known(placed: bool | None, then: bool | None) -> None:
     replacements = Replacements()
     replacements.put(FILE, Replacement(ASIDE, placed, until=7.0))
-    replacements.on_unknown(FILE)
+    replacements.on_interrupted(FILE)
     record = replacements.end(FILE)
     assert record is not None
     assert (record.aside, record.placed) == (ASIDE, then)
@@ -41,7 +41,7 @@ def test_that_the_new_file_is_not_there_stays_known(placed: bool | None, then: b
 
 def test_a_single_rename_was_interrupted() -> None:
     replacements = Replacements()
-    replacements.on_unknown(FILE)
+    replacements.on_interrupted(FILE)
     assert list(replacements) == [(FILE, Replacement())]
 
 
