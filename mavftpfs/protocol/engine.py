@@ -29,6 +29,7 @@ OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8
 _MAX_SIDE_EFFECT_REPLAYS = 2
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
+_FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
 _NAK = int(Opcode.NAK)
 
@@ -361,7 +362,11 @@ class Engine:
             if request.timer <= now:
                 # Round trips may have grown meanwhile. And ArduPilot answers nothing else during a burst:
                 # silence proves nothing then (servers.md 4).
-                request.timer = max(request.sent_at, self._burst_heard_at) + self._timers.wait(request)
+                due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(request)
+                paused = request.manner.ordered and not flow.starved and len(ledger.flying) > _FEW
+                pause = flow.pause if paused else 0.0
+                # A stream of other answers is no pause.
+                request.timer = max(due, min(due, self._heard_at) + pause)
             if request.timer > now:
                 self._due = min(self._due, request.timer)
                 continue

@@ -16,6 +16,10 @@ growing, a queue stands, or much is lost.
 A serial port has a receive buffer of unknown size in front of a slow server. Bytes that overflow it are lost
 silently. So at a serial port the window is 16 at most, and two requests go out at once, not three.
 
+A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
+pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
+pace.
+
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
 stand `pacing`, for servers that queue five requests, and `budget`, for the user's `bwlimit=`."""
 
@@ -80,12 +84,16 @@ LEAST_TRIP = 0.0005
 time keep them busy; more would only wait, and cost them time."""
 
 KNOWN = 30.0
-"""Seconds for which it is believed that the shortest round trip is right. Then two rounds with a STEP less
-than fills the path measure that again."""
+"""Seconds for which it is believed that a server pauses, and that the shortest round trip is right. Then two
+rounds with a STEP less than fills the path measure that again."""
 
 QUEUE_SHARE = 0.15
 """A queue stands if the quickest answer of a round took longer than the shortest round trip: by 15 % of that
 (LITTLE at most), plus TICK, plus twice the jitter of the round, which is no queue."""
+
+QUEUE = 0.1
+"""Seconds of answers that wait in a link's queue on purpose where a server pauses: the link sends them
+meanwhile."""
 
 SMOOTHING = 0.2
 """What one round counts for in an average, at most."""
@@ -102,8 +110,19 @@ UNUSUAL = 3.0
 """A round lost more than usual if its loss is so many standard deviations above the usual one."""
 
 BOLDER = 0.06
-"""Only a share is used of what the window has beyond the path. Each round adds so much to the share. A round
-that lost more than usual takes a STEP of it away: a short queue overflowed."""
+"""Only a share is used of what the window has beyond the path, and of the reserve for pauses. Each round adds
+so much to the share. A round that lost more than usual takes a STEP of it away: a short queue overflowed."""
+
+PAUSE, LONGEST_PAUSE = 0.02, 0.4
+"""Seconds without an answer after which it is a pause, and after which it is a silence."""
+
+BRIDGE = 0.35
+"""While a server pauses, requests go on at this share of its rate. Else it would have nothing to do for a
+round trip after the pause. Most of these requests overflow its buffer."""
+
+BRIDGE_FROM = 0.03
+"""Seconds: with a shorter round trip there is no reserve and no bridge. The requests in a server's buffer
+last for so long."""
 
 
 class Flow:
@@ -116,8 +135,10 @@ class Flow:
 
     Attributes:
         window: requests that may be in flight. cap: the widest window now.
-        loss: the share of requests that the link loses, 0..1: what overflows a queue does not count.
+        loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
+            server that pauses, does not count.
         alone: no other FTP client was heard lately.
+        pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`.
         starved: there was room and nothing to send.
     """
 
@@ -143,6 +164,9 @@ class Flow:
         self._spread = 0.0
         self._usual_loss, self._per_answer = 0.0, 1.0  # so many requests are to bring one answer
         self._bold = 1.0
+        # The pauses of a server.
+        self._answered_at, self._wake = inf, inf
+        self._paused_at, self.pause = -inf, 0.0
         # The round.
         self._round, self._round_end, self._round_start = 0, -1, 0.0
         self._answered = self._lost = 0
@@ -160,13 +184,14 @@ class Flow:
         if limit is None or self.cap == self._limit:
             self._pacer = None
         elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer = Pacer(self.cap, self._limit)
+            self._pacer, self.pause = Pacer(self.cap, self._limit), 0.0
 
     # --- what may go out
 
     def begin(self) -> None:
         """Begin to look at all operations: `room` is called for each that has something to send."""
         self._hurried = self._blocked = False
+        self._wake = inf
         if self._pacer is not None:
             self._pacer.begin()
         if self.budget is not None:
@@ -179,6 +204,8 @@ class Flow:
             self._hurried = True
         elif self._hurried:  # an urgent answer should not queue behind our slack
             room -= min(SLACK + 1, self.window // 2)
+        elif self.pause:
+            room += int(self._beyond(now, paced) * self._rate)
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
         elif room > 0 and not urgent and self._pace < inf:
@@ -202,6 +229,23 @@ class Flow:
         beyond = pacer.room_for_urgent if urgent else pacer.room
         return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
 
+    def _beyond(self, now: float, paced: bool) -> float:
+        """Return seconds of requests for which there is room beyond the window because a server pauses."""
+        if now >= self._paused_at + KNOWN or self._shortest < BRIDGE_FROM:
+            return 0.0
+        silence = now - self._answered_at
+        if silence > PAUSE:
+            bridge = min(LONGEST_PAUSE, silence)
+        else:  # after a pause its requests are answered a round trip later
+            bridge = self.pause if now < self._paused_at + self._shortest else 0.0
+        if silence < LONGEST_PAUSE:
+            self._wake = now + FIRST / self._rate
+        return max(BRIDGE * bridge, self._reserve() if paced else 0.0)
+
+    def _reserve(self) -> float:
+        """Return for how many seconds answers should wait in the link's queue."""
+        return 0.0 if self._probing else self._bold * QUEUE
+
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
         if self.budget is not None and self.budget.next_room_at() < inf:
@@ -209,8 +253,8 @@ class Flow:
         if self._pacer is not None:
             return self._pacer.next_at()
         if not self._blocked or self._tokens >= 1.0:
-            return inf
-        return self._tokens_at + (1.0 - self._tokens) / self._pace + 1e-6
+            return self._wake
+        return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace + 1e-6)
 
     # --- what happens
 
@@ -225,6 +269,7 @@ class Flow:
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""
         self.starved = True
+        self._answered_at = inf
         if self._pacer is not None:
             self._pacer.on_starved()
 
@@ -233,6 +278,13 @@ class Flow:
         known which of their transmissions were. newest: the order of the last of those. next_order: the order
         that the next transmission will get."""
         self._answered += count
+        gap, self._answered_at = now - self._answered_at, now
+        # An answer that ends a pause has waited for its end. After a run of losses none has.
+        waited = rtt is not None and rtt > self._shortest + gap / 2 and self._rate > 0.0
+        if waited and gap > PAUSE + FIRST / self._rate and self._pacer is None:
+            self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
+        elif now >= self._paused_at + KNOWN:
+            self.pause = 0.0
         if rtt is not None:
             self._least = min(self._least, rtt)
             if rtt <= self._shortest:
@@ -287,11 +339,15 @@ class Flow:
 
     def _learn(self, now: float, took: float) -> None:
         total = self._answered + self._lost
-        congested = self._lost > 0 and self._queued()
+        # Requests that arrive while a server pauses overflow its buffer, and answers wait. That says nothing
+        # of the link. It shows until a round trip after the pause.
+        paused = self.pause > 0.0 and self._paused_at + self._shortest >= self._round_start
+        waits = self._reserve() if self.pause else 0.0
+        congested = self._lost > 0 and not paused and self._queued(1.0, waits)
         usual = self._usual_loss * total
-        lost_too_much = congested or self._lost > usual + UNUSUAL * sqrt(usual + 1.0)
-        self._learn_averages(now, total, losses=not self._queued())
-        if congested and not self.starved and self._queued(2.0):
+        lost_too_much = congested or (not paused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
+        self._learn_averages(now, total, losses=not (paused or self._queued()))
+        if congested and not self.starved and self._queued(2.0, waits):
             self._rates.clear()  # the path has the rate of this round
         rate, before = self._answered / took, self._rate
         if rate > before or not self.starved:
@@ -299,11 +355,12 @@ class Flow:
         self._rate = max(self._rates, default=0.0)
         if self.starved:
             return
-        self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
+        if not paused:
+            self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
         if self._starting:
             self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
             overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
-            self._starting = self._flat < FLAT_ROUNDS and not overflown
+            self._starting = self._flat < FLAT_ROUNDS and (paused or not overflown)
         if self._starting:
             return
         to_fill = self._to_fill()  # the window is to fill the path, and a little more
@@ -338,14 +395,14 @@ class Flow:
         spread = self._total_rtt / self._rtts - self._shortest
         self._spread += (min(spread, LITTLE) - self._spread) * SMOOTHING
 
-    def _queued(self, times: float = 1.0) -> bool:
+    def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
         """Return whether even the quickest answer of the round waited in a queue: `times` as long as what
-        counts as a little."""
+        counts as a little. reserve: seconds that it waited for another reason."""
         if self._least == inf:
             return False
         little = min(QUEUE_SHARE * self._shortest, LITTLE) + TICK
         jitter = self._total_rtt / self._rtts - self._least
-        return self._least > self._shortest + times * little + 2.0 * jitter
+        return self._least > self._shortest + times * little + 2.0 * jitter + reserve
 
     def _to_fill(self) -> float:
         """Return how many requests fill the path, as far as is known."""

@@ -434,3 +434,29 @@ def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
     assert engine.stats.unknown == 20
     engine.receive(ack(request), 4.0)
     assert engine.stats.replies == 1
+
+
+# --- pauses of the server
+
+
+@pytest.mark.parametrize(("others", "patient"), [(8, True), (2, False)])
+def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does(
+    others: int, patient: bool
+) -> None:
+    """What waits in its buffer would be executed twice."""
+    engine = make(limit=1 + others)
+    reading(engine)
+    first = sent(engine, 0.0)
+    for request in first:
+        engine.receive(chunk(request, bytes(SIZE)), 0.05)
+    engine.flow.window = 1 + others
+    engine.flow.pause = 0.3
+    waiting = sent(engine, 0.05)
+    assert len(waiting) == 1 + others
+    engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
+    engine.flow.pause = 0.3
+    sent(engine, 0.1)
+    engine.on_deadline(0.35)
+    assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
+    engine.on_deadline(0.45)
+    assert engine._ledger.again or sent(engine, 0.45)

@@ -1,6 +1,6 @@
 """The in-flight window: what it does on paths whose every round trip is known.
 
-What it brings over whole links, with servers that queue little: tests/sim/test_shares.py and
+What it brings over whole links, with servers that pause or queue little: tests/sim/test_shares.py and
 test_latency.py.
 """
 
@@ -149,6 +149,58 @@ def test_a_serial_window_is_small_whatever_the_path_holds() -> None:
 def test_it_stays_near_what_the_receive_buffer_holds(loss: float) -> None:
     windows = lose_what_overflows(6, 200, loss=loss)
     assert 5 <= sum(windows[20:]) / len(windows[20:]) <= 9.5
+
+
+# --- a card that pauses
+
+
+def paused() -> Path:
+    """Return a path whose server has just paused for 0.2 s."""
+    path = Path(rate=400.0, base=0.1, rounds=40)
+    path.now += 0.2
+    path.flow.on_replies(path.now, path.base + 0.2, 1, path.order, path.order)
+    return path
+
+
+def beyond(path: Path, after: float = 0.0, *, paced: bool = True) -> int:
+    """Return how many requests may go out although the window is full."""
+    path.flow.begin()
+    return path.flow.room(path.window, path.now + after, paced=paced)
+
+
+def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
+    path = paused()
+    path.rounds(30)
+    usual = path.flow._reserve()
+    path.rounds(5, lost=10)
+    assert path.flow._reserve() < 0.5 * usual
+
+
+def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
+    path = paused()
+    path.rounds(1, lost=path.window // 2)
+    assert path.flow.loss == 0.0
+    path.rounds(10)
+    path.rounds(10, lost=path.window // 10)
+    assert 0.03 < path.flow.loss < 0.15
+
+
+def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
+    path = Path(rate=400.0, base=0.1, rounds=40)
+    path.flow.on_starved()
+    path.now += 0.3
+    path.rounds(3)
+    assert beyond(path) <= 0
+    assert path.flow.starved or path.flow.pause == 0.0
+
+
+def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
+    path = paused()
+    path.rounds(10)
+    assert beyond(path, 0.01, paced=False) <= 0
+    assert beyond(path, 0.1, paced=False) > 0
+    assert path.flow.next_room_at() < path.now + 0.2
+    assert path.flow.room(path.window + 200, path.now + 15.0, paced=False) <= 0
 
 
 # --- a fast path
