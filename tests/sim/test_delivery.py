@@ -254,7 +254,7 @@ async def test_a_new_file_of_which_it_is_not_known_whether_it_was_made_in_place(
     carried_out: bool, then: str
 ) -> None:
     """No byte of ours was sent: what others put there stays. An empty file is nothing that could be lost."""
-    async with rig("littlefs", {FILE: OLD}, options=ConnectOptions(op_deadline=5.0)) as here:
+    async with rig("littlefs", {FILE: OLD}, options=ConnectOptions(op_deadline=15.0)) as here:
         tree = here.mount()
         await write_file(tree, OTHER, content(70_000))  # finds out that it cannot rename
         file = await tree.create(FRESH, exclusive=True)
