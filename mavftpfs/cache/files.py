@@ -46,7 +46,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 from mavftpfs.shared.sameness import Listed, Opened, Sameness, compare
 
 MAX_CLOSED = 4096
@@ -363,12 +363,22 @@ class Files:
         for node in self._nodes.below(path):
             node.close_base()
 
-    async def make_way(self, path: bytes, entry: DirEntry) -> None:
-        """Another file, listed as `entry`, is about to get this path: nothing kept passes for it."""
-        if self.kept is not None:
-            for version in self._at_or_below(path):
-                version.kept = None
-            await self.kept.forget(path, entry)
+    async def make_way(self, old: bytes, new: bytes, entry: DirEntry) -> None:
+        """What is listed as `entry` at `old` is about to be at `new`: nothing kept passes for it, nor for a
+        file below it. With `cache_dir` directories below are listed for that.
+
+        Raises:
+            As Directories.get.
+        """
+        if self.kept is None:
+            return
+        if entry.kind is EntryKind.DIRECTORY:
+            for name, below in list((await self._directories.get(old)).entries.items()):
+                await self.make_way(join(old, name), join(new, name), below)
+            return
+        for version in self._at_or_below(new):
+            version.kept = None
+        await self.kept.forget(new, entry)
 
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns

@@ -204,8 +204,7 @@ class Namespace:
         for path in (old, new):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
-        if source.kind is EntryKind.FILE:
-            await context.files.make_way(new, source)
+        await context.files.make_way(old, new, source)
         await self._move(old, new, listed)
         if source.kind is EntryKind.DIRECTORY:
             context.directories.forget(old)

@@ -165,6 +165,25 @@ async def test_nor_is_what_was_kept_a_file_that_was_moved_to_its_name(mounts: Mo
     assert await read_file(mounts.mount(), LOG) == other
 
 
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("moved_away", ["file", "directory"])
+async def test_nor_one_that_was_moved_there_with_its_directory(mounts: Mounts, moved_away: str) -> None:
+    """Two directories of one layout change places, as a backup that is put back."""
+    other = content(len(DATA), seed=8)
+    mounts.here.put(b"/new/a.bin", other, MTIME)
+    mounts.here.put_directory(b"/new/empty")
+    await mounts.read_and_settle()
+    tree = mounts.mount()
+    if moved_away == "file":
+        await tree.unlink(LOG)
+        await tree.rmdir(b"/logs")
+    else:
+        await tree.rename(b"/logs", b"/old")
+    await tree.rename(b"/new", b"/logs")
+    assert await read_file(tree, LOG) == other
+    assert await read_file(mounts.mount(), LOG) == other
+
+
 async def test_what_is_kept_of_an_older_file_is_not_read_again(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     assert await read_file(mounts.mount(), LOG) == DATA
