@@ -202,6 +202,7 @@ async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
     old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
     async with here.connected() as connection:
         connection.scheduler.doubt.raise_it("as if a copy had been late")
+        connection.scheduler.doubt.late.saw(1.0, trio.current_time())
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
         began = trio.current_time()
         await connection.store.rename(old, new)
