@@ -1,18 +1,7 @@
 """The life of a mount: its state, the signals, and the programs that wait for its end. Layer: mount.
 
-Each way to the end of a mount:
-
-- `mavftpfs umount` has this process unmount. If the mount is in use, that is refused and it goes on; with
-  `-l` it leaves all the same.
-- A program unmounts it (`umount`, `fusermount3 -u`, the kernel): it leaves. After `umount -l` or
-  `fusermount3 -uz` of a mount in use that is when its last user leaves.
-- The first SIGINT, SIGTERM or SIGHUP: it leaves, also if it is in use. The next one: it hurries, and what is
-  not delivered is kept. While it is starting the first one ends it.
-- A lost vehicle, or a link that fails, ends nothing: the link is opened again. If another error of ours ends
-  it, what is not delivered is kept, and the log says why.
-- SIGKILL: nothing of this runs. The kernel's mount stays, and answers with ENOTCONN, until
-  `mavftpfs umount` (with `auto_unmount`, fusermount3 takes it away); the next mount of that vehicle finds the
-  spool.
+What ends a mount in which state is a table of docs/processes.md. The first SIGINT, SIGTERM or SIGHUP makes it
+leave, the next one makes it hurry.
 
 What leaving is, is said by the two kinds of mount: `mount.single` and `mount.supervisor`.
 """
