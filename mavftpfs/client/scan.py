@@ -27,15 +27,13 @@ LISTEN_TIME = 3.0
 """Seconds in which every component sends its heartbeat at least twice."""
 PROBE_TIME = 6.0
 """Seconds that a component has at most to answer a listing."""
-LEAST_PROBE = 1.5
-"""Seconds that each has at least, however many there are."""
 _TICK = 0.1
 
 
 async def scan(target: Target) -> list[Entry]:
     """Return the components that send heartbeats on a link, and which of them answer MAVLink FTP.
 
-    It ends within connect_timeout, or LEAST_PROBE for each component if they are many; sooner if all answer.
+    A component that does not answer takes PROBE_TIME, or connect_timeout if that is less.
 
     Raises:
         VehicleLost: no heartbeat at all within connect_timeout.
@@ -66,15 +64,10 @@ async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list
     """Return the other components that are heard, and which of them answer MAVLink FTP."""
     assert target.spec is not None
     options = target.options
-    deadline = trio.current_time() + options.connect_timeout
+    patience = min(PROBE_TIME, options.connect_timeout)
     heard = await _listen(link, options, partial(target.sinks.tell, waiting(target.spec, options)))
     others = sorted(heard.keys() - mounted)
-    found = []
-    for left, address in zip(range(len(others), 0, -1), others, strict=True):
-        share = (deadline - trio.current_time()) / left
-        patience = min(PROBE_TIME, max(LEAST_PROBE, share))
-        found.append(await _probe(link, options, heard[address], patience))
-    return found
+    return [await _probe(link, options, heard[address], patience) for address in others]
 
 
 async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
