@@ -28,7 +28,6 @@ _MIN_REORDER = 2
 queue."""
 
 _MAX_REORDER = 64
-_MOST_QUICK_SENDS = 20
 
 
 _MOST_REMEMBERED = 1024
@@ -252,8 +251,7 @@ class Ledger:
         proven = self.newest_answered - self.reorder
         for order in range(self.looked_at, proven + 1):  # looks at each transmission once
             request = self.flying.get(order)
-            # One that was lost so often may never be answered: only its timer repeats it from now on.
-            if request is not None and request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
+            if request is not None and request.manner.ordered:
                 request.outrun = True
                 self.lose(request)
                 lost.append(request)
