@@ -48,12 +48,12 @@ MOST_HEARD = 32
 """Components on the link of which a status tells: it has to fit into an extended attribute."""
 HEARD_SOON = 1.2
 """Seconds within which a vehicle that is there is heard: it sends one heartbeat a second."""
-TERMINATE_ON_EXIT = 1.0, 5.0
-"""Seconds to spend on closing the server's session when we leave: at least, and at most."""
+TERMINATE_ON_EXIT, WHERE_SILENT = 5.0, 1.0
+"""Seconds to spend at most on closing the server's session when we leave; the second where the vehicle is not
+heard."""
 
 SILENT_ON_EXIT = 2.5
-"""Seconds without a heartbeat after which a vehicle's answer is not waited for when we leave: two of them, or
-more, did not come."""
+"""Seconds without a heartbeat after which it is not: two of them, or more, did not come."""
 
 _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
@@ -394,23 +394,12 @@ async def connected(
 
 
 async def _leave(connection: Connection, serving: _Task) -> None:
-    """Close the server's session, as long as the vehicle is heard."""
-    least, most = TERMINATE_ON_EXIT
-    with trio.move_on_after(most):
-        async with trio.open_nursery() as nursery:
-
-            async def stop_in_silence() -> None:
-                await trio.sleep(least)
-                silence = connection.vehicle.silence  # each heartbeat begins it anew
-                while (left := SILENT_ON_EXIT - silence(connection.clock())) > 0:  # noqa: ASYNC110
-                    await trio.sleep(left)
-                nursery.cancel_scope.cancel()
-
-            nursery.start_soon(stop_in_silence)
-            serving.scope.cancel()
-            await serving.ended.wait()
-            await connection.scheduler.close()
-            nursery.cancel_scope.cancel()
+    """Close the server's session."""
+    heard = connection.vehicle.silence(connection.clock()) <= SILENT_ON_EXIT
+    with trio.move_on_after(TERMINATE_ON_EXIT if heard else WHERE_SILENT):
+        serving.scope.cancel()
+        await serving.ended.wait()
+        await connection.scheduler.close()
 
 
 class _Task:
