@@ -201,8 +201,9 @@ class Files:
         return entry
 
     async def open_reader(self, version: Version) -> None:
-        """Give a version a reader; run by `reopening`, once for all handles. In doubt the file is opened
-        again at once, else when bytes are wanted.
+        """Give a version a reader; run by `reopening`, once for all handles.
+
+        The file is opened when bytes are wanted. Only after a doubt it is opened now, and its size compared.
 
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
@@ -245,22 +246,22 @@ class Files:
 
     # --- is it the same file?
 
-    async def require_same(self, version: Version, *, now: bool) -> None:
+    async def require_same(self, version: Version, *, skip_pause: bool) -> None:
         """Check that the path still has this version. A listing is asked for only if it can tell more.
 
-        now: even if a listing was asked for just before to compare it.
+        skip_pause: do not wait for the pause between two listings that only compare.
 
         Raises:
             FileChanged: another file has the path. Else as RemoteStore.list_directory.
         """
-        soon = not now and self._clock() < version.compare_after
+        soon = not skip_pause and self._clock() < version.compare_after
         if not (soon or self._is_sure(version) or self._nodes.is_changing(version.path)):
             await self._ask_and_compare(version)
         version.require_not_replaced()
 
     def _is_sure(self, version: Version) -> bool:
-        """Return whether a listing would tell nothing more of a version: it is CURRENT, or no times are told,
-        and the open reply showed that the file did not become smaller. After a restart that is no proof."""
+        """Return whether a listing would tell nothing more of a version. It is CURRENT. Or no times are told,
+        the vehicle did not restart, and so the open reply was enough: the file did not become smaller."""
         timed = self._directories.tells_times or version.mtime is not None
         return version.current or not (timed or version.known.restarted)
 
@@ -306,7 +307,7 @@ class Files:
                 self._compare_with(version, directory)
 
     def kill(self, version: Version) -> None:
-        """Make a version REPLACED, and with the newest one of a path all older ones."""
+        """Make a version REPLACED. If it is the newest of its path, the older ones that are open are, too."""
         path = version.path
         newest = self._newest.get(path) in (version, None)
         older = [v for v in self.open_versions if newest and v.path == path]
@@ -477,7 +478,7 @@ class VersionHandle(OpenFile):
                     break
                 pieces.append(piece)
             else:
-                await files.require_same(version, now=stop == self.size)
+                await files.require_same(version, skip_pause=stop == self.size)
                 if version.doubts == doubts:
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
             if version.doubts != doubts:

@@ -6,7 +6,7 @@ delivers the drafts of what it moves.
 
 A program that has a file open reads on when the file loses its name. If the file was written here whole, its
 bytes are here. Else it is hidden: it stays on the vehicle under a reserved name until its last handle is
-closed. Where the card cannot rename (LittleFS), the change of the name is refused (EBUSY).
+closed. Where the card cannot rename (LittleFS), the change of the name is refused (unlink: EBUSY; mv: EXDEV).
 """
 
 from __future__ import annotations
@@ -124,8 +124,9 @@ class Namespace:
 
     @asynccontextmanager
     async def _looks_later(self, *paths: bytes) -> AsyncIterator[None]:
-        """If the outcome of the body is unknown, forget what these names were. If it happened, the first one
-        is gone: so what changes a file of these names, and is not delivered, looks for that one first."""
+        """For a body that moves or removes the first path. If its outcome is unknown, forget what these names
+        were. If it happened, the first path is gone. So drafts of these paths look for it before they go on.
+        """
         context = self._context
         try:
             yield

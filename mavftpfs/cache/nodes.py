@@ -187,8 +187,8 @@ class Nodes:
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
 
     def on_gone(self, path: bytes) -> None:
-        """A change of ours took this name away, and was answered: so none before it did
-        (`Draft.taken_if_gone`)."""
+        """A change of ours took this name away, and was answered. So the name was still there, and no earlier
+        change without an answer had taken it (`Draft.taken_if_gone`)."""
         for node in self._by_path.values():
             if node.draft is not None:
                 node.draft.taken_if_gone.discard(path)

@@ -26,9 +26,9 @@ class LateCopies:
 
     The copy of a request, carried out late, does to the name's next file what was meant for the last one: a
     REMOVE removes it, a RENAME takes it away. So a name rests after such a request: for twice the largest
-    lateness, and a second at least. If no copy was seen for ten minutes, all are forgotten, and it does not
-    rest at all. But where we repeated such a request two were on the way, and the other one may come late on
-    any link. So after that the name rests as if a copy had come as late as the answer.
+    lateness, and a second at least. If no copy was seen for ten minutes, it does not rest for them any more.
+    But where we repeated such a request two were on the way, and the other one may come late on any link. So
+    after that the name rests as if a copy had come as late as the answer.
 
     A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
     CreateFile that comes even later empties the file, which is found when it is compared again under its

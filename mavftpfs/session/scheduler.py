@@ -46,7 +46,7 @@ TURN_TRIPS = 10.0
 LONG_WAIT = 3.0
 LONG_WAIT_TRIPS = 20.0
 """Seconds, and round trips, of waiting after which a heavy user is not passed over any more. Opening the file
-of an upload again takes up to four round trips, and the first time in a mount five."""
+of an upload again takes up to four round trips, and five the first time after the vehicle's start."""
 
 RELIEF = 0.5
 """Seconds for which a user that had waited so long keeps its turn."""

@@ -284,9 +284,9 @@ class Upload(SessionUser):
     async def _reopen(self, turn: Turn) -> OpenSession | None:
         """Open an interrupted file to go on with it; None if it does not have what was proven.
 
-        The first time in a mount that finds out what OpenFileWO does (docs/servers.md 8): the size tells,
-        asked afterwards, since the reply to OpenFileWO may say what it was before. A refusal says nothing of
-        the server: only this upload is not interrupted any more.
+        The first time since the vehicle's start that finds out what OpenFileWO does (docs/servers.md 8): the
+        size tells, asked afterwards, since the reply to OpenFileWO may say what it was before. A refusal says
+        nothing of the server: only this upload is not interrupted any more.
         """
         traits, reached = self._engine.traits, self._source.reached
         try:

@@ -35,7 +35,7 @@ class Known:
     size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
     restarted: the vehicle restarted since the last proof. After a restart no program goes on writing an old
     file.
-    ours: we wrote it. Others may have replaced it before a listing told its time, so its time is no proof.
+    ours: we wrote it. Others may have replaced it before a listing told its time: an equal one is no proof.
     at_open: a program opens it now. Then equal sizes are no proof where no time is told.
     """
 
