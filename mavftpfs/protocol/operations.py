@@ -31,8 +31,6 @@ class Simple(Operation):
 
     Args:
         session: the id to send; None sends the engine's, and asks again with the new one if it changed.
-        size: header field; None means len(data).
-        side_effect: repeat under the same seq first, because a second execution would be another act.
         patience: seconds until RequestTimeout, inf for the engine's deadline.
         server_time: seconds that the slowest server works at it; a repetition waits for so long.
 
@@ -51,8 +49,6 @@ class Simple(Operation):
         *,
         offset: int = 0,
         session: int | None = None,
-        size: int | None = None,
-        side_effect: bool | None = None,
         patience: float = inf,
         server_time: float | None = None,
     ) -> None:
@@ -62,12 +58,11 @@ class Simple(Operation):
         self.opcode = opcode
         self.retransmitted = False
         manner = MANNERS[opcode]
-        if side_effect is not None:
-            manner = manner._replace(same_seq=side_effect)
         if server_time is not None:
             manner = manner._replace(family="work", free_sends=2, slow_from=1, slowest=server_time)
-        count = len(data) if size is None else size
-        request = Request(self, opcode, manner, session or 0, offset, count, data, follows=session is None)
+        request = Request(
+            self, opcode, manner, session or 0, offset, len(data), data, follows=session is None
+        )
         self._requests = [request]
         self.reply: Payload
 

@@ -434,7 +434,7 @@ class ServerSession:
             raise SessionBusy("the vehicle's only FTP session is in use by another client") from nak
         left.resets -= 1
         session = self.engine.home_session
-        await self._try(Simple(Opcode.RESET_SESSIONS, b"", session=session, side_effect=True))
+        await self._try(Simple(Opcode.RESET_SESSIONS, session=session))
 
     async def _close_ours(self, nak: FtpNak) -> bool:
         if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno

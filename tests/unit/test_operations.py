@@ -32,15 +32,6 @@ def begin(op: Operation) -> tuple[Engine, Payload]:
 # --- Simple, OpenRequest, Terminate
 
 
-@pytest.mark.holds("rule 14.4")
-def test_side_effect_decides_how_it_is_repeated() -> None:
-    for side_effect in (True, False):
-        engine, request = begin(Simple(Opcode.CALC_FILE_CRC32, b"/f", side_effect=side_effect))
-        engine.on_deadline(10.0)
-        (again,) = sent(engine, 10.0)
-        assert (again.seq == request.seq) is side_effect
-
-
 @pytest.mark.parametrize(
     ("codes", "code", "errno"),
     [
