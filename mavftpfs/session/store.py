@@ -379,6 +379,9 @@ class Store:
                 return
             except (FtpNak, RequestTimeout) as failure:
                 error, repeated = failure, isinstance(failure, FtpNak) and failure.retransmitted
+            except trio.Cancelled:
+                repeated = True  # it may be on the way, as one that is repeated
+                raise
             finally:
                 self._under_way -= 1
                 if repeated:

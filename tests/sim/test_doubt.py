@@ -520,6 +520,28 @@ async def test_a_change_of_a_name_that_we_repeated_comes_late(
         assert here.data(b"/d/f") == content(400, 2)
 
 
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("lateness", [0.15, 0.4, 0.8])
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("profile", taking_turns(RENAMING))
+async def test_a_change_of_a_name_whose_caller_was_cancelled_comes_late(
+    profile: str, moves: bool, lateness: float
+) -> None:
+    here = Rig(profile, {b"/d/f": content(500, 1)}, LinkSettings(delay=0.01))
+    name = path(profile, "f")
+    async with here.connected() as connection:
+        came = come_late(here, lateness, Opcode.RENAME if moves else Opcode.REMOVE_FILE)
+        with trio.move_on_after(0.002):
+            if moves:
+                await connection.store.rename(name, path(profile, "f~"))
+            else:
+                await connection.store.remove(name)
+        await put(connection, name, content(400, 2))
+        await came.wait()
+        await trio.sleep(READY)
+        assert here.card.data(name) == content(400, 2)
+
+
 @pytest.mark.holds("promise 1")
 @pytest.mark.parametrize(
     ("profile", "delay", "latenesses"),
