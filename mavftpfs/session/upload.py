@@ -95,6 +95,7 @@ class Upload(SessionUser):
         self._retry_at = 0.0  # not to be touched before
         self._changed = trio.lowlevel.ParkingLot()
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
+        self._in_vain = False  # its last turn got no further
         self._losses = 0  # of the session, without progress
         self._furthest = 0  # in the file, when the session was lost the last time
         self._cannot_resume = False  # its file was not opened again, or was empty then, or no size was told
@@ -205,7 +206,7 @@ class Upload(SessionUser):
 
     async def _use(self, turn: Turn) -> None:
         """Have a turn."""
-        began = self._clock()
+        began, before = self._clock(), self._source.reached
         try:
             try:
                 session = await self._open(turn)
@@ -215,6 +216,7 @@ class Upload(SessionUser):
                 await self._close(session, stop)
             finally:
                 self._end_transfer()
+                self._in_vain = self._source.reached <= before
             if stop is Stop.STARVED:
                 self._complete(finishers)
         except MavftpfsError as error:
@@ -409,6 +411,9 @@ class Upload(SessionUser):
             return Stop.STARVED if self.awaited or starved_for >= least else None
         if rival_use is None:
             over = self._keeps_content and now - session.opened_at >= CHECKPOINT_EVERY
+        elif self._in_vain and self._server.path_gate.shut and transfer.paused and not transfer.acked_bytes:
+            # A long listing is inside, as in the last turn. The next one might begin beside another, too.
+            over = now - session.opened_at >= 0.5 * self._server.op_deadline
         else:
             over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None

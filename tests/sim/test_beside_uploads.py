@@ -23,6 +23,7 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import (
     MemorySink,
     MemorySource,
+    begin_to_read,
     content,
     know,
     path,
@@ -454,12 +455,16 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
 
 
 @pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("beside_a_copy", [False, True])
 @pytest.mark.parametrize("count", [1, 2])
-async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_turn(count: int) -> None:
-    """Also where one of them is always under way."""
+async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_turn(
+    count: int, beside_a_copy: bool
+) -> None:
+    """Also where one of them is always under way, or where each turn begins beside one."""
     directories = [b"/l%d" % number for number in range(count)]
     files = {name + b"/a_long_name_of_a_log_%d.ulg" % i: b"" for name in directories for i in range(100)}
-    here = Rig("px4-nuttx", {b"/d": None, **files}, LinkSettings(rate=5_000.0, delay=0.1))
+    files |= {b"/d/big": content(1_000_000)}
+    here = Rig("px4-nuttx", files, LinkSettings(rate=5_000.0, delay=0.1))
     data = content(4_000)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         connection.engine.traits.paths_block_writes = True
@@ -468,10 +473,13 @@ async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_tu
             while True:
                 await connection.store.list_directory(here.root + directory)
 
+        if beside_a_copy:
+            know(connection, "px4-nuttx")
+            await begin_to_read(connection, path("px4-nuttx", "big"), 1000)
         for directory in directories:
             nursery.start_soon(list_for_ever, directory)
         await trio.sleep(1.0)
-        with trio.fail_after(90):
+        with trio.fail_after(300 if beside_a_copy else 90):
             await put(connection, path("px4-nuttx", "new"), data)
         nursery.cancel_scope.cancel()
     assert here.data(b"/d/new") == data
