@@ -20,6 +20,9 @@ from mavftpfs.shared.model import Traits
 
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
+_LONG_FROM = 3
+"""From this transmission on, every second one of a short request has full length (see `encode`)."""
+
 
 class Manner(NamedTuple):
     """How requests of one opcode are timed and repeated.
@@ -113,8 +116,18 @@ class Request:
 
 
 def encode(requests: Sequence[Request]) -> list[bytes]:
-    """Return the 251 wire bytes of each under its present seq; its data must fit."""
-    return [_pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data) for r in requests]
+    """Return the 251 wire bytes of each under its present seq; its data must fit.
+
+    After a frame whose length was damaged, a parser takes up to 255 bytes of the next frames for the rest of
+    it. So every second of the later repetitions has full length, by a last byte that no server reads.
+    """
+    wires = []
+    for r in requests:
+        wire = _pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data)
+        if r.sends >= _LONG_FROM and r.sends % 2 and len(r.data) < MAX_DATA - 1:
+            wire = wire[:-1] + b"\xff"
+        wires.append(wire)
+    return wires
 
 
 Run: TypeAlias = list[tuple[Request, bytes]]

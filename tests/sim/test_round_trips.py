@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from functools import partial
 
 import pytest
 import trio
@@ -13,7 +14,7 @@ from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from tests.support.memory import MemoryLink
 from tests.support.rigs import Rig, write_file
 from tests.support.takingturns import taking_turns
-from tests.support.transfers import ROOTS, content, path
+from tests.support.transfers import ROOTS, content, path, read_file
 
 RTT = 0.3
 LONG = LinkSettings(delay=RTT / 2)
@@ -195,3 +196,39 @@ async def test_changing_many_names_of_a_long_directory_seldom_lists_it() -> None
         took = trio.current_time() - began
     assert len(here.card.entries(directory)) == 2 + count // 2  # "." and ".."
     assert took <= 1.5 * count * RTT
+
+
+class Swallowing(LinkModel):
+    """The vehicle's parser takes the next `left` bytes of ours for the rest of a frame."""
+
+    def __init__(self) -> None:
+        super().__init__(random.Random(1), WIFI)
+        self.left = 0
+
+    def push(self, direction: Direction, frame: bytes, now: float) -> bool:
+        if direction is Direction.TO_VEHICLE and self.left > 0:
+            self.left -= len(frame)
+            return True
+        return super().push(direction, frame, now)
+
+
+@pytest.mark.holds("rule 14.38")
+@pytest.mark.parametrize("profile", PROFILES)
+async def test_a_parser_that_lost_the_thread_costs_no_second(profile: str) -> None:
+    """A dozen short frames had to be lost on it, of which the last came every 3 s."""
+    here = Rig(profile, {b"/d/f": content(100), b"/d/g": content(100)}, WIFI)
+    here.link = MemoryLink(here.vehicle, model := Swallowing())
+    async with here.connected() as connection:
+        store = connection.store
+        await store.list_directory(split(path(profile, "f"))[0])
+        await read_file(connection, path(profile, "f"))
+        await trio.sleep(3)
+        for work in (
+            partial(store.list_directory, split(path(profile, "f"))[0]),
+            partial(store.stat_size, path(profile, "f")),
+            partial(store.make_directory, path(profile, "new")),
+            partial(store.remove, path(profile, "g")),
+        ):
+            model.left, began = 255, trio.current_time()
+            await work()
+            assert trio.current_time() - began <= 2.0
