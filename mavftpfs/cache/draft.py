@@ -291,8 +291,8 @@ class Draft:
         """Note that others replaced the base. That changes nothing if no byte of the base was to stay, unless
         `though_rewritten`: another file that got the name by a change of ours may be its only copy.
         """
-        kept = self.base_limit or self.state is State.CLEAN  # CLEAN: also an empty base
-        if (kept or though_rewritten) and self.state is not State.STALE:
+        stays = self.base_limit or self.state is State.CLEAN  # CLEAN: also an empty base
+        if (stays or though_rewritten) and self.state is not State.STALE:
             self.give_up()
             self.on(Event.REPLACED)
 

@@ -10,6 +10,7 @@ request could bring the old file back.
 
   aside   placed   the name has
   none    None     the new file, the old one, or nothing: a single rename was interrupted
+  none    False    a file, or nothing: a listing showed that, or that the old file is gone, and a draft waits
   set     None     the new file or nothing: the old one was moved aside
   set     False    the old file or nothing: it was perhaps moved aside, and perhaps back
   set     True     the new file; in doubt the old one still lies aside
