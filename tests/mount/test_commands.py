@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -50,30 +49,3 @@ def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) 
     for folder in ("deep", "names"):
         mavftpfs("get", "-r", vehicle.source, f"/{folder}", "--to", tmp_path)
         assert differing(small_tree / folder, tmp_path / folder) == []
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("ls", "/none"), "/none"),
-        (("rmdir", "/sizes"), "empty"),
-    ],
-)
-def test_what_cannot_be_done_is_a_line_and_exit_1(
-    vehicle: SimVehicle, words: tuple[str, ...], named: str
-) -> None:
-    out, said = mavftpfs(words[0], vehicle.source, *words[1:], code=1)
-    assert out == ""
-    assert len(said.splitlines()) == 1, said
-    assert named in said
-
-
-def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
-    out, _ = mavftpfs("scan", "--json", vehicle.source)
-    found: list[dict[str, Any]] = json.loads(out)
-    assert [(peer["system"], peer["component"], peer["what"]) for peer in found] == [
-        (1, 1, "PX4 quadrotor, disarmed")
-    ]
-    assert (found[0]["ftp"], found[0]["answers"]) == ("answers", True)
-    assert found[0]["uid"] != "-"
-    assert found[0]["firmware"] != "-"

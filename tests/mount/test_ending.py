@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from mavftpfs.client.control import find_socket, own_directories
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, mounted_at, wait_until
+from tests.support.trees import content
+from tests.support.vehicles import HOST, free_udp_port
 
 BIG = 300 << 20
 """Bytes of a sparse file that no server sends within a test."""
 SILENCE = 60.0
 """Seconds within which everything that waits for a dead vehicle must have ended."""
-FEW = 40
-"""Descriptors of a mount's process, which needs some 25 to unmount."""
 QUICK = ("op_deadline=6",)
 
 READ_ALL = """
@@ -73,23 +68,13 @@ def end_of(reader: subprocess.Popen[str], mount: Mount) -> tuple[int, str]:
 
 
 @pytest.mark.holds("fault cancel")
-@pytest.mark.parametrize("how", ["SIGINT", "command"])
-def test_each_way_to_end_a_mount_is_clean(field: Field, big_tree: Path, how: str) -> None:
-    mount = field.mount(field.sim(big_tree).source)
-    assert mount.run("cat", mount.path / "dir1/small.txt").stdout == "small 1\n"
-    if how.startswith("SIG"):
-        assert mount.end_by(signal.Signals[how]) == 0
-    else:
-        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
-        assert mount.alive_or_ended().wait() == 0
-    assert not mounted_at(mount.path)
-
-
-@pytest.mark.holds("fault cancel")
-def test_a_signal_while_a_file_is_read_ends_both(field: Field, big_tree: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_file_is_read_ends_both(
+    field: Field, big_tree: Path, number: signal.Signals
+) -> None:
     mount = field.mount(field.sim(big_tree).source)
     reader = start_reading(mount)
-    assert mount.end_by(signal.SIGTERM) == 0
+    assert mount.end_by(number) == 0
     code, _ = end_of(reader, mount)
     assert code != 0, "a file that was cut short must not look complete"
     wait_until("the mount is gone", lambda: not mounted_at(mount.path))
@@ -117,29 +102,6 @@ def test_a_killed_vehicle_is_an_error_in_time_and_comes_back(field: Field, big_t
     fresh = start_reading(mount)
     fresh.kill()
     fresh.communicate(timeout=SILENCE)
-
-
-LIST_UNKNOWN = "os.listdir(sys.argv[1])"
-
-
-@pytest.mark.holds("promise 4")
-def test_ls_of_known_directories_asks_a_lost_vehicle_for_nothing(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree)
-    mount = field.mount(vehicle.source, "dir_timeout=0.5")
-    known = mount.path / "deep"
-    before = mount.run("ls", "-lR", known).stdout
-    time.sleep(1.0)  # what is known of it has expired
-    vehicle.pause()
-    wait_until("the vehicle is lost", lambda: mount.status()["link"]["state"] == "lost")
-    asked = mount.status()["cache"]["listings_asked"]
-    assert mount.run("ls", "-lR", known).stdout == before
-    assert mount.errno_of(LIST_UNKNOWN, mount.path / "sizes") == "ETIMEDOUT"
-    assert mount.errno_of(LIST_UNKNOWN, mount.path / "none") == "ENOENT"
-    assert mount.status()["cache"]["listings_asked"] == asked
-    vehicle.resume()
-    wait_until(
-        "files are readable again", lambda: mount.run("ls", mount.path / "sizes", code=None).stdout != ""
-    )
 
 
 def readable(mount: Mount, name: str, content: str) -> bool:
@@ -176,21 +138,6 @@ def test_unmounting_from_a_dead_vehicle_waits_for_no_read(field: Field, big_tree
     vehicle.resume()
 
 
-def test_a_mount_with_few_descriptors_and_idle_connections_ends_in_order(
-    field: Field, big_tree: Path
-) -> None:
-    mount = field.mount(field.sim(big_tree).source)
-    process = mount.alive()
-    resource.prlimit(process.popen.pid, resource.RLIMIT_NOFILE, (FEW, FEW))
-    path = find_socket(os.path.realpath(mount.path), own_directories())
-    with ExitStack() as idle:
-        for _ in range(FEW):
-            idle.enter_context(socket.socket(socket.AF_UNIX)).connect(str(path))
-        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
-    assert process.wait() == 0
-    assert process.text().count("no descriptor") <= 1
-
-
 def test_a_mount_that_the_kernel_aborted_is_gone(field: Field, big_tree: Path) -> None:
     """`umount -f` of one in use fails, and has cut the programs off all the same."""
     mount = field.mount(field.sim(big_tree).source)
@@ -207,3 +154,19 @@ def test_a_busy_mount_refuses_umount_and_goes_on(field: Field, big_tree: Path) -
         assert refusal.returncode == 3
         assert "in use" in refusal.stderr
         assert mount.run("cat", mount.path / "dir3/small.txt").stdout == "small 3\n"
+
+
+@pytest.mark.holds("promise 5", "fault reboot")
+def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
+    card = field.local("card")
+    data = content("reboot", 400_000)
+    (card / "log.bin").write_bytes(data)
+    link = f"tcpin:{HOST}:{free_udp_port()}"
+    vehicle = field.sim(card, "px4", ("--rate", "150000"), link=link)
+    mount = field.mount(vehicle.source)
+    with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
+        wait_until("it is under way", lambda: (tmp_path / "copy").stat().st_size > 0)
+        vehicle.react(signal.SIGPWR)
+        _, errors = copy.communicate(timeout=120)
+    assert (copy.returncode, errors) == (0, "")
+    assert (tmp_path / "copy").read_bytes() == data

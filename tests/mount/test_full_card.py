@@ -1,4 +1,4 @@
-"""A card that is full: an error, nothing lost that was there, nothing left behind, and room again later.
+"""A card that is full: an error, nothing lost that was there, nothing left behind.
 
 The card is a small tmpfs below the simulated server or the MAVSDK library's.
 """
@@ -6,7 +6,6 @@ The card is a small tmpfs below the simulated server or the MAVSDK library's.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -80,15 +79,3 @@ def test_what_does_not_fit_costs_nothing_that_was_there(
     mount.run("ls", "-A", shown)
     wait_until("nothing is left behind", lambda: names(card) == ["old.bin"])
     assert mount.read_bytes(shown / "old.bin") == NEW
-
-
-@pytest.mark.holds("fault full card")
-def test_room_that_comes_later_is_used(root: Path, field: Field, tmp_path: Path) -> None:
-    mount, shown, card = mounted(field, "px4", root, "log.bin")
-    source = tmp_path / "source.bin"
-    source.write_bytes(TOO_LARGE)
-    assert mount.run("cp", source, shown / "late.bin", code=None).returncode == 1
-    mount.run("rm", shown / "log.bin")
-    mount.run("sh", "-c", f'exec 3>>"{shown}/late.bin"; exec 3>&-')  # a close tries again
-    assert (card / "late.bin").read_bytes() == TOO_LARGE
-    assert shutil.disk_usage(root).free < CAPACITY - len(TOO_LARGE) + 8192

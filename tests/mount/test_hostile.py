@@ -6,7 +6,6 @@ Deadlines are short here; that each command ends is what `Mount.run` insists on.
 from __future__ import annotations
 
 import os
-import random
 import sys
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import pytest
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
-from tests.support.lying import LyingVehicle
 from tests.support.mounts import Mount, mounted_at
 from tests.support.replies import ack, nak
 
@@ -42,12 +40,6 @@ NAMES = (
     b"Fsub/dir\t4",
 )
 
-FINE = random.Random("fine").randbytes(5000)
-
-NAKED = {2: "EIO", 9: "EACCES", 12: "EIO"}
-"""Codes that opening /nak/open<code> and reading /nak/read<code> is refused with, known and unknown, and
-what a program is told; unit/test_errnos.py has them all."""
-
 MAX_RESIDENT = 150 << 20
 """Bytes; far above what a capped listing needs, far below what an endless one would take."""
 
@@ -55,29 +47,17 @@ MAX_RESIDENT = 150 << 20
 def card() -> MemoryTree:
     """What the vehicle has."""
     tree = MemoryTree()
-    tree.add(b"/fine.bin", FINE)
     for name in GOOD_NAMES:
         tree.add(b"/names/" + os.fsencode(name), GOOD)
-    tree.add(b"/silent.bin", bytes(1000))
-    for code in NAKED:
-        tree.add(b"/nak/open%d" % code, GOOD)
-        tree.add(b"/nak/read%d" % code, GOOD)
     for name in ("endless", "same", "refused"):
         tree.add_directory(f"/{name}".encode())
     return tree
 
 
-def refusal(request: Payload, code: int) -> Payload:
-    """Return a NAK; FailErrno carries the number of an error of some other operating system."""
-    return (
-        nak(request, code)
-        if code != NakCode.FAIL_ERRNO
-        else nak(request, code)._replace(data=b"\2\xcd", size=2)
-    )
-
-
 def listing(request: Payload) -> list[Payload] | None:
     """Answer requests for pages of the bad directories."""
+    if request.opcode != Opcode.LIST_DIRECTORY:
+        return None
     match request.data.strip(b"/\0"):
         case b"endless":
             names = [b"Fendless%09d\t4" % (request.offset + step) for step in range(8)]
@@ -92,42 +72,20 @@ def listing(request: Payload) -> list[Payload] | None:
     return [ack(request, b"\0".join(names) + b"\0") if names else nak(request, NakCode.EOF)]
 
 
-def lie(vehicle: LyingVehicle) -> None:
-    """Have listings and files broken as their names say."""
-
-    def answer(request: Payload) -> list[Payload] | None:
-        opened = b"".join(vehicle.server.open_paths)
-        if request.opcode == Opcode.LIST_DIRECTORY:
-            return listing(request)
-        if request.opcode == Opcode.OPEN_FILE_RO and request.data.startswith(b"/nak/open"):
-            return [refusal(request, int(request.data.rstrip(b"\0")[9:]))]
-        if request.opcode == Opcode.READ_FILE and opened.startswith(b"/nak/read"):
-            return [refusal(request, int(opened[9:]))]
-        if request.opcode == Opcode.READ_FILE and opened.endswith(b"silent.bin"):
-            return []
-        return None
-
-    vehicle.server.answer = answer
-
-
 @pytest.fixture(scope="module")
 def liar(module_field: Field) -> Mount:
-    """A mount of the vehicle with hostile listings and broken files."""
+    """A mount of the vehicle with hostile listings."""
     vehicle = module_field.lying(card())
-    lie(vehicle)
+    vehicle.server.answer = listing
     mount = module_field.mount(vehicle.source, *QUICK)
     mount.allowed_log = ("took longer than its deadline",)
     return mount
 
 
-@pytest.mark.holds("promise 10")
+@pytest.mark.holds("promise 10", "fault odd listing")
 def test_only_usable_names_enter_the_tree(liar: Mount) -> None:
     out = liar.python("import os, sys; print(ascii(sorted(os.listdir(sys.argv[1]))))", liar.path / "names")
     assert out.strip() == ascii(sorted(GOOD_NAMES))
-
-
-@pytest.mark.holds("fault odd listing")
-def test_good_files_among_bad_names_are_readable(liar: Mount) -> None:
     for name in sorted(GOOD_NAMES):
         assert liar.read_bytes(liar.path / "names" / name) == GOOD
 
@@ -138,22 +96,6 @@ def test_endless_listings_end_with_an_error(liar: Mount) -> None:
     assert error in {"EIO", "ETIMEDOUT"}
     assert liar.alive().peak_memory() < MAX_RESIDENT
     assert liar.run("cat", liar.path / "names/good.txt").stdout == GOOD.decode()
-
-
-@pytest.mark.holds("promise 1")
-def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount) -> None:
-    """sim/test_incomplete_listings.py has more ways in which it cannot."""
-    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "silent.bin")
-    assert error in {"EIO", "ETIMEDOUT"}
-    assert liar.read_bytes(liar.path / "fine.bin") == FINE
-
-
-@pytest.mark.holds("fault NAK")
-@pytest.mark.parametrize("step", ["open", "read"])
-def test_every_refusal_has_an_errno(liar: Mount, step: str) -> None:
-    for code, told in NAKED.items():
-        error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "nak" / f"{step}{code}")
-        assert error == told
 
 
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:

@@ -56,7 +56,12 @@ REFUSED = {
     "os.link(sys.argv[1] + '/file', sys.argv[1] + '/b')": "EPERM",
     "os.mkfifo(sys.argv[1] + '/b')": "EPERM",
     "os.setxattr(sys.argv[1] + '/file', 'user.x', b'y')": "ENOTSUP",
+    "os.removexattr(sys.argv[1] + '/file', 'user.x')": "ENOTSUP",
+    "os.readlink(sys.argv[1] + '/file')": "EINVAL",
+    "os.fsync(os.open(sys.argv[1], os.O_RDONLY))": "",
+    "assert os.access(sys.argv[1] + '/file', os.W_OK)": "",
 }
+"""Snippets, and the errno of each: "" for success."""
 
 
 def test_what_no_card_has_is_refused(plain: Mount) -> None:
