@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import signal
 import sys
@@ -168,26 +167,3 @@ def test_the_link_is_free_once_a_copy_was_interrupted(field: Field, tmp_path: Pa
     before = received()
     time.sleep(3)
     assert received() - before < rate / 2, "no more than heartbeats, and what was on its way"
-
-
-def test_a_shared_descriptor_is_read_on_though_one_of_its_owners_closed_it(field: Field) -> None:
-    card = field.local("card")
-    (card / "log.bin").write_bytes(content("log", 300_000))
-    mount = field.mount(field.sim(card, "px4", ("--rate", "60000", "--delay", "0.03")).source)
-    code = """
-import hashlib, os, subprocess, sys, threading
-fd = os.open(sys.argv[1], os.O_RDONLY)
-parts = []
-def read():
-    while part := os.read(fd, 200_000):
-        parts.append(part)
-reader = threading.Thread(target=read)
-reader.start()
-while reader.is_alive():
-    copy = os.dup(fd)
-    os.close(copy)
-    reader.join(0.1)
-print(hashlib.sha256(b"".join(parts)).hexdigest())
-"""
-    said = mount.python(code, mount.path / "log.bin")
-    assert said.strip() == hashlib.sha256((card / "log.bin").read_bytes()).hexdigest()

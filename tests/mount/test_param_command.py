@@ -122,14 +122,6 @@ def test_loading_goes_twice_where_parameters_appear_only_then(source: str, tmp_p
 
 
 @THROUGH_A_MOUNT
-def test_bad_lines_of_a_file_are_all_named(source: str, tmp_path: Path) -> None:
-    file = tmp_path / "bad.parm"
-    file.write_text("RTL_ALT,x\n\nRTL_ALT\n")
-    lines = said(source, "--load", file, code=1).splitlines()
-    assert [line.partition("bad.parm")[2][:4] for line in lines] == [":1: ", ":3: "]
-
-
-@THROUGH_A_MOUNT
 def test_lines_of_other_components_are_left_out_or_an_error(source: str, tmp_path: Path) -> None:
     file = tmp_path / "both.params"
     file.write_text("1\t1\tRTL_ALT\t1500\t6\n1\t154\tRTL_ALT\t99\t6\n".replace("\t99\t6", "\t1500\t6"))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -94,14 +92,6 @@ def test_vim_sets_what_its_user_changed(texts: Texts, vim: str) -> None:
     assert texts.errors() == ""
 
 
-@pytest.mark.parametrize("vim", [VIM, BACKUP])
-def test_vim_that_changed_nothing_sets_nothing(texts: Texts, vim: str) -> None:
-    before = texts.told(MOVING[texts.real])
-    texts.shell(f"{vim} {PAUSE} -c wq params.parm")
-    assert texts.told(MOVING[texts.real]) > before
-    assert texts.errors() == ""
-
-
 def test_vim_on_a_terminal_saves_without_a_question(texts: Texts) -> None:
     """Though what the vehicle sets by itself moved between the listing, the open and the save."""
     texts.shell("ls -l; sleep 1")
@@ -156,36 +146,6 @@ def test_rsync_in_place_works_and_else_is_refused(texts: Texts, tmp_path: Path) 
     assert "Read-only file system" in said
     texts.shell(f"rsync -I --inplace {wanted} params.parm")
     assert texts.told(texts.whole) == 44
-
-
-def test_python_hears_of_errors_at_close(texts: Texts) -> None:
-    for text, number in ((f"{texts.whole},1.5\n", errno.EINVAL), (f"{texts.whole},55", errno.EINVAL)):
-        with pytest.raises(OSError, match="Invalid") as caught:
-            texts.all.write_text(text)
-        assert caught.value.errno == number
-    assert texts.told(texts.whole) != 55
-    texts.all.write_text(f"{texts.whole},55\n")
-    assert texts.told(texts.whole) == 55
-
-
-def test_a_child_that_ends_flushes_half_a_line_and_sets_nothing(texts: Texts) -> None:
-    with texts.all.open("w") as file:
-        file.write(f"{texts.whole},6")
-        file.flush()
-        child = os.fork()
-        if child == 0:
-            os._exit(0)  # which closes the descriptor that it inherited
-        os.waitpid(child, 0)
-        assert texts.told(texts.whole) != 6
-        file.write("6\n")
-    assert texts.told(texts.whole) == 66
-
-
-def test_git_shows_what_differs(texts: Texts, tmp_path: Path) -> None:
-    saved = tmp_path / "saved.parm"
-    texts.shell(f"cp params.parm {saved}; echo '{texts.whole},77' >> params.parm")
-    said = texts.shell(f"git diff --no-index --unified=0 {saved} params.parm", code=1)
-    assert f"\n+{texts.whole},77\n" in said
 
 
 def test_a_listing_tells_sizes_that_are_right(texts: Texts) -> None:

@@ -5,17 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from mavftpfs.link.hublink import PROTOCOL, pack_facts
-from mavftpfs.link.rendezvous import HUB, hubs, knock
-from mavftpfs.link.samelink import port_name
-from mavftpfs.link.uri import parse_source
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, command, hub_of, wait_until
 from tests.support.vehicles import HOST, free_udp_port
@@ -47,15 +42,6 @@ def reads_right(mount: Mount, root: Path) -> bool:
     return mount.read_bytes(mount.path / "log.bin") == (root / "log.bin").read_bytes()
 
 
-def knock_and_leave(source: str) -> None:
-    """Want the port as a program does that ends before it is let in."""
-    hello = {"protocol": PROTOCOL, "join": source, "own": [254, 191], "forward": []}
-    sock = knock(port_name(parse_source(source)))
-    assert sock is not None
-    sock.send(pack_facts(hello))
-    sock.close()
-
-
 def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Field) -> None:
     cards, source = two_vehicles(field)
     one = field.mount(source, "target_system=1")
@@ -71,35 +57,10 @@ def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Fiel
         assert reads_right(mount, root)
         mount.run("cp", root / "log.bin", mount.path / "copy.bin")
         assert (root / "copy.bin").read_bytes() == (root / "log.bin").read_bytes()
-    the_hub_is_the_users_alone()
-    for _ in range(5):
-        knock_and_leave(source)
     assert one.unmount() == 0
     assert reads_right(two, cards[1]), "the hub goes on for the other one"
     assert two.unmount() == 0
     wait_until("the hub ended with its last client", lambda: hub_of(source) is None)
-
-
-def the_hub_is_the_users_alone() -> None:
-    """Check who may reach the hubs."""
-    doors = hubs()
-    assert doors
-    for door in doors:
-        assert door.suffix == HUB
-        assert stat.S_IMODE(door.lstat().st_mode) == 0o600
-        assert stat.S_IMODE(door.parent.lstat().st_mode) == 0o700
-
-
-def test_two_that_begin_at_once_share_the_port(field: Field) -> None:
-    cards, source = two_vehicles(field)
-    one = field.prepare(source, "target_system=1")
-    two = field.prepare(source, "target_system=2")
-    # Both begin at the same moment: one has the port, the other one knocks.
-    for mount in (one, two):
-        mount.begin()
-    for mount, root in ((one, cards[0]), (two, cards[1])):
-        mount.await_serving()
-        assert reads_right(mount, root)
 
 
 def kill_hub(source: str, mounts: list[Mount]) -> None:
@@ -130,16 +91,6 @@ def test_a_killed_hub_is_started_again_and_no_write_is_lost(field: Field) -> Non
     assert [path.read_bytes() for path, _ in written] == [data for _, data in written]
     for mount, root in zip(mounts, cards, strict=True):
         assert reads_right(mount, root)
-
-
-def test_a_killed_mount_disturbs_nobody(field: Field) -> None:
-    cards, source = two_vehicles(field)
-    one, two = (field.mount(source, f"target_system={number}") for number in (1, 2))
-    one.kill()
-    command("umount", one.path)
-    assert reads_right(two, cards[1])
-    again = field.mount(source, "target_system=1")
-    assert reads_right(again, cards[0])
 
 
 @pytest.mark.parametrize("link", ["pty", "tcpin"])

@@ -19,7 +19,7 @@ from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, command, wait_until
-from tests.support.vehicles import PROJECT, Program, free_udp_port
+from tests.support.vehicles import PROJECT
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
@@ -58,22 +58,6 @@ def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tr
         "mavftpfs: vehicle 1/1 is back after TIME",
         "mavftpfs: vehicle 1/1 restarted",
     ]
-
-
-def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree)
-    ports = (vehicle.vehicle_port, free_udp_port(), free_udp_port())
-    words = ["tests.support.proxy", *map(str, ports)]
-    fanout = Program("fanout", words, field.local("fanout"))
-    try:
-        mount = field.mount(f"udpin:127.0.0.1:{ports[1]}")
-        other = (sys.executable, "-m", "mavftpfs", "ls", f"udpin:127.0.0.1:{ports[2]}", "/")
-        mount.run(*other, "-o", "source_component=77")
-        logged(mount, "another FTP client of vehicle 1/1 is heard")
-        assert len([line for line in news(mount) if "FTP client" in line]) == 1
-        mount.finish()
-    finally:
-        fanout.stop()
 
 
 CLEAR = "\x1b[H\x1b[J"

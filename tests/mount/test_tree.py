@@ -74,27 +74,12 @@ def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
     scene.mount.run(*COMPARE, scene.expected, scene.path, timeout=240)
 
 
-def test_cp_r_copies_the_tree(scene: Scene, tmp_path: Path) -> None:
-    for part in ("sizes", "names", "deep", "many"):
-        scene.mount.run("cp", "-r", scene.path / part, tmp_path / part, timeout=240)
-        assert differing(scene.expected / part, tmp_path / part) == []
-
-
 def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path) -> None:
     for block, skip, count in DD_STEPS:
         numbers = (f"bs={block}", f"skip={skip}", f"count={count}", "status=none")
         name, copy = "sizes/131073.bin", tmp_path / "piece"
         scene.mount.run("dd", f"if={scene.path / name}", f"of={copy}", *numbers)
         assert copy.read_bytes() == bytes_of("dd", f"if={scene.expected / name}", *numbers)
-
-
-def test_tail_and_df(scene: Scene) -> None:
-    code = "import sys; f = open(sys.argv[1], 'rb'); f.seek(-300, 2); print(f.read().hex(), f.read(), end='')"
-    out = scene.mount.python(code, scene.path / "sizes/131073.bin")
-    assert out == (scene.expected / "sizes/131073.bin").read_bytes()[-300:].hex() + " b''"
-    last = scene.mount.run("df", "--output=size,avail,target", "-B1", scene.path).stdout.splitlines()[-1]
-    assert last.split()[-1] == str(scene.path)
-    assert int(last.split()[0]) > 0
 
 
 def test_find_and_ls_and_du_agree_with_the_disk(scene: Scene) -> None:

@@ -82,21 +82,6 @@ def test_umount_of_a_mount_that_lost_its_socket_says_what_is_held(
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
-def test_a_signal_ends_the_delivery_of_a_mount_that_is_unmounted(
-    field: Field, data: Path, state: Path
-) -> None:
-    mount, vehicle, _ = holding(field, data)
-    vehicle.left_alone = True
-    process, mount.process = mount.alive(), None
-    with mount.started(*MAVFTPFS, "umount", mount.path) as child:
-        wait_until("it delivers before it ends", lambda: "delivering" in process.text())
-        process.send_signal(signal.SIGTERM)
-        _, errors = child.communicate(timeout=60)
-        assert child.returncode == ExitCode.UNDELIVERED
-    assert process.wait() == ExitCode.UNDELIVERED
-    assert f"1 file(s) did not reach the vehicle; they are kept in {state}" in errors
-
-
 def test_what_came_from_stdin_and_was_not_delivered_is_kept(field: Field, data: Path, state: Path) -> None:
     vehicle = field.sim(field.local("card"))
     vehicle.left_alone = True

@@ -29,13 +29,6 @@ def test_parameters_are_one_consistent_file(ardupilot: Mount, tmp_path: Path) ->
     assert blocks, "param.pck is none of the vehicle's files, whatever the block size"
 
 
-def test_a_query_selects_parameters(ardupilot: Mount) -> None:
-    name = "param.pck?start=2&count=3"
-    assert ardupilot.read_bytes(ardupilot.path / "@PARAM" / name) == TRUTH.content(
-        b"@PARAM/" + name.encode(), 239
-    )
-
-
 @pytest.mark.parametrize("tool", ["cp", "rsync"])
 def test_copying_tools_get_the_true_bytes(ardupilot: Mount, tmp_path: Path, tool: str) -> None:
     sources = [f"./@SYS/{name}" for name in FILLED]
@@ -69,8 +62,3 @@ def test_a_mission_is_copied_edited_and_copied_back(ardupilot: Mount, tmp_path: 
     ardupilot.run("sh", "-c", vim, cwd=missions, code=1)
     assert b"mission.waypoints:4: 'x' is not a number" in ardupilot.read_bytes(missions / "last_error.txt")
     assert ardupilot.errno_of("open(sys.argv[1], 'w')", missions / "mission.dat") == "EROFS"
-
-
-def test_writing_below_at_is_refused(ardupilot: Mount) -> None:
-    assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@PARAM/param.pck") == "EROFS"
-    assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@SYS/new.txt") == "EROFS"

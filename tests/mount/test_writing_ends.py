@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -15,10 +14,6 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.client import control
-from mavftpfs.client.files import session_on
-from mavftpfs.client.options import Options
-from mavftpfs.shared.errors import MavftpfsError
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, unmount, wait_until
 from tests.support.trees import content
@@ -175,34 +170,16 @@ def told(process: Process) -> Path:
     return recovered(process.text())
 
 
-def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: Path) -> None:
-    card = field.local("card")
-    mount = field.mount(field.sim(card, "ardupilot5").source)
-    result = mount.run("cp", data, mount.path / "no?such*name", code=None)
-    assert (result.returncode, "Invalid argument" in result.stderr) == (1, True)
-    assert mount.errno_of("open(sys.argv[1], 'r+b').close()", mount.path / "no?such*name") == "EINVAL"
-    process, mount.process = mount.alive(), None
-    process.send_signal(signal.SIGTERM)
-    assert process.wait() == 4
-    assert (recovered(process.text()) / "no?such*name").read_bytes() == data.read_bytes()
-    assert process.text().count("is not delivered") == 1
-    assert list(card.iterdir()) == []
-
-
 @pytest.mark.holds("promise 3")
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
     mount, vehicle, card = holding(field, data)
     unmount(mount.path)
     wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
-    path = control.find_socket(str(mount.path), control.own_directories())
-    with socket.socket(socket.AF_UNIX) as client:
-        client.settimeout(60)
-        client.connect(str(path))
-        client.sendall(b'{"command": "umount"}\n')
-        control.ask(path, {"command": "status"}, timeout=20)  # served after the one before
+    with mount.started(sys.executable, "-m", "mavftpfs", "umount", mount.path) as second:
+        assert second.stderr is not None
+        assert "not everything is on the vehicle yet" in second.stderr.readline()
         vehicle.resume()
-        reply = json.loads(client.makefile().readline())
-    assert (reply["ok"], reply.get("exit_code")) == (True, 0), reply
+        assert second.wait(60) == 0
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
@@ -268,84 +245,26 @@ def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: P
     )
 
 
-def test_a_killed_daemon_leaves_what_was_being_written_under_its_name(field: Field, data: Path) -> None:
-    """Before any close: more than memory takes lies on the local disk, and its name beside it."""
-    vehicle = field.sim(field.local("card"), "px4", ("--rate", "50000"))
-    vehicle.left_alone = True
-    mount = field.mount(vehicle.source, *QUICK, "dirty_max=64K")
-    code = (
-        "import sys, time\n"
-        "f = open(sys.argv[1], 'xb', 0); f.write(b'n' * 100_000)\n"
-        "print('written', flush=True); time.sleep(60)"
-    )
-    with mount.started(sys.executable, "-c", code, mount.path / "log.bin") as child:
-        assert child.stdout is not None
-        assert child.stdout.readline()
-        mount.kill()
-        abort_mount(mount.path)
-    place = told(field.mount(vehicle.source, *QUICK).alive())
-    found = {path.name: path for path in place.iterdir()}
-    assert found["log.bin"].read_bytes() == b"n" * 100_000
-    facts = json.loads(found["log.bin.json"].read_text())
-    assert len(facts.pop("uid")) == 16
-    assert facts == {"path": "/log.bin", "system": 1}
-
-
-def test_a_mount_that_wrote_leaves_nothing_behind(
-    field: Field, data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    state, temporaries = field.local("state"), field.local("t")
-    monkeypatch.setenv("XDG_STATE_HOME", str(state))
-    monkeypatch.setenv("TMPDIR", str(temporaries))
-    card = field.local("card")
-    mount = field.mount(field.sim(card).source, "dirty_max=64K")
-    mount.run("cp", data, mount.path / "one.bin")
-    mount.run("cp", data, mount.path / "one.bin")
-    mount.run("truncate", "-s", "10", mount.path / "one.bin")
-    mount.run("rm", mount.path / "one.bin")
-    assert mount.unmount() == 0
-    assert os.listdir(temporaries) == []
-    assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
-    assert os.listdir(card) == []
-
-
 def readable(mount: Mount) -> bool:
     """Return whether the vehicle answers."""
     return mount.run("cat", mount.path / "confirmed", code=None).stdout == "confirmed\n"
 
 
-def test_a_put_that_is_refused_leaves_nothing_behind(
+def test_a_mount_that_wrote_and_a_put_that_was_refused_leave_nothing_behind(
     field: Field, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file is here already: no mount has to find another copy of it."""
-    vehicle = field.sim(field.local("card"), "px4-nuttx")
-    state = field.local("state")
+    card, state, temporaries = (field.local(name) for name in ("card", "state", "t"))
+    (card / "fs/microsd").mkdir(parents=True)
+    vehicle = field.sim(card, "px4-nuttx")
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    monkeypatch.setenv("TMPDIR", str(temporaries))
     assert "protected" in command("put", vehicle.source, data, "/outside-its-card", code=4)[1]
+    mount = field.mount(vehicle.source, "dirty_max=64K")
+    file = mount.path / "fs/microsd/one.bin"
+    mount.run("cp", data, file)
+    mount.run("truncate", "-s", "10", file)
+    mount.run("rm", file)
+    assert mount.unmount() == 0
+    assert os.listdir(temporaries) == []
     assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
-
-
-async def test_what_a_client_takes_back_from_a_mount_never_comes(field: Field) -> None:
-    """It closes the file as any program does, and yet the mount does not go on with it."""
-    card = field.local("card")
-    (card / "old").write_text("old")
-    vehicle = field.sim(card)
-    mount = field.mount(vehicle.source, "op_deadline=2")
-    mount.allowed_log = ("is not delivered",)
-    session = session_on(mount.status(), b"/", Options())
-    old = await session.files.open(b"/old", write=True, truncate=True)
-    new = await session.files.create(b"/new", exclusive=True)
-    for file in (old, new):
-        await file.write(0, b"new" * 5000)
-    vehicle.pause()
-    for file in (old, new):
-        with pytest.raises(MavftpfsError):
-            await file.fsync()
-        assert await file.take_back() is False
-    vehicle.resume()
-    wait_until("the vehicle is heard again", lambda: mount.status()["link"]["state"] != "lost")
-    assert mount.status()["held"]["files"] == 0
-    shown = [path for path in card.iterdir() if not is_reserved(os.fsencode(path.name))]
-    assert {path.name: path.read_text() for path in shown} == {"old": "old"}  # requests came out of its queue
-    assert (mount.path / "old").read_text() == "old"
-    assert os.listdir(mount.path) == ["old"]
+    assert os.listdir(card / "fs/microsd") == []

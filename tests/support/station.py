@@ -1,9 +1,9 @@
 """pymavlink as a ground station, in a process of its own: parameters, a mission, its own FTP client.
 
-    python -m tests.support.station PORT REMOTE --record FILE [--rounds N] [--key HEX]
+    python -m tests.support.station PORT REMOTE --record FILE [--key HEX]
 
-Listens on the loopback. It works for so many rounds and prints a line of JSON on what it got; --record: each
-frame that came in or went out, as `tests.support.flown` writes it.
+Listens on the loopback, and prints a line of JSON on what it got; --record: each frame that came in or went
+out, as `tests.support.flown` writes it.
 """
 
 from __future__ import annotations
@@ -127,7 +127,6 @@ def main() -> int:
     parser.add_argument("port", type=int)
     parser.add_argument("remote", nargs="?")
     parser.add_argument("--record", type=Path, required=True)
-    parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--key", type=bytes.fromhex)
     args = parser.parse_args()
     station = RecordedStation(args.port, args.record)
@@ -139,20 +138,15 @@ def main() -> int:
     beating = threading.Thread(target=beat, args=(station, stop))
     if args.key is None:
         beating.start()
-    results: list[dict[str, Any]] = []
-    for _ in range(args.rounds):
-        began = time.monotonic()
-        facts: dict[str, Any] = {"parameters": parameters(station)}
-        facts["seconds"] = time.monotonic() - began
-        facts["mission_result"] = upload_mission(station)
-        facts["mission"] = download_mission(station)
-        if args.remote:
-            facts["file"] = fetch(station, args.remote)
-        results.append(facts)
+    facts: dict[str, Any] = {"parameters": parameters(station)}
+    facts["mission_result"] = upload_mission(station)
+    facts["mission"] = download_mission(station)
+    if args.remote:
+        facts["file"] = fetch(station, args.remote)
     stop.set()
     if args.key is None:
         beating.join()
-    print(json.dumps(results), flush=True)
+    print(json.dumps(facts), flush=True)
     return 0
 
 
