@@ -1,11 +1,10 @@
 """The least that a client can do: a window of ReadFile or WriteFile requests over UDP, coded by hand.
 
-    python -m tests.bench.bare PORT read|write REMOTE LOCAL --window 64
+    python -m tests.bench.bare PORT read|write REMOTE LOCAL TIMEOUT --window 64
 
 What the machine and a server can do, as a yardstick: one file, no mount, no cache, no event loop, nothing of
 the product's. A reply is taken if its sequence number was asked for; nothing else is checked, and a refusal
-ends it. It is spoken to as the peers are (`tests.bench.peers`): says `ready`, waits for a line, works, says
-`done`.
+ends it. Started and timed as the peers are (`tests.bench.peer`).
 
 A request is repeated when four later ones were answered, or after a time-out.
 """
@@ -24,6 +23,8 @@ from pathlib import Path
 
 from fastcrc import crc16
 
+from tests.bench.peer import timed
+
 CHUNK = 239
 HEARTBEAT_ID, FTP_ID = 0, 110
 HEARTBEAT_EXTRA, FTP_EXTRA = 50, 84
@@ -36,7 +37,6 @@ DRAIN = 256
 OVERTAKEN = 4
 """Answers to later requests after which one counts as lost."""
 BEAT = 1.0
-GIVE_UP = 60.0
 
 _ftp = struct.Struct("<HBBBBBxI")
 _crc = crc16.mcrf4xx
@@ -53,17 +53,15 @@ def frame(message: int, extra: int, payload: bytes, seq: int = 0) -> bytes:
 
 
 class Bare:
-    """One client on one UDP port, for one file.
+    """One client on one UDP port, for one file. patience: seconds until a request is repeated.
 
     Raises:
-        TimeoutError: the vehicle does not answer.
-        OSError: it refused something.
+        OSError: the vehicle refused something.
     """
 
-    def __init__(self, port: int, window: int, timeout: float) -> None:
+    def __init__(self, port: int, window: int, patience: float) -> None:
         self.window = window
-        self.timeout = timeout
-        self.repeated = 0
+        self.patience = patience
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
         self._sock.setblocking(False)
@@ -74,15 +72,10 @@ class Bare:
         self._session = 0
         self._beat_at = 0.0
 
-    def close(self) -> None:
-        """Free the port."""
-        self._sock.close()
-
     def connect(self) -> None:
         """Wait for the vehicle's heartbeat."""
         while True:
-            if not select.select([self._sock], [], [], GIVE_UP)[0]:
-                raise TimeoutError("no heartbeat")
+            select.select([self._sock], [], [])
             data, self._peer = self._sock.recvfrom(65535)
             if data[:1] == b"\xfd" and data[7:10] == b"\0\0\0":
                 self._target = (data[5], data[6])
@@ -113,15 +106,14 @@ class Bare:
         """Return the data of the answer to one request, repeated under the same number."""
         self._seq = seq = (self._seq + 1) & 0xFFFF
         request = self._frame(seq, opcode, (0, len(data), data))
-        for _ in range(int(GIVE_UP / self.timeout)):
+        while True:
             self._send([request], time.monotonic())
-            until = time.monotonic() + self.timeout
+            until = time.monotonic() + self.patience
             while (left := until - time.monotonic()) > 0:
                 select.select([self._sock], [], [], left)
                 for answered, answer in self._answers():
                     if answered == (seq + 1) & 0xFFFF:
                         return answer
-        raise TimeoutError("no answer")
 
     def _frame(self, seq: int, opcode: int, piece: Piece) -> bytes:
         offset, size, data = piece
@@ -132,24 +124,20 @@ class Bare:
         """Ask for all pieces, at most `window` at a time; yield (offset, data) of each answer."""
         flying: OrderedDict[int, tuple[Piece, float]] = OrderedDict()
         again: deque[Piece] = deque()
-        heard_at = time.monotonic()
         while True:
             now = time.monotonic()
             self._send(self._fill(opcode, pieces, flying, again, now), now)
             if not flying:
                 return
-            if now - heard_at > GIVE_UP:
-                raise TimeoutError("no answer")
             oldest = next(iter(flying.values()))[1]
-            select.select([self._sock], [], [], max(0.0, oldest + self.timeout - now))
+            select.select([self._sock], [], [], max(0.0, oldest + self.patience - now))
             now = time.monotonic()
             for seq, answer in self._answers():
                 known = flying.pop(seq, None)
                 if known is not None:
-                    heard_at = now
                     yield known[0][0], answer
                     self._give_up_before(seq, flying, again)
-            while flying and next(iter(flying.values()))[1] + self.timeout <= now:
+            while flying and next(iter(flying.values()))[1] + self.patience <= now:
                 again.append(flying.popitem(last=False)[1][0])
 
     def _fill(
@@ -165,7 +153,6 @@ class Bare:
         while len(flying) < self.window:
             if again:
                 piece = again.popleft()
-                self.repeated += 1
             else:
                 following = next(pieces, None)
                 if following is None:
@@ -222,19 +209,16 @@ def main() -> int:
     parser.add_argument("direction", choices=["read", "write"])
     parser.add_argument("remote")
     parser.add_argument("local", type=Path)
+    parser.add_argument("timeout", type=float)
     parser.add_argument("--window", type=int, default=64)
-    parser.add_argument("--timeout", type=float, default=0.25, help="seconds until a request is repeated")
+    parser.add_argument("--patience", type=float, default=0.25, help="seconds until a request is repeated")
     args = parser.parse_args()
-    bare = Bare(args.port, args.window, args.timeout)
+    bare, remote = Bare(args.port, args.window, args.patience), args.remote.encode()
     bare.connect()
-    print("ready", flush=True)
-    sys.stdin.readline()
     if args.direction == "read":
-        args.local.write_bytes(bare.read(args.remote.encode()))
+        timed(args.timeout, lambda: args.local.write_bytes(bare.read(remote)))
     else:
-        bare.write(args.remote.encode(), args.local.read_bytes())
-    print("done", flush=True)
-    sys.stdin.readline()
+        timed(args.timeout, lambda: bare.write(remote, args.local.read_bytes()))
     return 0
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import random
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
@@ -20,14 +20,13 @@ from pathlib import Path
 import trio
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.bench import record
+from tests.bench import record, tables
 from tests.bench.cases import Case, Direction, Result
 from tests.support.rigs import Rig
 from tests.support.transfers import MemorySink
@@ -38,7 +37,6 @@ PATIENCE = 20
 PIECE = 128 * 1024
 """Bytes that a program writes at once."""
 
-TABLE_WIDTH = 100
 FILE = b"/d/log.bin"
 
 
@@ -108,14 +106,11 @@ async def _write(here: Rig, connection: Connection, data: bytes) -> float:
     return took
 
 
-def cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    """Yield every combination asked for."""
-    both: tuple[Direction, ...] = ("read", "write")
-    directions = both if arguments.direction == "both" else (arguments.direction,)
-    for profile, rate, rtt, loss, direction in product(
-        arguments.profiles, arguments.rates, arguments.rtts, arguments.losses, directions
-    ):
-        yield Case(profile, rate, rtt, loss, direction)
+def cases(arguments: argparse.Namespace) -> list[Case]:
+    """Return every combination asked for."""
+    directions: tuple[Direction, ...] = ("read", "write")
+    chosen = (arguments.profiles, arguments.rates, arguments.rtts, arguments.losses, directions)
+    return [Case(*conditions) for conditions in product(*chosen)]
 
 
 def everything(chosen: Sequence[Case], seconds: float) -> list[Result]:
@@ -126,35 +121,10 @@ def everything(chosen: Sequence[Case], seconds: float) -> list[Result]:
         return list(track(found, "goodput", total=len(chosen), console=Console(stderr=True), transient=True))
 
 
-def show(results: list[Result]) -> None:
-    """Print a table."""
-    table = Table(
-        "", "profile", "bytes/s", "RTT s", "loss", "share of limit", "target", "requests/chunk", "dropped"
-    )
-    for result in results:
-        case = result.case
-        target = case.target
-        table.add_row(
-            case.direction,
-            case.profile,
-            f"{case.rate:g}",
-            f"{case.rtt:g}",
-            f"{case.loss:g}",
-            f"{result.share:.3f}",
-            "" if target is None else f"{target:.2f}{' ' if result.share >= target else '!'}",
-            f"{result.requests:.2f}",
-            f"{result.dropped}",
-        )
-    console = Console()
-    console.width = max(console.width, TABLE_WIDTH)
-    console.print(table)
-
-
 def main(argv: Sequence[str]) -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="scripts/bench goodput", description="share of the link's limit")
     profiles = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
-    parser.add_argument("--direction", choices=["read", "write", "both"], default="both")
     parser.add_argument("--profiles", nargs="+", default=profiles)
     parser.add_argument("--rates", nargs="+", type=float, default=[5760.0, 100_000.0, 1_000_000.0])
     parser.add_argument("--rtts", nargs="+", type=float, default=[0.01, 0.1, 0.3])
@@ -162,9 +132,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="link time of each run")
     parser.add_argument("--json", type=Path, help="put the results into this file")
     arguments = parser.parse_args(argv)
-    results = everything(list(cases(arguments)), arguments.seconds)
-    show(results)
+    results = everything(cases(arguments), arguments.seconds)
+    found = [asdict(result) | {"target": result.case.target} for result in results]
+    print(tables.goodput_table(found))
     if arguments.json is not None:
-        found = [asdict(result) | {"target": result.case.target} for result in results]
         record.put(arguments.json, "goodput", argv, 0.0, found)
     return 0

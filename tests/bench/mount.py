@@ -1,4 +1,4 @@
-"""Real sockets and a real mount beside the peers: scripts/bench mount [--quick] [--json FILE].
+"""Real sockets and a real mount beside the peers: scripts/bench mount [--json FILE].
 
 For each server, link and direction, everybody moves the same file (a shorter one goes to the peers where a
 link has no rate), in turns, each against a freshly started server: nobody pays for what another left behind.
@@ -48,8 +48,6 @@ CELLS = (
 )
 """Server and link."""
 
-QUICK = (("px4", "unshaped"), ("px4", "wifi-5%"))
-
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -85,10 +83,9 @@ class Cell:
         return 0.1 + 2 * (self.shape.rtt + self.window * 277 / self.shape.rate)
 
 
-def cells(pairs: Sequence[tuple[str, str]], *, quick: bool) -> Iterator[Cell]:
+def cells() -> Iterator[Cell]:
     """Yield cells with sizes and a time-out that keep a run within bounds."""
-    part = 4 if quick else 1
-    for server, link in pairs:
+    for server, link in CELLS:
         shape, slow = LINKS[link], server == "ardupilot"
         if shape is None:
             size, peers_size, timeout = (200_000, 200_000, 10.0) if slow else (8_000_000, 800_000, 10.0)
@@ -99,7 +96,7 @@ def cells(pairs: Sequence[tuple[str, str]], *, quick: bool) -> Iterator[Cell]:
             timeout = 12.0
         directions: tuple[Direction, ...] = ("read", "write")
         for direction in directions:
-            yield Cell(server, link, direction, size // part, peers_size // part, timeout)
+            yield Cell(server, link, direction, size, peers_size, timeout)
 
 
 def server_argv(cell: Cell, root: Path, port: int, seed: int) -> list[str]:
@@ -176,12 +173,11 @@ def main(argv: Sequence[str]) -> int:
     everybody = clients()
     parser.add_argument("--clients", nargs="+", choices=everybody, default=list(everybody))
     parser.add_argument("--repetitions", type=int, default=1, help="of each run, interleaved")
-    parser.add_argument("--quick", action="store_true", help="two cells, shorter files")
     parser.add_argument("--json", type=Path, help="put the rows into this file")
     args = parser.parse_args(argv)
     if {*args.clients} - {US, BARE}:
         install()
-    chosen = list(cells(QUICK if args.quick else CELLS, quick=args.quick))
+    chosen = list(cells())
     load = os.getloadavg()[0]
     if load > tables.BUSY * (os.cpu_count() or 1):
         print(f"load {load:.1f} before we began: rates will be too low", file=sys.stderr)

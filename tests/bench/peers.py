@@ -1,9 +1,9 @@
 """Who takes part in `tests.bench.mount`, and how each is made to move a file.
 
-Two kinds. A *worker* is a process that says `ready` when it is connected, waits for a line, moves the file,
-says `done` or `failed WHY`, and waits for another line so that its CPU time and memory can be read. A *mount*
-is a daemon; the transfer is a `cp`. Peers live in an environment of their own, with pinned versions, in the
-user's cache directory; pymavlink's mount needs libfuse.so.2 (Debian: libfuse2) besides.
+Two kinds. A *worker* is a process that connects, moves the file and says what it took (`peer.timed`), or
+ends with a reason. A *mount* is a daemon; the transfer is a `cp`. Peers live in an environment of their own,
+with pinned versions, in the user's cache directory; pymavlink's mount needs libfuse.so.2 (Debian: libfuse2)
+besides.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import select
+import resource
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
 import venv
 from collections.abc import Callable
@@ -24,12 +26,11 @@ from pathlib import Path
 
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, US, Measured, Outcome
-from tests.support.mounts import abort_mount, mounted_at
-from tests.support.vehicles import HOST, PROJECT, Process, peak_memory
+from tests.support.mounts import abort_mount, mounted_at, wait_until
+from tests.support.vehicles import HOST, Process, peak_memory
 
 PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
 CONNECT_TIMEOUT = 120.0
-END_TIMEOUT = 20.0
 HERE = Path(__file__).parent
 
 
@@ -67,141 +68,66 @@ class Client:
         """Do the job; everything that was started has ended on return."""
         point = job.folder / "mnt"
         point.mkdir()
-        return (
-            _by_mount(self.argv(job, point), point, job)
-            if self.mounts
-            else _by_worker(self.argv(job, point), job)
-        )
-
-
-def cpu_of(pid: int) -> float:
-    """Return the seconds of CPU, user and system, that the threads of a process used."""
-    total = 0
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        total += int((task / "schedstat").read_text().split()[0])
-    return total / 1e9
-
-
-class Lines:
-    """Awaits lines of a child's output, with a limit."""
-
-    def __init__(self, pipe: int) -> None:
-        self._pipe = pipe
-        self._buffer = b""
-
-    def await_one(self, beginnings: tuple[str, ...], timeout: float) -> str | None:
-        """Return the first line with one of the beginnings; None at the end of output or of `timeout`."""
-        deadline = time.monotonic() + timeout
-        while True:
-            line, newline, rest = self._buffer.partition(b"\n")
-            if newline:
-                self._buffer = rest
-                text = line.decode(errors="replace").strip()
-                if text.startswith(beginnings):
-                    return text
-                continue
-            left = deadline - time.monotonic()
-            if left <= 0 or not select.select([self._pipe], [], [], left)[0]:
-                return None
-            piece = os.read(self._pipe, 65536)
-            if not piece:
-                return None
-            self._buffer += piece
+        argv = self.argv(job, point)
+        return _by_mount(argv, point, job) if self.mounts else _by_worker(argv, job)
 
 
 def _by_worker(argv: list[str], job: Job) -> Measured:
-    log = job.folder / "worker.log"
-    with log.open("wb") as errors:
-        child = subprocess.Popen(
-            argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=PROJECT
-        )
+    worker = Process("worker", argv, job.folder)
     try:
-        measured = _converse(child, job)
-    finally:
-        child.kill()
-        child.communicate()
-    if measured.outcome is Outcome.FAILED and not measured.detail:
-        return Measured(Outcome.FAILED, detail=_last_line(log))
-    return measured
-
-
-def _converse(child: subprocess.Popen[bytes], job: Job) -> Measured:
-    assert child.stdout is not None
-    assert child.stdin is not None
-    lines = Lines(child.stdout.fileno())
-    first = lines.await_one(("ready", "failed"), CONNECT_TIMEOUT)
-    if first != "ready":
-        return Measured(Outcome.FAILED, detail=first or "")
-    cpu = cpu_of(child.pid)
-    began = time.monotonic()
-    child.stdin.write(b"go\n")
-    child.stdin.flush()
-    answer = lines.await_one(("done", "failed"), job.timeout)
-    seconds = time.monotonic() - began
-    if answer is None:
-        return Measured(Outcome.TIMEOUT if seconds >= job.timeout else Outcome.FAILED)
-    if answer != "done":
-        return Measured(Outcome.FAILED, detail=answer.removeprefix("failed "))
-    return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, peak_memory(child.pid))
+        code = worker.popen.wait(CONNECT_TIMEOUT + job.timeout)
+    except subprocess.TimeoutExpired:
+        worker.kill()
+        return Measured(Outcome.FAILED, detail="not connected in time")
+    if code == -signal.SIGALRM:
+        return Measured(Outcome.TIMEOUT)
+    if code:
+        return Measured(Outcome.FAILED, detail=_last_line(worker.log.read_text(errors="replace")))
+    seconds, cpu, memory = worker.output.read_text(errors="replace").split()[-3:]
+    return Measured(Outcome.OK, float(seconds), float(cpu), int(memory))
 
 
 def _by_mount(argv: list[str], point: Path, job: Job) -> Measured:
     daemon = Process("daemon", argv, job.folder)
     try:
-        if not _await_mount(daemon, point):
-            return Measured(Outcome.FAILED, detail=_last_line(daemon.log) or "not mounted in time")
-        there = point / job.remote.lstrip("/")
-        source, target = (there, job.local) if job.direction == "read" else (job.local, there)
-        cpu = cpu_of(daemon.popen.pid)
-        copied = _copy(source, target, job, point)
-        if copied.cpu is None:
-            return copied
-        spent = copied.cpu + cpu_of(daemon.popen.pid) - cpu
-        return Measured(Outcome.OK, copied.seconds, spent, peak_memory(daemon.popen.pid))
+        with suppress(AssertionError):
+            wait_until("mounted", lambda: mounted_at(point) or not daemon.running, CONNECT_TIMEOUT)
+        if not mounted_at(point):
+            return Measured(Outcome.FAILED, detail=_last_line(daemon.log.read_text(errors="replace")))
+        return _copied(daemon.popen.pid, point, job)
     finally:
-        if mounted_at(point) and daemon.running:
-            subprocess.run(["fusermount3", "-u", point], capture_output=True, timeout=20, check=False)
-            with suppress(subprocess.TimeoutExpired):
-                daemon.popen.wait(END_TIMEOUT)
-        daemon.kill()
+        with suppress(AssertionError):  # it was killed for not ending
+            daemon.stop()
         abort_mount(point)
 
 
-def _copy(source: Path, target: Path, job: Job, point: Path) -> Measured:
-    """Run `cp`; cpu is its own."""
-    log = job.folder / "cp.log"
-    with log.open("wb") as errors:
-        began = time.monotonic()
-        child = subprocess.Popen(["cp", source, target], stdin=subprocess.DEVNULL, stderr=errors)
-    ended = os.pidfd_open(child.pid)  # exact, where Popen.wait would poll
-    try:
-        in_time = bool(select.select([ended], [], [], job.timeout)[0])
-        seconds = time.monotonic() - began
-    finally:
-        os.close(ended)
-    if not in_time:
-        child.kill()
-        abort_mount(point)  # else it waits in the kernel
-    _, status, used = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if not in_time:
+def _copied(daemon: int, point: Path, job: Job) -> Measured:
+    """Run `cp`, which ends at the time-out because the mount does."""
+    there = point / job.remote.lstrip("/")
+    paths = (there, job.local) if job.direction == "read" else (job.local, there)
+    watch = threading.Timer(job.timeout, abort_mount, [point])
+    watch.start()
+    cpu, began = _spent(daemon), time.monotonic()
+    copied = subprocess.run(["cp", *paths], stderr=subprocess.PIPE, text=True, check=False)
+    seconds = time.monotonic() - began
+    watch.cancel()
+    if seconds >= job.timeout:
         return Measured(Outcome.TIMEOUT)
-    if child.returncode:
-        return Measured(Outcome.FAILED, detail=_last_line(log))
-    return Measured(Outcome.OK, seconds, used.ru_utime + used.ru_stime)
+    if copied.returncode:
+        return Measured(Outcome.FAILED, detail=_last_line(copied.stderr))
+    return Measured(Outcome.OK, seconds, _spent(daemon) - cpu, peak_memory(daemon))
 
 
-def _await_mount(daemon: Process, point: Path) -> bool:
-    deadline = time.monotonic() + CONNECT_TIMEOUT
-    while daemon.running and time.monotonic() < deadline:
-        if mounted_at(point):
-            return True
-        time.sleep(0.02)
-    return False
+def _spent(daemon: int) -> float:
+    """Return the seconds of CPU that a daemon used, and children of ours that have ended."""
+    threads = Path(f"/proc/{daemon}/task").glob("*/schedstat")
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    nanoseconds = sum(int(thread.read_text().split()[0]) for thread in threads)
+    return nanoseconds / 1e9 + children.ru_utime + children.ru_stime
 
 
-def _last_line(log: Path) -> str:
-    lines = log.read_text(errors="replace").strip().splitlines()
+def _last_line(text: str) -> str:
+    lines = text.strip().splitlines()
     return lines[-1][:200] if lines else ""
 
 
@@ -244,7 +170,7 @@ def clients() -> dict[str, Client]:
         return peer("pymavlink", job, "--chunk", "239", "--window", str(job.window))
 
     def bare(job: Job, point: Path) -> list[str]:
-        limits = ["--window", str(job.window), "--timeout", str(job.patience)]
+        limits = ["--window", str(job.window), "--patience", str(job.patience)]
         return [sys.executable, "-m", "tests.bench.bare", *_task(job), *limits]
 
     def ours(job: Job, point: Path) -> list[str]:
@@ -267,4 +193,4 @@ def clients() -> dict[str, Client]:
 
 
 def _task(job: Job) -> list[str]:
-    return [str(job.port), job.direction, job.remote, str(job.local)]
+    return [str(job.port), job.direction, job.remote, str(job.local), str(job.timeout)]
