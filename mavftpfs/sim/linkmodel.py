@@ -57,29 +57,12 @@ class LinkSettings:
     corrupt: float = 0.0
 
 
-@dataclass(slots=True)
-class LinkCounters:
-    """What happened to the frames of one direction.
-
-    INVARIANT: pushed + duplicated == dropped + lost + cut + delivered + those under way.
-    """
-
-    pushed: int = 0
-    dropped: int = 0
-    """For want of room in the queue."""
-    lost: int = 0
-    cut: int = 0
-    duplicated: int = 0
-    delivered: int = 0
-
-
 class _Lane:
     """One direction."""
 
-    __slots__ = ("arrivals", "bad", "counters", "free_at", "last_arrival", "on_air", "queue", "queued")
+    __slots__ = ("arrivals", "bad", "free_at", "last_arrival", "on_air", "queue", "queued")
 
     def __init__(self) -> None:
-        self.counters = LinkCounters()
         self.queue: deque[tuple[float, bytes]] = deque()
         self.queued = 0
         self.on_air = 0
@@ -90,7 +73,10 @@ class _Lane:
 
 
 class LinkModel:
-    """Both directions of one link. `now` must not go back."""
+    """Both directions of one link. `now` must not go back.
+
+    dropped: how many frames the queues had no room for.
+    """
 
     def __init__(self, rng: random.Random, settings: LinkSettings | None = None) -> None:
         self.settings = settings if settings is not None else LinkSettings()
@@ -100,6 +86,7 @@ class LinkModel:
         self._turn = 0
         self._serial = 0
         self._now = float("-inf")
+        self.dropped = 0
 
     # -- the ends ----------------------------------------------------------------------------
 
@@ -107,9 +94,8 @@ class LinkModel:
         """Hand a frame to the transmitter's queue; returns False if it was dropped for want of room."""
         self._advance(now)
         lane = self._lanes[direction]
-        lane.counters.pushed += 1
         if self.settings.rate is not None and len(frame) > self.room(direction):
-            lane.counters.dropped += 1
+            self.dropped += 1
             return False
         lane.queue.append((now, frame))
         lane.queued += len(frame)
@@ -123,11 +109,8 @@ class LinkModel:
         frames: list[bytes] = []
         while lane.arrivals and lane.arrivals[0][0] <= now:
             arrival, _, sent, frame = heapq.heappop(lane.arrivals)
-            if self.is_cut(sent) or self.is_cut(arrival):
-                lane.counters.cut += 1
-                continue
-            frames.append(frame)
-        lane.counters.delivered += len(frames)
+            if not (self.is_cut(sent) or self.is_cut(arrival)):
+                frames.append(frame)
         return frames
 
     def next_deadline(self) -> float | None:
@@ -143,15 +126,6 @@ class LinkModel:
         lane = self._lanes[direction]
         on_air = lane.on_air if lane.free_at > self._now else 0
         return max(0, self.settings.queue - lane.queued - on_air)
-
-    def counters(self, direction: Direction) -> LinkCounters:
-        """Return one direction's counters."""
-        return self._lanes[direction].counters
-
-    def pending(self, direction: Direction) -> int:
-        """Return how many frames are queued or under way."""
-        lane = self._lanes[direction]
-        return len(lane.queue) + len(lane.arrivals)
 
     # -- cuts --------------------------------------------------------------------------------
 
@@ -209,11 +183,9 @@ class LinkModel:
         sent = max(lane.free_at, pushed_at) + self._airtime(frame)
         lane.free_at = sent
         if self._is_lost(lane, len(frame)):
-            lane.counters.lost += 1
             return
         self._schedule(lane, sent, self._maybe_corrupt(frame))
         if self._chance(self.settings.duplicate):
-            lane.counters.duplicated += 1
             self._schedule(lane, sent, frame)
 
     def _schedule(self, lane: _Lane, sent: float, frame: bytes) -> None:

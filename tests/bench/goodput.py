@@ -24,7 +24,6 @@ from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
-from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench import record, tables
 from tests.bench.cases import Case, Direction, Result
@@ -71,7 +70,7 @@ def measure(
                 took = await transfer(here, connection, data)
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
         server = here.vehicle.server
-        dropped = sum(here.model.counters(direction).dropped for direction in LinkDirection)
+        dropped = here.model.dropped
         dropped += server.firmware.dropped_replies
         limit = replace(case, rate=case.rate - telemetry).limit_beside(server.firmware.pauses)
         return Result(case, limit, len(data) / took / limit, requests, dropped)

@@ -86,13 +86,17 @@ class FakeFile:
 
 @dataclass
 class FakeTree:
-    """Files by path; directories are the parents of files, and what `directories` names."""
+    """Files by path; directories are the parents of files, and what `directories` names.
+
+    error: fails all calls; failing: those of a name, or of a name and a path. delays: seconds, by name.
+    """
 
     files: dict[bytes, bytes] = field(default_factory=dict)
     directories: set[bytes] = field(default_factory=set)
     valid_for: float = 1.0
     calls: list[tuple[str, bytes]] = field(default_factory=list)
     error: BaseException | None = None
+    failing: dict[str | tuple[str, bytes], BaseException] = field(default_factory=dict)
     delays: dict[str, float] = field(default_factory=dict)
     short_read: int | None = None
     direct_io: bool = False
@@ -108,8 +112,9 @@ class FakeTree:
         if self.delays.get(name):
             await trio.sleep(self.delays[name])
         self.on_call(name, path)
-        if self.error is not None:
-            raise self.error
+        error = self.error or self.failing.get(name) or self.failing.get((name, path))
+        if error is not None:
+            raise error
 
     def kind_of(self, path: bytes) -> EntryKind:
         if path in self.files:
@@ -204,6 +209,9 @@ class FakeTree:
     def recover_to(self, directory: Path) -> Sequence[Path]:
         self.calls.append(("recover_to", os.fsencode(directory)))
         return [directory / os.fsdecode(path.lstrip(b"/")) for path in self.left]
+
+    async def keep_whole_files(self) -> None:
+        """Nothing to keep."""
 
     async def crc32(self, path: bytes) -> int:
         await self.pause("crc32", path)

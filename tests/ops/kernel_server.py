@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,32 +29,13 @@ VALID_FOR = 1000.0
 """So long that only being told makes the kernel ask again."""
 
 
-class QuietTree(FakeTree):
-    """A tree that holds nothing back at the end of a mount."""
-
-    def undelivered(self) -> Sequence[bytes]:
-        """Nothing."""
-        return ()
-
-    async def drain(self, timeout: float) -> Sequence[bytes]:
-        """Nothing to do."""
-        return ()
-
-    def recover_to(self, directory: Path) -> Sequence[Path]:
-        """Nothing to keep."""
-        return ()
-
-    async def keep_whole_files(self) -> None:
-        """Nothing to keep."""
-
-
 class Server:
     """The tree and the commands that change it."""
 
     def __init__(self) -> None:
         many = {b"/many/%04d" % number: b"x" * number for number in range(1500)}
         small = {b"/a": b"one", b"/b": b"one", b"/c": b"one"}
-        self.tree = QuietTree({**small, **many}, valid_for=VALID_FOR)
+        self.tree = FakeTree({**small, **many}, valid_for=VALID_FOR)
 
     @asynccontextmanager
     async def attach(self, invalidate: Callable[[bytes], None]) -> AsyncIterator[Attached]:

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import cast
 
 import pytest
-import trio
-import trio.testing
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
@@ -65,20 +63,6 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     assert os.fsdecode(directory).endswith("-udpin_0.0.0.0_14550")
 
 
-@pytest.mark.holds("promise 3")
-async def test_a_second_signal_ends_the_delivery_and_not_the_keeping() -> None:
-    tree = Patient(left=[b"/a"], delays={"drain": 1e9})
-    said: list[str] = []
-    with trio.CancelScope() as scope:
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(farewell.say_goodbye, cast(Tree, tree), "x", said.append)
-            await trio.testing.wait_all_tasks_blocked()
-            scope.cancel()
-    assert scope.cancelled_caught
-    assert len(said) == 1
-    assert tree.calls[-1][0] == "recover_to"
-
-
 async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
     class Full(FakeTree):
         def recover_to(self, directory: Path) -> Sequence[Path]:
@@ -102,21 +86,6 @@ def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
     with leftovers.spool_for(None) as unknown:
         assert unknown is not None
         assert unknown.path.parent.name == "unknown"
-
-
-def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
-    base = state / "base"
-    dead = SpoolDirectory(base, random.Random(1))
-    (dead.path / "000001.data").write_bytes(b"held")
-    dead.close()
-    spool = SpoolDirectory(base, random.Random(2))
-    line = leftovers.rescue(spool, "tcp:x:1")
-    assert line.startswith("1 file(s) of an earlier mount did not reach their vehicle; they are in ")
-    place = line.rpartition(" in ")[2].partition("; ")[0]
-    assert [path.read_bytes() for path in Path(place).iterdir()] == [b"held"]
-    assert line.endswith(f"; put them back by: mavftpfs recover tcp:x:1 {place}")
-    assert leftovers.rescue(spool, "tcp:x:1") == ""
-    spool.close()
 
 
 def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:

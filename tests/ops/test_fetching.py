@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -70,6 +69,12 @@ class SpoiltTree(FakeTree):
         self.forgotten += 1
 
 
+@pytest.fixture
+def tree() -> SpoiltTree:
+    """A vehicle with one file."""
+    return SpoiltTree({b"/big": BIG})
+
+
 def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto", resume: bool = True) -> Fetcher:
     return Fetcher(session_of(tree, root), Progress(), verify, resume)
 
@@ -88,8 +93,7 @@ async def get(tree: FakeTree, path: bytes, local: Path, verify: Verify = "auto")
     return await fetcher_of(tree, verify=verify).fetch(wanted(tree, path, local))
 
 
-async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path, tree: SpoiltTree) -> None:
     tree.bad = 1
     fetched = await get(tree, b"/big", tmp_path / "big")
     assert (tmp_path / "big").read_bytes() == BIG
@@ -101,8 +105,9 @@ async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) 
 
 
 @pytest.mark.holds("promise 1")
-async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(
+    tmp_path: Path, tree: SpoiltTree
+) -> None:
     tree.bad = 2
     (tmp_path / "big").write_bytes(b"old")
     with pytest.raises(DataUnproven, match=r"/big.*CRC32"):
@@ -114,12 +119,8 @@ async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: P
 # -- going on -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mountpoint", [None, "/mnt/drone"])
 @pytest.mark.parametrize("returns", [True, False])
-async def test_a_vehicle_that_is_lost_is_waited_for(
-    tmp_path: Path, returns: bool, mountpoint: str | None
-) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, tree: SpoiltTree, returns: bool) -> None:
     reads, asked = 0, 0
 
     def lose(name: str, path: bytes) -> None:
@@ -134,7 +135,7 @@ async def test_a_vehicle_that_is_lost_is_waited_for(
         return {"link": {"state": "fine" if asked % 2 == 0 and returns else "lost"}}
 
     tree.on_call = lose
-    fetcher = Fetcher(Session(cast(Files, tree), status, ROOT, mountpoint, 1.0), Progress())
+    fetcher = Fetcher(Session(cast(Files, tree), status, ROOT, None, 1.0), Progress())
     if returns:
         fetched = await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
         assert (tmp_path / "big").read_bytes() == BIG
@@ -146,17 +147,20 @@ async def test_a_vehicle_that_is_lost_is_waited_for(
     assert names_in(tmp_path) == ["big.part"]
 
 
-async def test_a_part_of_another_file_is_found_out(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+@pytest.mark.parametrize("error", [None, FtpNak(14, 7)], ids=["by its checksum", "for want of checksums"])
+async def test_a_part_of_another_file_is_not_gone_on_with(
+    tmp_path: Path, tree: SpoiltTree, error: Exception | None
+) -> None:
+    tree.crc_error = error
     (tmp_path / "big.part").write_bytes(b"x" * 1000)
     fetched = await get(tree, b"/big", tmp_path / "big")
-    assert (tmp_path / "big").read_bytes() == BIG
-    assert fetched.resumed == 0
+    assert (fetched.resumed, (tmp_path / "big").read_bytes()) == (0, BIG)
 
 
 @pytest.mark.parametrize("error", [Armed("x"), RequestTimeout("x"), SessionBusy("x"), FileBusy("x")])
-async def test_what_was_resumed_waits_for_its_proof(tmp_path: Path, error: Exception) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_what_was_resumed_waits_for_its_proof(
+    tmp_path: Path, tree: SpoiltTree, error: Exception
+) -> None:
     tree.crc_error = error
     (tmp_path / "big.part").write_bytes(BIG[:1000])
     with pytest.raises(NotProvenYet, match="is here"):
@@ -168,14 +172,6 @@ async def test_what_was_resumed_waits_for_its_proof(tmp_path: Path, error: Excep
     assert names_in(tmp_path) == ["big"]
 
 
-async def test_where_no_checksum_can_be_had_all_is_fetched_anew(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    tree.crc_error = FtpNak(14, 7)
-    (tmp_path / "big.part").write_bytes(b"x" * 1000)
-    fetched = await get(tree, b"/big", tmp_path / "big")
-    assert (fetched.resumed, (tmp_path / "big").read_bytes()) == (0, BIG)
-
-
 @pytest.mark.parametrize(
     ("error", "lacking", "later"),
     [
@@ -185,9 +181,8 @@ async def test_where_no_checksum_can_be_had_all_is_fetched_anew(tmp_path: Path) 
     ],
 )
 async def test_without_a_checksum_it_says_what_was_proven(
-    tmp_path: Path, error: Exception, lacking: str, later: bool
+    tmp_path: Path, tree: SpoiltTree, error: Exception, lacking: str, later: bool
 ) -> None:
-    tree = SpoiltTree({b"/big": BIG})
     tree.crc_error = error
     fetched = await get(tree, b"/big", tmp_path / "big")
     assert fetched.proof == Proof("size", lacking, later)
@@ -207,16 +202,14 @@ async def test_what_is_made_anew_at_each_opening_is_not_proven(
     assert fetched.proof == (BY_CRC32 if proven else GENERATED)
 
 
-async def test_a_read_that_ends_early_is_no_file(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_a_read_that_ends_early_is_no_file(tmp_path: Path, tree: SpoiltTree) -> None:
     tree.short_read = 0
     with pytest.raises(DataUnproven, match="ended"):
         await get(tree, b"/big", tmp_path / "big")
     assert names_in(tmp_path) == []
 
 
-async def test_two_programs_do_not_write_one_part(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
+async def test_two_programs_do_not_write_one_part(tmp_path: Path, tree: SpoiltTree) -> None:
     tree.delays["read"] = 0.05
     async with trio.open_nursery() as nursery:
         nursery.start_soon(get, tree, b"/big", tmp_path / "big")
@@ -255,10 +248,10 @@ async def test_neither_a_link_nor_a_pipe_is_taken_for_a_part(tmp_path: Path) -> 
 
 async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/d/a": b"1", b"/d/a.part": b"22"})
-    tree.on_call = refusing("read", b"")
+    tree.failing["read"] = RequestTimeout("no answer")
     with pytest.raises(RequestTimeout):
         await get(tree, b"/d/a", tmp_path / "a")
-    tree.on_call = lambda name, path: None
+    tree.failing.clear()
     for _ in range(2):
         await get_all(tree, b"/d", to=tmp_path)
         assert names_in(tmp_path / "d") == ["a", "a.part"]
@@ -295,38 +288,16 @@ async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> 
     assert (tmp_path / "file").read_bytes() == b"in the way"
 
 
-def refusing(name: str, path: bytes) -> Callable[[str, bytes], None]:
-    """Return what makes one call on one path fail."""
-
-    def refuse(called: str, at: bytes) -> None:
-        if (called, at) == (name, path):
-            raise RequestTimeout("no answer")
-
-    return refuse
-
-
 @pytest.mark.parametrize("call", [("open", b"/d/b"), ("list", b"/d/b")])
 async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[str, bytes]) -> None:
     inner = b"/d/b/x" if call[0] == "list" else b"/d/b"
     tree = SpoiltTree({b"/d/a": b"1", inner: b"2", b"/d/c": b"3"})
-    tree.on_call = refusing(*call)
+    tree.failing[call] = RequestTimeout("no answer")
     outcome, said = await get_all(tree, b"/d", to=tmp_path / "d")
     assert (len(outcome.fetched), list(outcome.failed), said) == (2, [b"/d/b"], ["/d/b: no answer"])
+    states = [file["state"] for file in outcome.facts()["files"]]
+    assert (states, outcome.complete) == (["fetched", *["failed"] * (call[0] == "open"), "fetched"], False)
     assert (tmp_path / "d/d/c").read_bytes() == b"3"
-
-
-async def test_a_lost_vehicle_ends_it_at_once(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/d/a": b"1", b"/d/b": b"2"})
-    tree.error = None
-
-    def lose(name: str, path: bytes) -> None:
-        if name == "open":
-            raise VehicleLost("gone")
-
-    tree.on_call = lose
-    with pytest.raises(VehicleLost):
-        await get_all(tree, b"/d", to=tmp_path / "d")
-    assert [call for call in tree.calls if call[0] == "open"] == [("open", b"/d/a")]
 
 
 @pytest.mark.parametrize("there", [True, False])
@@ -449,14 +420,6 @@ async def test_a_file_that_is_named_twice_comes_once(tmp_path: Path) -> None:
     assert (len(outcome.fetched), names_in(tmp_path)) == (2, ["a.ulg", "b.ulg"])
 
 
-async def test_files_have_the_vehicle_s_names_below_a_directory_of_a_mount(tmp_path: Path) -> None:
-    outcome = Outcome()
-    fetcher = fetcher_of(SpoiltTree({b"/a": b"1", b"/d/b": b"2"}), root=b"/fs/etc")
-    downloads = Downloads(fetcher, outcome, lambda _: None, print)
-    await downloads.get([b"/a", b"/d"], tmp_path, into=False, recursive=True)
-    assert [one.wanted.name for one in outcome.fetched] == ["/fs/etc/a", "/fs/etc/d/b"]
-
-
 async def test_a_pattern_for_one_file_means_a_directory_all_the_same(tmp_path: Path) -> None:
     await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*", to=tmp_path / "new")
     assert names_in(tmp_path / "new") == ["a"]
@@ -521,15 +484,6 @@ async def test_the_card_s_copy_of_our_memory_does_not_replace_it(tmp_path: Path)
     assert memory.read_text() == "ours\n"
 
 
-async def test_a_log_that_grew_since_is_gone_on_with(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/log/1": BIG[:2000]})
-    await sync(tree, tmp_path)
-    tree.files[b"/log/1"] = BIG
-    outcome, _, _ = await sync(tree, tmp_path)
-    assert (outcome.fetched[0].resumed, (tmp_path / "1").read_bytes()) == (2000, BIG)
-    assert names_in(tmp_path) == ["1"]
-
-
 @pytest.mark.parametrize("new", [b"other and longer", b"x"])
 async def test_another_log_of_that_name_does_not_destroy_the_old_one(tmp_path: Path, new: bytes) -> None:
     """ArduPilot counts from 1 again after its logs were erased."""
@@ -541,15 +495,6 @@ async def test_another_log_of_that_name_does_not_destroy_the_old_one(tmp_path: P
     assert (tmp_path / "1.BIN").read_bytes() == new
     assert (tmp_path / "1.BIN.~1~").read_bytes() == b"flight of May"
     assert outcome.fetched[0].kept_words == "; another one of that name is kept as 1.BIN.~1~"
-
-
-async def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
-    tree = SpoiltTree(dict(LOGS))
-    tree.on_call = refusing("open", b"/fs/microsd/log/d/2.ulg")
-    outcome, told, said = await sync(tree, tmp_path)
-    assert (told, said, outcome.complete) == (["d/1.ulg"], ["d/2.ulg: no answer"], False)
-    states = {file["path"]: file["state"] for file in outcome.facts()["files"]}
-    assert states == {"/fs/microsd/log/d/2.ulg": "failed", "/fs/microsd/log/d/1.ulg": "fetched"}
 
 
 async def test_a_log_that_was_fetched_while_armed_is_proven_later(tmp_path: Path) -> None:
@@ -588,13 +533,18 @@ async def test_all_that_is_here_is_proven_if_that_is_wished_for(tmp_path: Path) 
     assert (tmp_path / "2").read_bytes() == b"two"
 
 
+async def check(tree: FakeTree, local: Path) -> Outcome:
+    outcome = Outcome()
+    fetcher = fetcher_of(tree, verify="none")
+    await Downloads(fetcher, outcome, lambda _: None, lambda _: None).check(Wish(local))
+    return outcome
+
+
 async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two", b"/log/3": b"three", b"/log/4": b"four"})
     for name, data in (("1", b"one"), ("2", b"TWO"), ("3", b"thr")):
         (tmp_path / name).write_bytes(data)
-    outcome = Outcome()
-    downloads = Downloads(fetcher_of(tree, verify="none"), outcome, lambda _: None, lambda _: None)
-    await downloads.check(Wish(tmp_path))
+    outcome = await check(tree, tmp_path)
     assert tree.reads == 0
     assert names_in(tmp_path) == ["1", "2", "3"]
     assert {file["path"]: file["state"] for file in outcome.facts()["files"]} == {
@@ -607,11 +557,7 @@ async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
     assert outcome.facts()["complete"] is False
     for path, data in tree.files.items():
         (tmp_path / path.decode().rpartition("/")[2]).write_bytes(data)
-    outcome = Outcome()
-    await Downloads(fetcher_of(tree, verify="none"), outcome, lambda _: None, lambda _: None).check(
-        Wish(tmp_path)
-    )
-    assert outcome.facts()["complete"] is True
+    assert (await check(tree, tmp_path)).facts()["complete"] is True
 
 
 @pytest.mark.parametrize("what", ["LOCAL", "--from"])

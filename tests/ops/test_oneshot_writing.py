@@ -146,12 +146,7 @@ def test_what_cannot_be_put_is_said_before_anything_is_sent(local: Path, tmp_pat
 @pytest.mark.parametrize("call", ["create", "write", "fsync"])
 async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> None:
     tree = Card({}, {b"/d"})
-
-    def refuse(name: str, path: bytes) -> None:
-        if name == call and path.endswith(b"\xff"):
-            raise RequestTimeout("no answer")
-
-    tree.on_call = refuse
+    tree.failing[call, b"/d/d/e/\xff"] = RequestTimeout("no answer")
     with pytest.raises(NotDelivered, match=r"xff was not delivered: no answer; 2 file\(s\)") as caught:
         await put(tree, local, to=b"/d", recursive=True)
     assert exit_code_for(caught.value) is ExitCode.UNDELIVERED
@@ -172,12 +167,8 @@ async def test_a_missing_directory_is_that_and_no_undelivered_file(local: Path) 
 
 
 async def test_what_came_from_stdin_needs_a_name(local: Path) -> None:
-    tree, told = Card({b"/d/x": b""}), list[bytes]()
-    session = session_of(tree)
     with pytest.raises(IsADirectory, match="stdin"):
-        await put_alone(session, local / "a", b"/d", Progress(), print)
-    await put_alone(session, local / "a", b"/d/new", Progress(), lambda path, _, __: told.append(path))
-    assert (tree.files[b"/d/new"], told) == (BIG, [b"/d/new"])
+        await put_alone(session_of(Card({b"/d/x": b""})), local / "a", b"/d", Progress(), print)
 
 
 # -- names ----------------------------------------------------------------------------------------
@@ -231,12 +222,7 @@ async def test_the_root_is_not_moved_into_a_part_of_itself(renames: bool) -> Non
 async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
     tree = Card({b"/a": BIG})
     tree.renames = False
-
-    def refuse(name: str, path: bytes) -> None:
-        if name == "fsync":
-            raise RequestTimeout("no answer")
-
-    tree.on_call = refuse
+    tree.failing["fsync"] = RequestTimeout("no answer")
     with pytest.raises(NotDelivered) as caught:
         await mv(tree, b"/a", to=b"/new")
     assert caught.value.there is False
@@ -254,14 +240,20 @@ async def test_mv_ends_where_the_source_has_shrunk_meanwhile() -> None:
 # -- by a mount -----------------------------------------------------------------------------------
 
 
+async def put_by_mount(tree: Card, local: Path, session: Session | None = None) -> None:
+    """Put the file `a` to /x."""
+    session = session or session_of(tree, mountpoint="/mnt/drone")
+    batch = (local / "a", collect(local / "a", recursive=False))
+    await put_paths(session, [batch], b"/x", Progress(), print)
+
+
 @pytest.mark.parametrize("renames", [True, False])
 async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
     local: Path, renames: bool
 ) -> None:
     tree = Card({b"/x": b"old"})
     tree.renames = renames
-    session = session_of(tree, mountpoint="/mnt/drone")
-    await put_paths(session, [(local / "a", collect(local / "a", recursive=False))], b"/x", Progress(), print)
+    await put_by_mount(tree, local)
     assert tree.files == {b"/x": BIG}
     opened = [path for name, path in tree.calls if name == "open"]
     assert (b"/x" in opened) is not renames
@@ -275,10 +267,8 @@ async def test_by_a_mount_an_error_names_the_file_and_not_what_is_written_beside
             raise ReadOnly(f"{os.fsdecode(path)}: Read-only file system (the vehicle is armed)")
 
     tree.on_call = refuse
-    session = session_of(tree, mountpoint="/mnt/drone")
-    batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(NotDelivered) as caught:
-        await put_paths(session, [batch], b"/x", Progress(), print)
+        await put_by_mount(tree, local)
     assert str(caught.value) == ("/x was not delivered: Read-only file system (the vehicle is armed)")
 
 
@@ -296,21 +286,15 @@ async def test_by_a_mount_what_is_there_is_said_of_the_file_and_not_of_what_is_w
 ) -> None:
     """Even if all of the file beside got there at last."""
     tree = Card({b"/x": b"old"})
-
-    def fail(name: str, path: bytes) -> None:
-        if name == fails:
-            raise error
+    tree.failing[fails] = error
 
     async def take_back(file: FakeFile) -> bool:
         file.tree.files[file.path] = file.content
         return True
 
     monkeypatch.setattr(FakeFile, "take_back", take_back)
-    tree.on_call = fail
-    session = session_of(tree, mountpoint="/mnt/drone")
-    batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(NotDelivered) as caught:
-        await put_paths(session, [batch], b"/x", Progress(), print)
+        await put_by_mount(tree, local)
     assert caught.value.there is there
     assert tree.files == {b"/x": b"old"}
 
@@ -330,22 +314,14 @@ async def test_a_mount_that_does_not_tell_how_far_it_is_ends_no_put(
         return await quiet()
 
     session = Session(cast(Files, tree), status, mountpoint="/mnt/drone")
-    batch = (local / "a", collect(local / "a", recursive=False))
-    await put_paths(session, [batch], b"/x", Progress(), print)
+    await put_by_mount(tree, local, session)
     assert tree.files == {b"/x": BIG}
 
 
 async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> None:
     tree = Card({b"/x": b"old"})
-
-    def interrupt(name: str, path: bytes) -> None:
-        if name == "fsync":
-            raise KeyboardInterrupt
-
-    tree.on_call = interrupt
-    session = session_of(tree, mountpoint="/mnt/drone")
-    batch = (local / "a", collect(local / "a", recursive=False))
+    tree.failing["fsync"] = KeyboardInterrupt()
     with pytest.raises(BaseException, match=r".*") as caught:
-        await put_paths(session, [batch], b"/x", Progress(), print)
+        await put_by_mount(tree, local)
     assert caught.group_contains(KeyboardInterrupt) or caught.type is KeyboardInterrupt
     assert tree.files == {b"/x": b"old"}

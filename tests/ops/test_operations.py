@@ -18,14 +18,11 @@ from pyfuse3 import FUSEError, RequestContext
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Space
 from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
-from mavftpfs.mount.handles import ROOT_INO, Presentation
-from mavftpfs.mount.operations import (
-    UNKNOWN_SPACE,
-    Operations,
-)
+from mavftpfs.mount.handles import ROOT_INO, DirectoryHandle, Presentation
+from mavftpfs.mount.operations import UNKNOWN_SPACE, Operations
 from mavftpfs.mount.root import RootOperations
 from mavftpfs.mount.roster import Roster
-from mavftpfs.shared.errors import Armed, FtpNak, ListingIncomplete, NotFound, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, ListingIncomplete, NotFound, PathTooLong
 from tests.ops.faketree import FakeTree
 
 CTX = cast(RequestContext, None)
@@ -185,22 +182,6 @@ async def test_a_short_reply_in_mid_file_is_an_error(short: int, caplog: pytest.
     assert "bug" in caplog.text
 
 
-async def test_a_size_the_kernel_does_not_know_is_told_before_open_returns() -> None:
-    told: list[int] = []
-
-    async def refresh(ino: int) -> None:
-        told.append(ino)
-
-    tree = some_tree()
-    ops = operations(tree, refresh=refresh)
-    ino = await ino_of(ops, b"a.txt")
-    await ops.open(ino, os.O_RDONLY, CTX)
-    assert told == []
-    tree.files[b"/a.txt"] += b"more"
-    await ops.open(ino, os.O_RDONLY, CTX)
-    assert told == [ino]
-
-
 # -- the file system ------------------------------------------------------------------------------
 
 
@@ -214,20 +195,6 @@ async def test_statfs_never_asks_the_tree() -> None:
     assert known.f_blocks * known.f_frsize == 1 << 30
     assert known.f_bavail * known.f_frsize == known.f_bfree * known.f_frsize == 1 << 20
     assert tree.calls == []
-
-
-@pytest.mark.holds("promise 9")
-async def test_checksum_while_armed_is_erofs() -> None:
-    tree = some_tree()
-    ops = operations(tree)
-    ino = await ino_of(ops, b"a.txt")
-
-    def arm(name: str, path: bytes) -> None:
-        if name == "crc32":
-            raise Armed("armed")
-
-    tree.on_call = arm
-    assert await failure(ops.getxattr(ino, XATTR_CRC32, CTX)) == errno.EROFS
 
 
 @pytest.mark.holds("promise 4")
@@ -261,17 +228,11 @@ Call = Callable[[Operations, int, int], Coroutine[Any, Any, object]]
 CALLS: dict[str, Call] = {
     "lookup": lambda ops, ino, fh: ops.lookup(ROOT_INO, b"a.txt", CTX),
     "getattr": lambda ops, ino, fh: ops.getattr(ino, CTX),
-    "readdir": lambda ops, ino, fh: ops.readdir(ops.directories.add(_root()), 0, TOKEN),
+    "readdir": lambda ops, ino, fh: ops.readdir(ops.directories.add(DirectoryHandle(ROOT_INO)), 0, TOKEN),
     "open": lambda ops, ino, fh: ops.open(ino, os.O_RDONLY, CTX),
     "read": lambda ops, ino, fh: ops.read(fh, 0, 6),
     "getxattr": lambda ops, ino, fh: ops.getxattr(ino, XATTR_CRC32, CTX),
 }
-
-
-def _root() -> Any:
-    from mavftpfs.mount.handles import DirectoryHandle
-
-    return DirectoryHandle(ROOT_INO)
 
 
 async def prepared(tree: FakeTree) -> tuple[Operations, int, int]:
@@ -284,33 +245,23 @@ async def prepared(tree: FakeTree) -> tuple[Operations, int, int]:
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
-        (RequestTimeout("x"), errno.ETIMEDOUT),
         (PathTooLong("x"), errno.ENAMETOOLONG),
-        (FtpNak(4, 9), errno.EACCES),
         (FUSEError(errno.EXDEV), errno.EXDEV),
+        (ValueError("a bug"), errno.EIO),
+        (ExceptionGroup("bugs", [KeyError("y")]), errno.EIO),
     ],
     ids=str,
 )
-async def test_the_tree_s_errors_become_errnos(call: Call, error: Exception, expected: int) -> None:
+async def test_errors_become_errnos_and_a_bug_is_logged_with_its_traceback(
+    call: Call, error: Exception, expected: int, caplog: pytest.LogCaptureFixture
+) -> None:
     tree = some_tree()
     ops, ino, fh = await prepared(tree)
     tree.error = error
     assert await failure(call(ops, ino, fh)) == expected
     ops.inodes.check_invariants()
-
-
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-@pytest.mark.parametrize("bug", [ValueError("x"), ExceptionGroup("x", [KeyError("y")])], ids=repr)
-async def test_a_bug_is_eio_and_logged_with_its_traceback(
-    call: Call, bug: Exception, caplog: pytest.LogCaptureFixture
-) -> None:
-    tree = some_tree()
-    ops, ino, fh = await prepared(tree)
-    tree.error = bug
-    assert await failure(call(ops, ino, fh)) == errno.EIO
-    records = [record for record in caplog.records if record.levelno == logging.ERROR]
-    assert len(records) == 1
-    assert records[0].exc_info is not None
+    logged = [bool(record.exc_info) for record in caplog.records if record.levelno == logging.ERROR]
+    assert logged == [True] * (expected == errno.EIO)
 
 
 @pytest.mark.holds("promise 4")

@@ -96,15 +96,6 @@ def test_the_pages_about_the_code_name_what_is_there() -> None:
     assert unknown_modules("see `cache/nothing.py: Class` and `nowhere/`") == ["cache/nothing.py", "nowhere/"]
 
 
-def test_a_missing_page_and_a_broken_link_are_seen() -> None:
-    file = PROJECT / "README.md"
-    assert list(lacking(file, "as nowhere.md says, and servers.md too")) == ["README.md: nowhere.md"]
-    assert list(broken(file, "[a](docs/servers.md#1-sessions) [b](docs/none.md) [c](#nothing)")) == [
-        "README.md: docs/none.md",
-        "README.md: #nothing",
-    ]
-
-
 def test_the_newest_entry_of_the_changes_is_this_version() -> None:
     versions = re.findall(r"^## (\S+)", (PROJECT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert versions[versions[0] == "Unreleased"] == mavftpfs.__version__

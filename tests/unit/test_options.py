@@ -18,7 +18,6 @@ from mavftpfs.mount.options import (
     KERNEL_WORDS,
     VALUES,
     MountOptions,
-    fuse_words,
     option_help,
     parse_options,
 )
@@ -152,20 +151,6 @@ def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> 
 def test_wrong_keywords_are_named(keywords: dict[str, object], named: str) -> None:
     with pytest.raises(UsageError, match=named):
         options_of(keywords)
-
-
-def test_what_goes_to_fuse() -> None:
-    words = fuse_words(parse_options(["ro,allow_other,auto_unmount,noexec"]), "udpin:0.0.0.0:14550")
-    assert words == {
-        "fsname=udpin:0.0.0.0:14550",
-        "subtype=mavftpfs",
-        "default_permissions",
-        "noexec",
-        "ro",
-        "allow_other",
-        "auto_unmount",
-    }
-    assert "rw" in fuse_words(MountOptions(), "x")
 
 
 @pytest.mark.parametrize(

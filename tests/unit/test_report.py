@@ -100,11 +100,6 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
     ]
 
 
-def test_an_empty_file_on_its_way_has_no_speed() -> None:
-    empty = {"path": "/b", "size": 0, "bytes_left": 0, "sending": True, "eta": 0.0}
-    assert lines(None, {"transfers": [empty], "write_rate": 300.0})[1] == "  sending /b: empty"
-
-
 def test_a_status_of_many_files_fits_an_extended_attribute() -> None:
     names = [f"/fs/microsd/log/2026-11-20/{number:05}.ulg" for number in range(5000)]
     cache = {
