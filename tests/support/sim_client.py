@@ -17,14 +17,17 @@ from tests.support.replies import decode_reply
 CLIENT = Address(255, 190)
 OTHER = Address(254, 191)
 
+A, FIVE, DIR = (b"/fs/microsd/" + name for name in (b"a.bin", b"five", b"dir"))
+"""Of `small_tree`."""
+
 
 def small_tree() -> MemoryTree:
     """A tree with a few files, below /fs/microsd where PX4 on NuttX may write."""
     tree = MemoryTree()
-    tree.add(b"/fs/microsd/a.bin", bytes(range(256)) * 4)
-    tree.add(b"/fs/microsd/five", b"\x05")
+    tree.add(A, bytes(range(256)) * 4)
+    tree.add(FIVE, b"\x05")
     tree.add(b"/fs/microsd/empty")
-    tree.add_directory(b"/fs/microsd/dir")
+    tree.add_directory(DIR)
     return tree
 
 

@@ -4,40 +4,26 @@ from __future__ import annotations
 
 import errno
 import struct
-from typing import Any
 
 import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import OTHER, Client, ack, nak, small_tree
+from tests.support.sim_client import DIR, FIVE, OTHER, A, Client, ack, nak
 
-A = b"/fs/microsd/a.bin"
-FIVE = b"/fs/microsd/five"
-DIR = b"/fs/microsd/dir"
 INVALID_SESSION = bytes([NakCode.INVALID_SESSION])
 NOT_FOUND = bytes([NakCode.FILE_NOT_FOUND])
-FAIL = bytes([NakCode.FAIL])
-EOF = bytes([NakCode.EOF])
-
-
-def big(profile: str, size: int, **changes: Any) -> Client:
-    tree = small_tree()
-    tree.add(A, bytes(i % 251 for i in range(size)))
-    made = Client(profile, tree, **changes)
-    made.open(A, session=7)
-    return made
 
 
 # -- queue and timing ----------------------------------------------------------------------------
 
 
 def test_five_wait_and_the_sixth_is_dropped_silently() -> None:
-    c = big("ardupilot", 10_000)
-    for i in range(8):
-        c.send(Opcode.READ_FILE, session=7, size=239, offset=239 * i)
-    replies = c.receive(1.0)
-    assert [p.offset for p in replies] == [239 * i for i in range(5)]
+    c = Client("ardupilot")
+    c.open(A, session=7)
+    for offset in range(8):
+        c.send(Opcode.READ_FILE, session=7, size=239, offset=offset)
+    assert [p.offset for p in c.receive(1.0)] == [0, 1, 2, 3, 4]
     assert c.server.firmware.dropped_requests == 3
 
 

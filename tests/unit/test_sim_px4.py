@@ -10,11 +10,7 @@ import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak
-
-A = b"/fs/microsd/a.bin"
-FIVE = b"/fs/microsd/five"
-DIR = b"/fs/microsd/dir"
+from tests.support.sim_client import CLIENT, DIR, FIVE, OTHER, A, Client, ack, nak
 
 
 def client(profile: str = "px4", tree: MemoryTree | None = None, **changes: Any) -> Client:

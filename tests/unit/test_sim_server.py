@@ -16,14 +16,13 @@ from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree
 from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import decode_reply
-from tests.support.sim_client import CLIENT, OTHER, small_tree
+from tests.support.sim_client import CLIENT, DIR, FIVE, OTHER, A, small_tree
 
-A = b"/fs/microsd/a.bin"
 PATHS = [
     A,
-    b"/fs/microsd/five",
+    FIVE,
     b"/fs/microsd/empty",
-    b"/fs/microsd/dir",
+    DIR,
     b"/fs/microsd/new",
     b"/",
     b"",
