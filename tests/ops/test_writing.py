@@ -180,5 +180,7 @@ async def test_an_open_that_fails_after_all_leaves_nothing_open(monkeypatch: pyt
             assert await failure(ops.create(ROOT_INO, name, 0o600, flags, CTX)) == errno.ETIMEDOUT
     tree.files[b"/a.txt"] = b"longer than the kernel was told"
     assert await failure(ops.open(ino, os.O_RDWR, CTX)) == errno.ETIMEDOUT
-    assert [file.closed for file in tree.opened] == [1, 1, 1]
+    tree.failing["release"] = RequestTimeout("silence")
+    assert await failure(ops.mknod(ROOT_INO, b"node", stat.S_IFREG, 0, CTX)) == errno.ETIMEDOUT
+    assert [file.closed for file in tree.opened] == [1, 1, 1, 1]
     assert not list(ops.files)
