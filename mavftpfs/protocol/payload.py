@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
+from mavftpfs.shared.errors import RemoteProtocolError
 
 PAYLOAD_SIZE = 251
 HEADER_SIZE = 12
@@ -83,19 +83,8 @@ class Payload(NamedTuple):
     data: bytes = b""
 
     def encode(self) -> bytes:
-        """Return the 251 wire bytes, zero-filled behind the data.
-
-        Raises:
-            LocalProtocolError: a field does not fit.
-        """
-        data = self.data
-        if len(data) > MAX_DATA:
-            raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
-        try:
-            header = _HEADER.pack(*self[:7])
-        except struct.error as exc:
-            raise LocalProtocolError(f"payload field out of range: {exc}") from exc
-        return header + data + _ZEROS[HEADER_SIZE + len(data) :]
+        """Return the 251 wire bytes, zero-filled behind the data."""
+        return _HEADER.pack(*self[:7]) + self.data + _ZEROS[HEADER_SIZE + len(self.data) :]
 
 
 def request(
