@@ -9,7 +9,6 @@ from __future__ import annotations
 from math import inf
 
 from mavftpfs.protocol.payload import MAX_DATA
-from mavftpfs.shared.errors import LocalProtocolError
 
 SHORT = 64
 """Bytes of a short chunk: its frame is hardly longer than that of a request with a path, which must pass
@@ -37,18 +36,13 @@ class ChunkSize:
     """The size of chunks of one direction, for all its transfers.
 
     Args:
-        fixed: the size that the user asked for, in bytes; None to choose it.
+        fixed: the size that the user asked for, 1..239 bytes; None to choose it.
 
     Attributes:
         most: bytes of the longest chunk. size: of a chunk as far as that is settled.
-
-    Raises:
-        LocalProtocolError: a fixed size that is not within 1..239.
     """
 
     def __init__(self, fixed: int | None = None) -> None:
-        if fixed is not None and not 1 <= fixed <= MAX_DATA:
-            raise LocalProtocolError(f"a chunk of {fixed} bytes is not within 1..{MAX_DATA}")
         self.most = self.size = MAX_DATA if fixed is None else fixed
         self._least = SHORT if fixed is None else fixed
         self.trying = False

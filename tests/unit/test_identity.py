@@ -64,32 +64,6 @@ def test_it_may_have_restarted_while_it_was_away() -> None:
     assert identity.away_since(20.0, 20.5)
 
 
-def test_nothing_is_asked_into_a_silence() -> None:
-    identity = Watched()
-    identity.heard(0.0)
-    assert identity.may_be_asked(1000.0), "it never told its id"
-    identity.told(version(1))
-    assert identity.may_be_asked(ABSENCE)
-    assert not identity.may_be_asked(ABSENCE + 0.1)
-    identity.heard(ABSENCE + 0.2)
-    assert not identity.may_be_asked(ABSENCE + 0.2)
-    identity.told(version(1))
-    assert identity.may_be_asked(ABSENCE + 0.2)
-
-
-def test_a_silence_makes_it_doubtful_and_the_same_id_trusted() -> None:
-    identity = Watched()
-    identity.told(version(1))
-    identity.heard(0.0)
-    identity.heard(ABSENCE)
-    assert standing(identity) is Standing.TRUSTED
-    identity.heard(2 * ABSENCE + 0.1)
-    assert (identity.standing, identity.doubts) == (Standing.DOUBTED, 1)
-    assert identity.told(version(1))
-    assert standing(identity) is Standing.TRUSTED
-    assert identity.trusted == [False]
-
-
 def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity = Watched()
     identity.told(version(1))
@@ -116,13 +90,4 @@ def test_a_vehicle_that_is_heard_but_tells_no_id_is_believed_in_the_end(silences
             identity.heard(beat * 2 * ABSENCE)
         identity.unanswered()
     assert standing(identity) is Standing.TRUSTED
-
-
-def test_another_id_is_a_strangers_however_silent_it_falls_and_is_asked_for_again() -> None:
-    identity = Watched()
-    identity.told(version(1))
-    assert not identity.told(version(2))
-    assert identity.doubts == 1
-    for _ in range(2 * MOST_UNANSWERED):
-        identity.unanswered()
-    assert standing(identity) is Standing.STRANGER
+    assert identity.trusted == [False]
