@@ -212,9 +212,6 @@ class Framer(FrameBuffer[Message]):
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
             or the vehicle refuses us.
         on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
-
-    Raises:
-        UsageError: the key has another length.
     """
 
     def __init__(

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -56,6 +56,7 @@ def test_fast_encoding_is_pymavlinks_byte_for_byte(
 
 
 @given(st.lists(st.tuples(addresses, addresses, payloads), max_size=8), st.integers(0, 255))
+@example([(Address(1, 1), Address(0, 0), bytes(251)), (Address(1, 1), Address(1, 1), b"\1" * 251)], 0)
 def test_fast_decoding_of_several_is_pymavlinks(
     several: list[tuple[Address, Address, bytes]], seq: int
 ) -> None:

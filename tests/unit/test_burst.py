@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.protocol.burst import Burst
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.payload import Opcode, Payload
 
 SEQ = 65000
 RTO = 0.2
@@ -71,16 +71,6 @@ def test_incoherent_first_packets_are_refused(reply: Payload) -> None:
     assert burst.packet == 0
 
 
-@pytest.mark.holds("promise 1")
-@pytest.mark.parametrize(
-    "reply", [data(2)._replace(offset=0), data(2)._replace(offset=479), data(2, step=200)]
-)
-def test_incoherent_later_packets_are_refused(reply: Payload) -> None:
-    burst = make()
-    burst.take(data(0), 0.0)
-    assert burst.take(reply, 0.0) is None
-
-
 def test_a_grown_file_is_clipped_to_its_size() -> None:
     burst = make(300)
     burst.take(data(0), 0.0)
@@ -88,15 +78,6 @@ def test_a_grown_file_is_clipped_to_its_size() -> None:
     assert burst.over
     assert burst.highest == 300
     assert burst.take(data(2), 0.0) == b""
-
-
-@pytest.mark.holds("fault burst end", "rule 14.15")
-def test_eof_ends_it_wherever_it_says_it_is() -> None:
-    burst = make()
-    burst.take(data(0), 0.0)
-    assert burst.take(control(1, Opcode.NAK, b"\x06", offset=77), 0.1) == b""
-    assert burst.over
-    assert burst.nak == NakCode.EOF
 
 
 def test_control_packets_of_another_burst_are_refused() -> None:
