@@ -19,6 +19,7 @@ from math import inf
 
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
+from mavftpfs.protocol.pathgate import PathGate
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
 from mavftpfs.protocol.requests import Operation, Request, encode
 from mavftpfs.protocol.timers import Timers
@@ -90,6 +91,7 @@ class Engine:
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
         self._finished: list[Operation] = []
+        self._gate = PathGate()
         self._timers = Timers()
         self._due, self._heard_at = inf, -inf
         self._burst_op: Operation | None = None  # to which burst packets belong
@@ -279,6 +281,8 @@ class Engine:
         """Return the payloads (251 bytes each) to send now, most urgent first, within the window."""
         wires: list[bytes] = []
         self.flow.begin()
+        concerned = self._ops if self.traits.paths_block_writes else ()
+        self._gate.look(concerned, self._ledger.flying.values(), now, self.rtt)
         starved = True
         for op in self._ops.copy():
             starved = starved and self._serve(op, now, wires)
@@ -299,6 +303,9 @@ class Engine:
     def _serve(self, op: Operation, now: float, wires: list[bytes]) -> bool:
         """Send what `op` has; return False when the window is full."""
         if op.done or not op.waits(now):
+            return True
+        if self._gate.keeps(op):
+            op.progress_at = now  # it is not the vehicle that is silent
             return True
         ledger = self._ledger
         # An urgent one may use one slot more than bulk work: a full window must not make it wait.

@@ -18,6 +18,9 @@ from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
 __all__ = ["ListDirectory", "OpenRequest", "Operation", "Simple"]
 
+BEYOND = 100_000
+"""Offset of a listing that is beyond the end of any directory."""
+
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
 _MAX_FRUITLESS_PAGES = 32
@@ -170,7 +173,7 @@ class ListDirectory(Operation):
         self.on_page: Callable[[], None] | None = None
         self._path = path
         self._with_time = with_time
-        self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
+        self.opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
         self._names: set[bytes] = set()
         self.strings = 0
         self._asked = False
@@ -185,8 +188,8 @@ class ListDirectory(Operation):
         if self._asked:
             return []
         self._asked = True
-        manner, path = MANNERS[self._opcode], self._path
-        return [Request(self, self._opcode, manner, 0, self.strings, len(path), path, follows=True)]
+        manner, path = MANNERS[self.opcode], self._path
+        return [Request(self, self.opcode, manner, 0, self.strings, len(path), path, follows=True)]
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""

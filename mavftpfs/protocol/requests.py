@@ -168,6 +168,9 @@ class Operation:
     urgent = True
     """Whether it goes first when there is room. The transfers of bytes are not urgent."""
 
+    opcode = -1
+    """That of the one request it makes, again and again or once; -1: it makes several kinds."""
+
     bulk = -1
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
 
@@ -212,6 +215,10 @@ class Operation:
     def on_run(self, run: Run, now: float) -> None:
         """Take believed ACKs to requests with the opcode `bulk`, in the order in which they came."""
         raise NotImplementedError
+
+    def on_paths(self) -> None:
+        """Requests with a path go out, or are on their way, beside this one. It is told only where these
+        disturb it (see `pathgate`)."""
 
     def takes_back(self, request: Request, now: float) -> bool:
         """Return whether the bytes of a lost request are asked for by other requests in its place."""

@@ -11,9 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
+from mavftpfs.protocol.operations import BEYOND
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
     LAST_WRITE_MANNER,
+    MANNERS,
     WRITE_MANNER,
     Operation,
     Request,
@@ -35,6 +37,7 @@ MAX_OFFSET = 1 << 32
 """Offsets are 32 bits on the wire; the end of a file must fit too (servers.md 14.27)."""
 
 _WRITE = int(Opcode.WRITE_FILE)
+_LIST = int(Opcode.LIST_DIRECTORY)
 _NAK = int(Opcode.NAK)
 _COUNT_SIZE = 4
 _ROW = 64
@@ -47,6 +50,9 @@ _NO_FILE_ERRNOS = frozenset((0, 9))
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
 MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting further."""
+
+
+_DISTURBED = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
 class ChunkSource(Protocol):
@@ -107,6 +113,8 @@ class WriteTransfer(Operation):
 
     Args:
         session: id of the file open for writing. chunks: the size of requests.
+        root: a directory to list when other requests with a path may disturb the next write (see
+            `pathgate`); None: a write that is refused for that fails.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
         on_starved: called when the source has nothing more. After a full window that shows only when all of
             it was answered.
@@ -130,6 +138,7 @@ class WriteTransfer(Operation):
         source: ChunkSource,
         chunks: ChunkSize | None = None,
         *,
+        root: bytes | None = None,
         in_flight: int | None = None,
         on_starved: Callable[[], None] = lambda: None,
     ) -> None:
@@ -137,6 +146,10 @@ class WriteTransfer(Operation):
         self.session = session
         self.acked_bytes = 0
         self._source = source
+        self._root = root
+        self._disturbed = False  # the root is to be listed before the next write
+        self._listing: Request | None = None
+        self._listed = False  # and nothing was ACKed since
         self._in_flight = in_flight
         self._on_starved = on_starved
         self._rest: deque[tuple[int, bytes]] = deque()
@@ -183,6 +196,8 @@ class WriteTransfer(Operation):
             most = min(most, self._in_flight - len(self._unanswered))
         if self.paused or most <= 0:
             return []
+        if self._disturbed:
+            return self._list_root()
         session = self.session
         chunk = self.chunks.next_size(now)
         most = 1 if self.chunks.trying else min(most, _ROW)
@@ -203,6 +218,20 @@ class WriteTransfer(Operation):
             requests.append(request)
             self._unanswered[request] = None
         return requests
+
+    def _list_root(self) -> list[Request]:
+        """Return a listing of the root, once all else is answered. It sets right what paths disturb, and
+        clears a sticky errno. One request from beyond any end suffices; whatever it answers, the next write
+        tells."""
+        if self._unanswered or self._listing is not None or self._root is None:
+            return []
+        root = self._root
+        self._listing = Request(self, _LIST, MANNERS[_LIST], 0, BEYOND, len(root), root, follows=True)
+        return [self._listing]
+
+    def on_paths(self) -> None:
+        """See Operation."""
+        self._disturbed = self._root is not None
 
     def _new_piece(self, limit: int) -> tuple[int, bytes] | None:
         """Return at most `limit` bytes of the source; None if it has none, or fails."""
@@ -226,8 +255,17 @@ class WriteTransfer(Operation):
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Tell the source what was written, or end with what a refusal means."""
+        if request is self._listing:
+            self._listing, self._disturbed, self._listed = None, False, True
+            return
         if reply.opcode == _NAK:
-            self.fail(self._meaning(nak_of(request, reply)))
+            nak = nak_of(request, reply)
+            if is_disturbed(nak) and self._root is not None and not self._listed:
+                del self._unanswered[request]
+                self._rest.append((request.offset, request.data))
+                self._disturbed = self.port.traits.paths_block_writes = True
+            else:
+                self.fail(self._meaning(nak))
             return
         self.on_run([(request, reply.data)], now, placed=reply.offset == request.offset)
 
@@ -259,7 +297,7 @@ class WriteTransfer(Operation):
 
     def _tell(self, start: int, stop: int) -> None:
         if start < stop:
-            self._barren = 0
+            self._barren, self._listed = 0, False
             self.acked_bytes += stop - start
             self._source.on_acked(start, stop - start)
 
@@ -289,7 +327,7 @@ class WriteTransfer(Operation):
 
     def takes_back(self, request: Request, now: float) -> bool:
         """See Operation: the bytes of a chunk that was too long go out in shorter ones."""
-        if not self.chunks.on_lost(request.size, request.sent_at, now):
+        if request is self._listing or not self.chunks.on_lost(request.size, request.sent_at, now):
             return False
         del self._unanswered[request]
         offset, data = request.offset, request.data
@@ -314,3 +352,8 @@ class WriteTransfer(Operation):
         for start, stop in pieces:
             self._source.on_unsent(start, stop - start)
         super().finish()
+
+
+def is_disturbed(error: MavftpfsError | None) -> bool:
+    """Return whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
+    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _DISTURBED

@@ -14,8 +14,8 @@ Requests that carry a path and need no session (`ask`) run beside it, and carry 
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf
@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import trio
 
-from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple
+from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
@@ -60,9 +60,6 @@ _OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
 _NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
 """What servers say to a Terminate of a session that is not there; 8 is PX4's sticky errno."""
 
-_BEYOND = 100_000
-"""Offset of a listing that is beyond the end of any directory."""
-
 Asked = TypeVar("Asked", bound=Operation)
 
 
@@ -92,54 +89,6 @@ class _Remedies:
     resets: int = 1
 
 
-class PathGate:
-    """Keeps requests that carry a path out while an upload writes, and lets them in now and then.
-
-    Attributes:
-        shut: they wait. waiting: how many do. inside: how many are let in, and not answered yet.
-    """
-
-    def __init__(self) -> None:
-        self.shut = False
-        self.waiting = 0
-        self.inside = 0
-        self._changed = trio.lowlevel.ParkingLot()
-
-    @asynccontextmanager
-    async def passing(self, wake: Callable[[], None]) -> AsyncIterator[None]:
-        """Wait to be let in, and stay inside for the length of the body. wake: wakes the upload that shut
-        the gate."""
-        self.waiting += 1
-        try:
-            while self.shut:
-                wake()
-                await self._changed.park()
-        finally:
-            self.waiting -= 1
-            self._changed.unpark_all()
-        self.inside += 1
-        try:
-            yield
-        finally:
-            self.inside -= 1
-            self._changed.unpark_all()
-            if self.shut:
-                wake()
-
-    def open(self) -> None:
-        """Keep nobody out any longer."""
-        self.shut = False
-        self._changed.unpark_all()
-
-    async def let_in(self, seconds: float) -> None:
-        """Let requests in for at most so long. Then it is shut, and some may be inside."""
-        self.open()
-        with trio.move_on_after(seconds):
-            while self.waiting or self.inside:
-                await self._changed.park()
-        self.shut = True
-
-
 class ServerSession:
     """Opens and closes files, and knows what is open. Its user sleeps here until there is news.
 
@@ -151,7 +100,7 @@ class ServerSession:
         maybe_open: files that may be open over there by our doing, by session id: a request was not answered
         yet, or never, or the session is not believed any more.
         opening_at: when the last open went out; once its ACK came: when that was.
-        path_gate: what asks the server for a path passes it. others: other clients of this server.
+        others: other clients of this server.
         changed: where tasks park until something more is closed.
     """
 
@@ -172,7 +121,6 @@ class ServerSession:
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
         self.opening_at = -inf
-        self.path_gate = PathGate()
         self.others = OtherClients()
         self._asked_sessions_at = -inf
         self._news = trio.Event()
@@ -373,8 +321,8 @@ class ServerSession:
     async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
         """Carry out a request that needs no session of its own, and carries a path.
 
-        It passes the path gate: looking up a path disturbs an upload on NuttX. ArduPilot refuses it while
-        another client has a session: then a new one is made and sent after a silence.
+        ArduPilot refuses it while another client has a session: then a new one is made and sent after a
+        silence.
 
         changes: it changes the card. If it was sent twice, a refusal may answer the second execution, and is
             raised at once.
@@ -387,8 +335,7 @@ class ServerSession:
             operation = make()
             self.vehicle.require(self.clock())
             try:
-                async with self.path_gate.passing(self.wake):
-                    await self.driver.run(operation)
+                await self.driver.run(operation)
             except FtpNak as nak:
                 if nak.code not in _TAKEN or self.session is not None or (changes and nak.retransmitted):
                     raise
@@ -409,7 +356,7 @@ class ServerSession:
         self._asked_sessions_at, refused = now, True
         with trio.move_on_after(STAYS_ITS_OWN), suppress(MavftpfsError):
             try:
-                await self.driver.run(Simple(Opcode.LIST_DIRECTORY, b"/", offset=_BEYOND))
+                await self.driver.run(Simple(Opcode.LIST_DIRECTORY, b"/", offset=BEYOND))
                 refused = False
             except FtpNak as nak:
                 refused = nak.code in _TAKEN

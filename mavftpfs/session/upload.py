@@ -5,22 +5,17 @@ at any time: Terminate right behind the window, and later OpenFileWO and what of
 was seen to empty files that would begin the file anew, so the upload keeps the session until its source has
 nothing more. Where neither was seen yet, the upload is interrupted when another user waits, and reopening its
 file tells. What was ACKed before an ACKed Terminate is written.
-
-PX4 on NuttX checks each WriteFile against a scratch buffer that every path operation overwrites
-(docs/servers.md 8). Once that was seen, path operations and writes take turns (`PathGate`).
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
 from enum import Enum
 from math import inf
 
 import trio
 
-from mavftpfs.protocol.operations import Simple
-from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.writing import WriteTransfer, is_disturbed
 from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
 from mavftpfs.shared.errors import (
@@ -55,9 +50,7 @@ CHECKPOINT_EVERY = 60.0
 REFUSALS = (FtpNak, ProtocolError)
 """Errors that do not pass by themselves."""
 
-_PATHS_TURN = 0.5
 _OFTEN = 0.25
-_BLOCKED = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
 class Stop(Enum):
@@ -95,7 +88,6 @@ class Upload(SessionUser):
         self._retry_at = 0.0  # not to be touched before
         self._changed = trio.lowlevel.ParkingLot()
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
-        self._in_vain = False  # its last turn got no further
         self._losses = 0  # of the session, without progress
         self._furthest = 0  # in the file, when the session was lost the last time
         self._cannot_resume = False  # its file was not opened again, or was empty then, or no size was told
@@ -206,7 +198,7 @@ class Upload(SessionUser):
 
     async def _use(self, turn: Turn) -> None:
         """Have a turn."""
-        began, before = self._clock(), self._source.reached
+        began = self._clock()
         try:
             try:
                 session = await self._open(turn)
@@ -216,7 +208,6 @@ class Upload(SessionUser):
                 await self._close(session, stop)
             finally:
                 self._end_transfer()
-                self._in_vain = self._source.reached <= before
             if stop is Stop.STARVED:
                 self._complete(finishers)
         except MavftpfsError as error:
@@ -320,42 +311,33 @@ class Upload(SessionUser):
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
-        server, traits, gate = self._server, self._engine.traits, self._server.path_gate
-        blocked = False
-        gate.shut = traits.paths_block_writes
+        server, stop = self._server, None
+        # If a light user waits already, a short queue is half filled: the Terminate finds a place in it, and
+        # is not behind as many writes. Else a small read at 300 ms waits a round trip more.
+        use, queue = turn.rival_use, self._engine.traits.queue_limit
+        transfer = WriteTransfer(
+            session.id,
+            self._source,
+            self._scheduler.write_chunks,
+            root=storage_root(self.path),
+            in_flight=queue // 2 if queue and use is not None and use < LIGHT_USE else None,
+            on_starved=server.wake,
+        )
+        self._transfer = server.transfer = transfer
         try:
-            while True:
-                # If a light user waits already, a short queue is half filled: the Terminate finds a place in
-                # it, and is not behind as many writes. Else a small read at 300 ms waits a round trip more.
-                use, queue = turn.rival_use, traits.queue_limit
-                most = queue // 2 if queue and use is not None and use < LIGHT_USE else None
-                chunks = self._scheduler.write_chunks
-                transfer = WriteTransfer(
-                    session.id, self._source, chunks, in_flight=most, on_starved=server.wake
-                )
-                transfer.paused = blocked or (gate.shut and gate.inside > 0)
-                self._transfer = server.transfer = transfer
-                stop = None
-                try:
-                    await self._driver.start(transfer, server.wake, self._on_batch)
-                    stop = await self._watch(turn, session, transfer)
-                finally:
-                    if not transfer.trailing:  # else its last answers come while `_close` waits for its own
-                        self._end_transfer()
-                error = transfer.error
-                if error is None:
-                    assert stop is not None
-                    return stop
-                if not is_blocked(error):
-                    raise error
-                if blocked and not transfer.acked_bytes:
-                    # Another client's path requests take no turns: the next turns try again.
-                    another = self._vehicle.another_client_heard(self._clock())
-                    raise SessionLost(f"beside another FTP client: {error}") if another else error
-                # From now on path operations take turns with uploads: first those under way end.
-                blocked = gate.shut = traits.paths_block_writes = True
+            await self._driver.start(transfer, server.wake, self._on_batch)
+            stop = await self._watch(turn, session, transfer)
         finally:
-            gate.open()
+            if not transfer.trailing:  # else its last answers come while `_close` waits for its own
+                self._end_transfer()
+        error = transfer.error
+        if is_disturbed(error) and self._vehicle.another_client_heard(self._clock()):
+            # Its requests for paths take no turns with ours: the next turns try again.
+            raise SessionLost(f"beside another FTP client: {error}") from error
+        if error is not None:
+            raise error
+        assert stop is not None
+        return stop
 
     def _on_batch(self, now: float) -> None:
         """A batch of replies was processed."""
@@ -365,8 +347,8 @@ class Upload(SessionUser):
 
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
         """Return the reason to let go; None if the transfer ended by itself."""
-        server, gate, clock = self._server, self._server.path_gate, self._clock
-        fed_at, let_in_at, shut_for = clock(), -inf, 0.0
+        server, clock = self._server, self._clock
+        fed_at = clock()
         while not transfer.done:
             server.require_open(session)
             if not transfer.starved:
@@ -378,20 +360,11 @@ class Upload(SessionUser):
             stalled = closes and server.is_stalled(transfer)
             if stalled and stop is None:
                 stop = Stop.YIELD
-            transfer.paused = stop is not None or (gate.shut and (transfer.paused or gate.waiting > 0))
-            if stop is not None:
-                if transfer.idle or stalled or stop is Stop.ARMED or self._let_trail(transfer):
-                    return stop
-            elif transfer.paused and transfer.idle:
-                paths_turn = max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0))
-                # Beside a long listing or checksum others go in, too, each time after twice the wait.
-                # Else one might always be inside, and nothing would be written.
-                if gate.waiting and clock() - let_in_at >= (shut_for if gate.inside else inf):
-                    let_in_at, shut_for = clock(), 2.0 * max(shut_for, paths_turn)
-                    await gate.let_in(paths_turn)
-                if not gate.inside:
-                    await self._unblock()
-                    transfer.paused, let_in_at, shut_for = False, -inf, 0.0
+            transfer.paused = stop is not None
+            if stop is not None and (
+                transfer.idle or stalled or stop is Stop.ARMED or self._let_trail(transfer)
+            ):
+                return stop
             self._driver.kick()
             await server.sleep(BRIEF_STARVE if transfer.starved else _OFTEN)
         return None
@@ -411,9 +384,6 @@ class Upload(SessionUser):
             return Stop.STARVED if self.awaited or starved_for >= least else None
         if rival_use is None:
             over = self._keeps_content and now - session.opened_at >= CHECKPOINT_EVERY
-        elif self._in_vain and self._server.path_gate.shut and transfer.paused and not transfer.acked_bytes:
-            # A long listing is inside, as in the last turn. The next one might begin beside another, too.
-            over = now - session.opened_at >= 0.5 * self._server.op_deadline
         else:
             over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
@@ -439,18 +409,6 @@ class Upload(SessionUser):
             transfer.finish()
             self._driver.cancel(transfer)
 
-    async def _unblock(self) -> None:
-        """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.
-
-        One request from beyond any end suffices; whatever it answers, the next write tells.
-        """
-        parts = self.path.split(b"/")
-        on_nuttx = len(parts) > 3 and parts[1] == b"fs"  # then it is /fs/NAME, else the parent directory
-        root = b"/".join(parts[:3]) if on_nuttx else split(self.path)[0]
-        wire = wire_path(root).rstrip(b"/") + b"/"
-        with suppress(FtpNak):
-            await self._driver.run(Simple(Opcode.LIST_DIRECTORY, wire, offset=100_000))
-
     # --- letting go
 
     async def _close(self, session: OpenSession, stop: Stop) -> None:
@@ -470,12 +428,14 @@ class Upload(SessionUser):
         if not ours or isinstance(failed, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from failed
         self._source.check_point()
-        if failed is not None and is_blocked(failed):
-            self._engine.traits.paths_block_writes = True
-        elif isinstance(failed, REFUSALS):
+        if isinstance(failed, REFUSALS):
             raise failed
 
 
-def is_blocked(error: MavftpfsError) -> bool:
-    """Whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
-    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _BLOCKED
+def storage_root(path: bytes) -> bytes:
+    """Return the directory, with a slash at its end, that fits PX4's whitelist for writes: `/fs/NAME/` on
+    NuttX, else where the file is."""
+    parts = path.split(b"/")
+    on_nuttx = len(parts) > 3 and parts[1] == b"fs"
+    root = b"/".join(parts[:3]) if on_nuttx else split(path)[0]
+    return wire_path(root).rstrip(b"/") + b"/"

@@ -380,52 +380,6 @@ async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer() -> N
     assert here.data(b"/d/new") == data
 
 
-@pytest.mark.holds("promise 4", "promise 9")
-@pytest.mark.parametrize("first", [False, True], ids=["later", "first"])
-async def test_a_long_checksum_beside_an_upload_on_nuttx_holds_nobody_else_up(first: bool) -> None:
-    """The upload waits for it; others list and read, and the file is closed when the vehicle is armed. first:
-    it was asked for before the upload began its turn."""
-    data = content(100_000)
-    here = Rig("px4-nuttx", FILES, PLAIN)
-    here.card.add(b"/etc/rc", b"#")
-    async with here.connected() as connection, trio.open_nursery() as nursery:
-        know(connection, "px4-nuttx")
-        connection.engine.traits.paths_block_writes = True
-        checksum = trio.CancelScope()
-
-        async def sum_up() -> None:
-            here.faults.ignore(Opcode.CALC_FILE_CRC32)
-            with checksum:
-                await connection.store.crc32(path("px4-nuttx", "other"), size=120 * 10**6)
-
-        if first:
-            nursery.start_soon(sum_up)
-            await trio.sleep(0.5)
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        upload.wake()
-        await trio.sleep(1.0)
-        if not first:
-            nursery.start_soon(sum_up)
-            await trio.sleep(3.0)
-        written = source.reached
-        with trio.fail_after(10):
-            await connection.store.list_directory(b"/etc")
-            await read_brief(here)
-        await trio.sleep(5.0)
-        assert source.reached == written
-        assert Opcode.WRITE_FILE not in here.faults.refused, here.faults.refused
-        here.vehicle.arm()
-        await trio.sleep(0.5)
-        assert here.server.open_sessions == 0
-        here.vehicle.disarm()
-        checksum.cancel()
-        await trio.sleep(2.0)
-        with trio.fail_after(60):
-            await upload.finish()
-    assert here.data(b"/d/new") == data
-
-
 async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
     """Whatever slips in between arming and writing, the upload is not refused for it."""
     data = content(40_000)
@@ -479,7 +433,7 @@ async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_tu
         for directory in directories:
             nursery.start_soon(list_for_ever, directory)
         await trio.sleep(1.0)
-        with trio.fail_after(300 if beside_a_copy else 90):
+        with trio.fail_after(20):
             await put(connection, path("px4-nuttx", "new"), data)
         nursery.cancel_scope.cancel()
     assert here.data(b"/d/new") == data

@@ -1,0 +1,144 @@
+"""Writes and requests with a path take turns where paths block writes: hand-driven time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.chunking import ChunkSize
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.pathgate import LEAST
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.shared.errors import FtpNak
+from tests.support.replies import ack, nak, sent
+from tests.support.transfers import MemorySource
+
+pytestmark = pytest.mark.holds("rule 14.24")
+
+CHUNK = 239
+FULL = CHUNK.to_bytes(4, "little")
+ROOT = b"/fs/microsd/"
+
+
+class Card:
+    """An engine with an upload, of which two requests are on their way at once, on such a server."""
+
+    def __init__(self, *, known: bool = True, chunk: int = CHUNK) -> None:
+        self.engine = Engine(random.Random(3), Flow(limit=2))
+        self.engine.traits.paths_block_writes = known
+        self.transfer = WriteTransfer(0, MemorySource(bytes(CHUNK * 100)), ChunkSize(chunk), root=ROOT)
+        self.engine.start(self.transfer, 0.0)
+
+    def ask(self, opcode: Opcode, now: float) -> Simple:
+        operation = Simple(opcode, b"/etc")
+        self.engine.start(operation, now)
+        return operation
+
+    def sends(self, now: float) -> list[Opcode]:
+        """Return what goes out now; nothing of it is answered yet."""
+        self.out = sent(self.engine, now)
+        return [Opcode(request.opcode) for request in self.out]
+
+    def answer(self, now: float, requests: list[Payload] | None = None) -> list[Opcode]:
+        """ACK what went out last, and return what goes out then."""
+        for request in self.out if requests is None else requests:
+            data = FULL if request.opcode == Opcode.WRITE_FILE else b""
+            self.engine.receive(ack(request, data), now)
+        return self.sends(now)
+
+
+def test_a_path_waits_for_the_writes_on_their_way_and_the_next_writes_for_a_listing_of_the_root() -> None:
+    card = Card()
+    writes = [Opcode.WRITE_FILE] * 2
+    assert card.sends(0.0) == writes
+    card.ask(Opcode.CREATE_DIRECTORY, 0.1)
+    assert card.answer(0.1) == writes, "a turn lasts for a while"
+    on_their_way = card.out
+    assert card.sends(LEAST) == []
+    assert card.answer(LEAST + 0.1, on_their_way) == [Opcode.CREATE_DIRECTORY]
+    path = card.out
+    assert card.sends(LEAST + 0.2) == [], "nothing beside it"
+    assert card.answer(LEAST + 0.3, path) == [Opcode.LIST_DIRECTORY]
+    assert card.out[0].data == ROOT
+    assert card.answer(LEAST + 0.4) == writes
+
+
+def test_a_checksum_and_a_terminate_wait_for_nothing() -> None:
+    card = Card()
+    card.sends(0.0)
+    card.ask(Opcode.CALC_FILE_CRC32, 0.0)
+    card.ask(Opcode.TERMINATE_SESSION, 0.0)
+    assert card.sends(0.0) == [Opcode.CALC_FILE_CRC32]
+
+
+def test_one_path_after_another_leaves_the_writes_their_turn() -> None:
+    card = Card()
+    now, seen = 0.0, {Opcode.WRITE_FILE: 0, Opcode.RENAME: 0}
+    card.ask(Opcode.RENAME, now)
+    card.sends(now)
+    for _ in range(200):
+        now += 0.05
+        for opcode in card.answer(now):
+            if opcode in seen:
+                seen[opcode] += 1
+            if opcode == Opcode.RENAME:
+                card.ask(Opcode.RENAME, now)
+    assert seen[Opcode.WRITE_FILE] > 50
+    assert seen[Opcode.RENAME] > 25
+
+
+def test_waiting_for_its_turn_is_no_silence() -> None:
+    card = Card()
+    card.sends(0.0)
+    path = card.ask(Opcode.RENAME, 0.0)
+    now = 0.0
+    while now < LEAST:
+        card.answer(now)
+        now += 0.01
+    assert path.progress_at >= LEAST - 0.02
+
+
+def test_a_refused_write_is_sent_again_behind_a_listing_of_the_root() -> None:
+    card = Card(known=False)
+    card.sends(0.0)
+    for now in (1.0, 2.0):
+        first, second = card.out
+        card.engine.receive(nak(first, NakCode.FILE_PROTECTED), now)
+        assert card.engine.traits.paths_block_writes
+        assert card.sends(now) == [], "the other one is not answered yet"
+        card.engine.receive(nak(second, NakCode.FILE_PROTECTED), now)
+        assert card.sends(now) == [Opcode.LIST_DIRECTORY]
+        assert card.answer(now + 0.1) == [Opcode.WRITE_FILE] * 2
+        assert {request.offset for request in card.out} == {first.offset, second.offset}
+        card.answer(now + 0.2)
+    card.engine.receive(nak(card.out[0], NakCode.FILE_PROTECTED), 3.0)
+    card.engine.receive(nak(card.out[1], NakCode.FILE_PROTECTED), 3.0)
+    card.sends(3.0)
+    card.answer(3.1)
+    card.engine.receive(nak(card.out[0], NakCode.FILE_PROTECTED), 3.2)
+    assert isinstance(card.transfer.error, FtpNak), "that listing did not help"
+
+
+def test_a_lost_listing_of_the_root_goes_out_again() -> None:
+    card = Card(known=False, chunk=1)
+    card.sends(0.0)
+    for request in card.out:
+        card.engine.receive(nak(request, NakCode.FILE_PROTECTED), 0.1)
+    assert card.sends(0.1) == [Opcode.LIST_DIRECTORY]
+    due = card.engine.next_deadline()
+    assert due is not None
+    card.engine.on_deadline(due)
+    assert card.sends(due) == [Opcode.LIST_DIRECTORY]
+
+
+def test_after_a_restart_nothing_waits() -> None:
+    card = Card()
+    card.sends(0.0)
+    card.engine.remove(card.transfer)
+    card.engine.forget_server()
+    card.ask(Opcode.RENAME, 0.1)
+    assert card.sends(0.1) == [Opcode.RENAME]
