@@ -73,11 +73,13 @@ def check(meter: Meter, limit: float = LIMIT, *, late: float = 0.0) -> None:
 async def test_bulk_keeps_the_limit_and_uses_it(
     profile: str, transfer: Callable[[Connection, Rig], Awaitable[None]]
 ) -> None:
+    """Whatever read_mode says: the pace of bursts is the server's."""
     here = Rig(profile, {b"/d/f": DATA}, WIDE)
     limit = LIMIT // 2 if profile == "ardupilot" else LIMIT  # its short queue allows no more
-    async with here.connected(ConnectOptions(bwlimit=limit)) as connection:
+    async with here.connected(ConnectOptions(bwlimit=limit, read_mode="burst")) as connection:
         meter = Meter(connection)
         await transfer(connection, here)
+        assert Opcode.BURST_READ_FILE not in connection.engine.stats.by_opcode
         check(meter, limit, late=here.server.profile.stall_chance and 0.3)
 
 
@@ -107,12 +109,3 @@ async def test_the_slowest_limit_is_slow_and_no_time_out() -> None:
             connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 1
         )  # waiting for the limit is no silence
         assert connection.engine.stats.retransmissions == 0
-
-
-async def test_no_bursts_with_a_limit() -> None:
-    here = Rig("ardupilot", {b"/d/f": DATA}, WIDE)
-    async with here.connected(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
-        meter = Meter(connection)
-        await read(connection, here)
-        assert Opcode.BURST_READ_FILE not in connection.engine.stats.by_opcode
-        check(meter, LIMIT // 2)

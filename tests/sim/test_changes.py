@@ -6,8 +6,7 @@ ours is open where a name changes is asserted in every test with a Rig (support/
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from typing import Literal
+from collections.abc import Awaitable
 
 import pytest
 import trio
@@ -15,10 +14,9 @@ import trio
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import SLACK
 from mavftpfs.protocol.operations import Simple
-from mavftpfs.protocol.payload import Opcode, crc32
-from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.store import Store
-from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, RequestTimeout
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import Connection
+from mavftpfs.shared.errors import FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -121,20 +119,6 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
     assert shown >= set(names[taken:])
 
 
-@pytest.mark.holds("promise 9")
-@pytest.mark.parametrize("when_armed", ["ro", "ok"])
-async def test_no_checksum_is_asked_for_in_flight(when_armed: Literal["ro", "ok"]) -> None:
-    """The vehicle reads the whole file for it (promise 9)."""
-    here = Rig("px4", {b"/d/file": b"content"})
-    async with here.connected(ConnectOptions(when_armed=when_armed)) as connection:
-        await here.arm()
-        with pytest.raises(Armed):
-            await connection.store.crc32(b"/d/file")
-        assert Opcode.CALC_FILE_CRC32 not in here.faults.requests
-        await here.disarm()
-        assert await connection.store.crc32(b"/d/file") == crc32(b"content")
-
-
 LIMIT = CacheOptions().op_deadline + SLACK
 RADIO = LinkSettings(rate=5760.0, delay=0.05)
 D = b"/d"
@@ -144,7 +128,6 @@ def made(profile: str, settings: LinkSettings | None = None) -> Rig:
     here = Rig(profile, link=settings or LinkSettings())
     for name in (b"/a", b"/b"):
         here.card.add(D + name, b"x" * 30)
-    here.card.add_directory(D + b"/empty")
     return here
 
 
@@ -186,28 +169,6 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing() -> No
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(here.faults.requests)
-
-
-@pytest.mark.parametrize(
-    ("opcode", "change"),
-    [
-        (Opcode.REMOVE_FILE, lambda store: store.remove(D + b"/a")),
-        (Opcode.REMOVE_DIRECTORY, lambda store: store.remove_directory(D + b"/empty")),
-        (Opcode.RENAME, lambda store: store.rename(D + b"/a", D + b"/c")),
-        (Opcode.CREATE_DIRECTORY, lambda store: store.make_directory(D + b"/new")),
-    ],
-)
-async def test_in_doubt_a_refusal_may_answer_the_networks_copy_of_the_request(
-    opcode: Opcode, change: Callable[[Store], Awaitable[None]]
-) -> None:
-    """The first was carried out, and its answer is lost. (PX4 and ArduPilot send that answer once more.)"""
-    here = made("mavsdk")
-    async with here.connected() as connection:
-        connection.scheduler.doubt.raise_it("for the test")
-        here.faults.repeat(1)
-        here.faults.lose_reply_to(opcode)
-        await change(connection.store)
-        assert here.faults.requests.count(opcode) == 2
 
 
 async def test_changes_that_concern_one_another_take_turns() -> None:

@@ -5,7 +5,6 @@ Virtual time, bytes compared. The targets are those of docs/benchmarks.md; scrip
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from statistics import mean
 
@@ -285,83 +284,3 @@ async def test_a_way_that_becomes_longer_for_good_is_found_out() -> None:
         share = (sink.have.total - before) / (10.0 * 60_000.0 * MAX_DATA / FRAME * (1 - loss))
         reader.close()
     assert share > 0.85
-
-
-# --- the end of a transfer
-
-RATE, RTT, LOSS, SIZE = 100_000.0, 0.1, 0.1, 700_000
-LAST = 0.99
-IN_VAIN = 1 - (1 - LOSS) ** 2
-"""The share of requests that get no answer."""
-
-TIMER, LONE_TIMER = 1.5, 3.0
-"""Round trips after which what no newer answer tells to be lost is asked for again; the same for Terminate,
-of which it is not known yet how long answers take."""
-
-
-def allowed(case: Case) -> float:
-    """Return how many seconds the last percent may take on average: its share at the rate to be reached, one
-    round trip, and a timer for each time that what is lost most often is lost; one more for chance."""
-    in_flight = min(RATE / FRAME, case.limit / MAX_DATA) * RTT
-    losses: float = sum(1 - (1 - IN_VAIN**times) ** in_flight for times in range(1, 30))
-    close = (1 + IN_VAIN / (1 - IN_VAIN) * LONE_TIMER) * RTT if case.direction == "write" else 0.0
-    return (1 - LAST) * SIZE / (target(case) * case.limit) + RTT + (losses + 1) * TIMER * RTT + close
-
-
-async def last_read(here: Rig) -> float:
-    """Return how long the end of a read takes."""
-    data, almost = content(SIZE, 1), 0.0
-    here.card.add(b"/d/f", data)
-
-    class Sink(MemorySink):
-        def on_data(self, offset: int, data: bytes) -> None:
-            nonlocal almost
-            super().on_data(offset, data)
-            if offset + len(data) >= LAST * SIZE:
-                almost = almost or trio.current_time()
-
-    async with here.connected() as connection:
-        sink = Sink(SIZE)
-        reader = await connection.store.open_reader(b"/d/f", sink)
-        reader.want(0, SIZE, demand=True)
-        assert await sink.wait_for(0, SIZE) == data
-        took = trio.current_time() - almost
-        reader.close()
-    return took
-
-
-async def last_write(here: Rig) -> float:
-    """Return how long the end of an upload takes."""
-    almost = 0.0
-
-    class Source(MemorySource):
-        def on_acked(self, offset: int, count: int) -> None:
-            nonlocal almost
-            super().on_acked(offset, count)
-            if offset + count >= LAST * SIZE:
-                almost = almost or trio.current_time()
-
-    async with here.connected() as connection:
-        source = Source(content(SIZE, 1))
-        upload = await connection.store.open_upload(b"/d/f", source)
-        await upload.finish()
-        took = trio.current_time() - almost
-        await upload.end()
-    assert here.card.data(b"/d/f") == source.content
-    return took
-
-
-ENDS: dict[Direction, Callable[[Rig], Awaitable[float]]] = {"read": last_read, "write": last_write}
-
-
-@HARDER
-def test_the_last_percent_is_not_slow(direction: Direction) -> None:
-    """What is lost is asked for again on the way: all of it, only in the end, would be 1.6 s more."""
-
-    def run(seed: int) -> float:
-        link = LinkSettings(rate=RATE, delay=RTT / 2, loss=LOSS, queue=int(RATE / 2))
-        here = Rig("px4", link=link, seed=seed)
-        here.card.add_directory(b"/d")
-        return trio.run(ENDS[direction], here, clock=MockClock(autojump_threshold=0))
-
-    assert mean(map(run, (1, 2))) <= allowed(Case("px4", RATE, RTT, LOSS, direction))
