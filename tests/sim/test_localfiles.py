@@ -54,23 +54,6 @@ async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
     assert here.data(SWAP) == b"data"
 
 
-async def test_vim_saves(here: Rig, tree: Tree) -> None:
-    """Swap file, a probe called 4913, a backup by renaming, the new file, backup removed."""
-    swap = await tree.create(SWAP, exclusive=True)
-    await swap.write(4096, b"b0VIM")
-    assert await swap.read(0, 4) == bytes(4)
-    await write_file(tree, b"/scripts/4913", b"")
-    await tree.unlink(b"/scripts/4913")
-    await tree.rename(FILE, FILE + b"~")
-    await write_file(tree, FILE, b"-- new")
-    await tree.unlink(FILE + b"~")
-    await swap.fsync()
-    await swap.release()
-    await tree.unlink(SWAP)
-    assert here.files() == {FILE: b"-- new"}
-    assert tree.status()["bytes_local"] == 0
-
-
 async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
     """They are two places: mv(1) copies then, and removes."""
     await write_file(tree, SWAP, b"local")

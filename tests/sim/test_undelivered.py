@@ -7,6 +7,8 @@ import errno
 import json
 import os
 import tempfile
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 from random import Random
 
@@ -41,9 +43,9 @@ OLD = bytes(range(256)) * 400
 FILE, NEW = b"/d/file.txt", b"/d/new"
 KIB = 1024
 BIG = content(70_000)
-DEADLINE = 5.0
+QUICK = ConnectOptions(op_deadline=5.0)
 
-here = card({FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE))
+here = card({FILE: OLD}, options=QUICK)
 
 
 @pytest.fixture
@@ -91,24 +93,6 @@ async def test_a_checksum_is_the_vehicle_s_or_none(here: Rig, tree: Tree) -> Non
     await file.release()
 
 
-@pytest.mark.parametrize("end", ["flush", "release"])
-async def test_an_upload_of_what_was_taken_back_is_called_off(end: str) -> None:
-    async with rig("mavsdk", {FILE: OLD}) as here:
-        tree = here.mount()
-        file = await tree.open(FILE, write=True, truncate=True)
-        await file.write(0, OLD)
-        await file.write(len(OLD), bytes(100 * KIB))
-        await trio.sleep(1)
-        assert here.litter(), "it was to begin beside the program"
-        await file.truncate(len(OLD))
-        await getattr(file, end)()
-        assert here.files() == {FILE: OLD}
-        assert here.server.open_sessions == 0
-        await file.release()
-        await tree.unlink(FILE)
-        await tree.rmdir(b"/d")
-
-
 # --- what waits
 
 
@@ -146,19 +130,6 @@ async def test_what_can_only_go_at_the_close_holds_nobody_back(here: Rig, tree: 
 # --- trying again
 
 
-async def test_what_a_close_did_not_deliver_is_delivered_without_news(here: Rig, tree: Tree) -> None:
-    """The link failed and returned between two looks at it."""
-    fall_silent(here)
-    await close_in_vain(tree)
-    assert tree.undelivered() == [NEW]
-    speak(here)
-    await trio.sleep(2 * PAUSES[0])
-    assert tree.undelivered() == []
-    assert here.data(NEW) == b"content"
-    assert tree._writing is not None
-    assert list(tree._writing._context.nodes) == []
-
-
 RENAMES = [
     ("px4", 1),
     ("mavsdk", 1),
@@ -169,10 +140,25 @@ RENAMES = [
 ]
 """Which requests give a file its name instead of an old one."""
 
+OTHERS = OLD[::-1]
+TWO = {FILE: OLD, NEW: OTHERS}
+"""As large as each other; listings need not tell times."""
 
-def silence(here: Rig, *, carried_out: bool, nth: int) -> None:
+
+@asynccontextmanager
+async def mounted(profile: str, files: Mapping[bytes, bytes | None]) -> AsyncIterator[tuple[Rig, Tree]]:
+    """Mount a card with these files, and find out how it renames."""
+    async with rig(profile, files, options=QUICK) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/other", b"")
+        await write_file(tree, b"/d/other", b"over it")
+        await tree.unlink(b"/d/other")
+        yield here, tree
+
+
+def silence(here: Rig, *, carried_out: bool, nth: int = 1, opcode: Opcode = Opcode.RENAME) -> None:
     """Fall silent at a rename."""
-    here.faults.at(Opcode.RENAME, lambda: fall_silent(here), nth=nth, drop=not carried_out)
+    here.faults.at(opcode, lambda: fall_silent(here), nth=nth, drop=not carried_out)
 
 
 async def interrupt(here: Rig, file: OpenFile, *, carried_out: bool, nth: int) -> None:
@@ -182,15 +168,21 @@ async def interrupt(here: Rig, file: OpenFile, *, carried_out: bool, nth: int) -
         await file.fsync()
 
 
+async def rename_unheard(here: Rig, tree: Tree, *, carried_out: bool, nth: int = 1) -> None:
+    """Rename NEW over FILE, and fall silent at a rename."""
+    silence(here, carried_out=carried_out, nth=nth)
+    with pytest.raises(OutcomeUnknown):
+        await tree.rename(NEW, FILE)
+    speak(here)
+
+
 @pytest.mark.parametrize("carried_out", [False, True])
 @pytest.mark.parametrize(("profile", "nth"), RENAMES)
 async def test_what_others_put_there_after_an_interruption_stays(
     profile: str, nth: int, carried_out: bool
 ) -> None:
     """A part of the old file was to stay, and that is gone."""
-    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
-        await write_file(tree, b"/d/other", b"found out how it renames")
+    async with mounted(profile, {FILE: OLD}) as (here, tree):
         file = await tree.open(FILE, write=True)
         await file.write(len(OLD), b"more")
         await interrupt(here, file, carried_out=carried_out, nth=nth)
@@ -205,9 +197,7 @@ async def test_what_others_put_there_after_an_interruption_stays(
 @pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
 async def test_what_others_put_there_before_ours_was_confirmed_stays(profile: str, path: bytes) -> None:
     """In doubt the file is compared once more under its own name, and the vehicle falls silent there."""
-    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
-        await write_file(tree, b"/d/other", b"found out how it renames")
+    async with mounted(profile, {FILE: OLD}) as (here, tree):
         here.connection.scheduler.doubt.raise_it("for the test")
         file = await (tree.open(path, write=True) if path == FILE else tree.create(path, exclusive=True))
         await file.write(len(OLD) if path == FILE else 0, b"more")
@@ -230,9 +220,8 @@ async def test_what_is_written_after_an_interruption_goes_there(
     profile: str, nth: int, path: bytes, carried_out: bool
 ) -> None:
     """The name may have what was sent before: that is ours, and may be replaced."""
-    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree, before = here.mount(), OLD if path == FILE else b""
-        await write_file(tree, b"/d/other", b"found out how it renames")
+    async with mounted(profile, {FILE: OLD}) as (here, tree):
+        before = OLD if path == FILE else b""
         file = await (tree.open(path, write=True) if before else tree.create(path, exclusive=True))
         await file.write(len(before), b"more")
         await interrupt(here, file, carried_out=carried_out, nth=nth if before else 1)
@@ -247,7 +236,7 @@ async def test_what_is_written_after_an_interruption_goes_there(
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
 async def test_an_old_file_that_is_kept_for_a_while_is_not_put_in_a_later_one_s_place(profile: str) -> None:
     """In doubt it is kept for ten seconds. Meanwhile others remove the file, and a new one is made."""
-    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+    async with rig(profile, {FILE: OLD}, options=QUICK) as here:
         tree = here.mount()
         here.connection.scheduler.doubt.raise_it("for the test")
         await write_file(tree, FILE, b"replaced")
@@ -275,28 +264,20 @@ async def test_an_old_file_that_is_kept_for_a_while_is_not_put_in_a_later_one_s_
 async def test_an_append_survives_a_rename_over_its_file_that_did_not_happen(
     profile: str, nth: int, whole: bool, carried_out: bool
 ) -> None:
-    """If it did happen, the append is refused: the file that has the name now is as large as the old one, and
-    listings need not tell times. Nor does the handle read that file."""
-    async with rig(
-        profile, {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)
-    ) as here:
-        tree = here.mount()
-        await write_file(tree, b"/d/other", b"found out how it renames")
+    """If it did, the append is refused, and the handle does not read the file that has the name now."""
+    async with mounted(profile, TWO) as (here, tree):
         file = await tree.open(FILE, write=True)
         if whole:  # else the old file moves aside first, because a program has it open
             await file.write(0, OLD)
         await file.write(len(OLD), b"more")
-        silence(here, carried_out=carried_out, nth=nth)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
-        happened = here.files().get(FILE) == OLD[::-1]
+        await rename_unheard(here, tree, carried_out=carried_out, nth=nth)
+        happened = here.files().get(FILE) == OTHERS
         if happened:
             with pytest.raises(FileChanged):
                 await (file.fsync() if whole else file.read(0, 1000))
             with pytest.raises(FileChanged):
                 await file.release()
-            assert here.data(FILE) == OLD[::-1]
+            assert here.data(FILE) == OTHERS
         else:
             assert await file.read(0, 1000) == OLD[:1000]
             await file.write(file.size, b" and more")
@@ -305,53 +286,37 @@ async def test_an_append_survives_a_rename_over_its_file_that_did_not_happen(
         assert happened == (NEW not in here.files())
 
 
+@pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize("carried_out", [False, True])
-async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(carried_out: bool) -> None:
-    """Nothing of the old file was to stay, and the other file is nowhere else."""
-    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
+async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(
+    carried_out: bool, again: bool
+) -> None:
+    """Nothing of the old file was to stay, and the other file is nowhere else. again: a new file had its old
+    name, was never sent, and was removed, which says nothing of the rename."""
+    async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, b"new")
-        silence(here, carried_out=carried_out, nth=1)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
+        await rename_unheard(here, tree, carried_out=carried_out)
+        if again and carried_out:
+            await (await tree.create(NEW, exclusive=True)).write(0, b"again")
+            await tree.unlink(NEW)
         if carried_out:
             with pytest.raises(FileChanged):
                 await file.release()
-            assert here.files() == {FILE: OLD[::-1]}
+            assert here.files() == {FILE: OTHERS}
         else:
             await file.release()
-            assert here.files() == {FILE: b"new", NEW: OLD[::-1]}
-
-
-async def test_a_new_file_that_was_never_sent_says_nothing_of_an_earlier_rename() -> None:
-    """To remove it no request goes out, so none was answered."""
-    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
-        file = await tree.open(FILE, write=True, truncate=True)
-        await file.write(0, b"new")
-        silence(here, carried_out=True, nth=1)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
-        again = await tree.create(NEW, exclusive=True)
-        await again.write(0, b"again")
-        await tree.unlink(NEW)
-        with pytest.raises(FileChanged):
-            await file.release()
-        assert here.files() == {FILE: OLD[::-1]}
+            assert here.files() == {FILE: b"new", NEW: OTHERS}
 
 
 @pytest.mark.parametrize("data", [b"new", b""])
 @pytest.mark.parametrize("opcode", [Opcode.RENAME, Opcode.REMOVE_FILE])
 async def test_after_that_refusal_the_name_can_be_written_anew(opcode: Opcode, data: bytes) -> None:
     """It is a copy that begins anew: by O_TRUNC, and through the library by what makes files, too."""
-    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
+    async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, data)
-        here.faults.at(opcode, lambda: fall_silent(here))
+        silence(here, carried_out=True, opcode=opcode)
         with pytest.raises(OutcomeUnknown):
             await (tree.rename(NEW, FILE) if opcode is Opcode.RENAME else tree.unlink(FILE))
         speak(here)
@@ -363,13 +328,9 @@ async def test_after_that_refusal_the_name_can_be_written_anew(opcode: Opcode, d
 
 @pytest.mark.holds("promise 1")
 async def test_who_opened_an_empty_file_does_not_write_over_what_got_its_name_unnoticed() -> None:
-    async with rig("px4", {FILE: b"", NEW: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
+    async with mounted("px4", {FILE: b"", NEW: OLD}) as (here, tree):
         file = await tree.open(FILE, write=True)
-        silence(here, carried_out=True, nth=1)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
+        await rename_unheard(here, tree, carried_out=True)
         assert await read_file(tree, FILE) == OLD
         with pytest.raises(FileChanged):
             await file.write(0, b"more")
@@ -380,27 +341,20 @@ async def test_who_opened_an_empty_file_does_not_write_over_what_got_its_name_un
 @pytest.mark.holds("promise 1")
 async def test_a_checksum_is_asked_for_again_after_a_rename_without_an_answer() -> None:
     """Two files may have one size and time."""
-    async with rig("mavsdk", options=ConnectOptions(op_deadline=DEADLINE)) as here:
+    async with mounted("mavsdk", {b"/d": None}) as (here, tree):
         here.put(FILE, OLD, 1_600_000_000)
-        here.put(NEW, OLD[::-1], 1_600_000_000)
-        tree = here.mount()
+        here.put(NEW, OTHERS, 1_600_000_000)
+        tree.forget_caches()
         checksums = [await tree.crc32(path) for path in (FILE, NEW)]
-        silence(here, carried_out=True, nth=1)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
+        await rename_unheard(here, tree, carried_out=True)
         assert await tree.crc32(FILE) == checksums[1] != checksums[0]
 
 
 async def test_a_rename_that_did_not_happen_is_no_reason_once_its_file_went_otherwise() -> None:
-    async with rig("px4", {FILE: OLD, NEW: OLD[::-1]}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
+    async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True)
         await file.write(len(OLD), b"more")
-        silence(here, carried_out=False, nth=1)
-        with pytest.raises(OutcomeUnknown):
-            await tree.rename(NEW, FILE)
-        speak(here)
+        await rename_unheard(here, tree, carried_out=False)
         await tree.unlink(NEW)
         await file.release()
         assert here.files() == {FILE: OLD + b"more"}
@@ -408,12 +362,11 @@ async def test_a_rename_that_did_not_happen_is_no_reason_once_its_file_went_othe
 
 @pytest.mark.parametrize("carried_out", [False, True])
 async def test_an_append_survives_a_removal_that_did_not_happen(carried_out: bool) -> None:
-    """The card cannot rename. If it did happen, the append is refused, as there is no file."""
-    async with rig("px4", {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
-        tree = here.mount()
+    """If it did happen, the append is refused, as there is no file."""
+    async with mounted("px4", {FILE: OLD}) as (here, tree):
         file = await tree.open(FILE, write=True)
         await file.write(0, OLD)
-        here.faults.at(Opcode.REMOVE_FILE, lambda: fall_silent(here), drop=not carried_out)
+        silence(here, carried_out=carried_out, opcode=Opcode.REMOVE_FILE)
         with pytest.raises(OutcomeUnknown):
             await tree.unlink(FILE)
         speak(here)
@@ -447,6 +400,8 @@ async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree
     speak(here)
     await trio.sleep(2 * PAUSES[0])
     assert tree.undelivered() == [], "the next one begins anew"
+    assert tree._writing is not None
+    assert list(tree._writing._context.nodes) == []
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC])
@@ -572,28 +527,6 @@ async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
     assert here.data(NEW) == BIG[:65_000]
 
 
-async def test_the_log_says_once_that_the_full_disk_is_the_one_here(
-    here: Rig, caplog: pytest.LogCaptureFixture
-) -> None:
-    """To a program ENOSPC means the card."""
-    tree = here.mount(dirty_max=1, spool_max=65_010)
-    file = await begin(here, tree, BIG[:65_000])
-    for _ in range(3):
-        with pytest.raises(NoSpace):
-            await file.write(65_000, b"more than fits")
-    (said,) = caplog.messages
-    assert "here, not on the vehicle" in said
-    assert "spool_max" in said
-    speak(here)
-    await file.release()
-    again = await tree.create(b"/d/again", exclusive=True)
-    await again.write(0, BIG[:65_000])
-    caplog.clear()
-    with pytest.raises(NoSpace):
-        await again.write(65_000, b"more than fits")
-    assert len(caplog.messages) == 1, "there was room meanwhile, so it is news"
-
-
 @pytest.mark.parametrize("how", ["unlink", "rename over it"])
 async def test_removing_what_was_not_delivered_frees_its_place(here: Rig, how: str) -> None:
     tree = here.mount(dirty_max=64 * KIB, spool_max=2 * len(BIG))
@@ -668,14 +601,6 @@ async def test_what_a_killed_mount_leaves_is_what_the_vehicle_lacks(
 
 
 # --- what is kept at the end
-
-
-async def test_what_is_recovered_has_its_whole_size(here: Rig, tree: Tree, tmp_path: Path) -> None:
-    file = await tree.create(NEW, exclusive=True)
-    await file.write(0, b"abc")
-    await file.truncate(1000)
-    (saved,) = tree.recover_to(tmp_path / "r")
-    assert saved.read_bytes() == b"abc".ljust(1000, b"\0")
 
 
 async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_saved(
