@@ -62,17 +62,10 @@ def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> N
     assert demo.returncode == 0, out
     assert suspects(out) == []
     for word in (
-        "ls -l",
         "cat drone",
-        "cp drone",
-        "mavftpfs status drone",
         "PX4 1/1, disarmed, link ",
         "sed -i",
-        "mavlink start -d /dev/ttyS1 -b 115200",
         "diff -r",
-        "md5sum card",
-        "  flight.ulg\n",
-        "Right, byte for byte",
         "10_32_15.ulg",
         "Every byte was right",
     ):

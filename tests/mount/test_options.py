@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -90,57 +88,27 @@ def test_every_payload_is_printed_and_recorded_decoded(
     mount.run("cat", mount.path / "sizes/478.bin")
     assert mount.unmount() == 0
     text = mount.alive_or_ended().text()
-    for word in ("LIST_DIRECTORY", "OPEN_FILE_RO", "TERMINATE_SESSION", "/sizes/478.bin"):
-        assert word in text
     lines = [line for line in text.splitlines() if "/sizes/478.bin" in line or "mounted" in line]
+    assert len(lines) > 1
     assert [line for line in lines if not re.match(r"\d\d:\d\d:\d\d\.\d+ ", line)] == []
     records = [json.loads(line) for line in trace.read_text().splitlines()]
-    times = [datetime.fromisoformat(record["time"]) for record in records]
-    assert sorted(times) == times
-    assert abs((datetime.now(UTC) - times[0]).total_seconds()) < 600
     opened = [record for record in records if record["opcode"] == "OPEN_FILE_RO"]
     looked_for = b"@PARAM/param.pck"  # once, by the mount
     assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin", looked_for}
-    answered = {record.get("req_opcode") for record in records if record["dir"] == "reply"}
-    assert {"LIST_DIRECTORY", "OPEN_FILE_RO", "READ_FILE", "TERMINATE_SESSION"} <= answered
 
 
-# mount(8) runs the program named by the type from a fixed PATH, so one is made to hold it, in a mount
-# namespace of its own. The script prints what the test looks at; the mount is not seen outside.
+# mount(8) runs the program named by the type from a fixed PATH, and the helper of a type from /sbin, so both
+# are made to hold ours, in a mount namespace of its own. The script prints what the test looks at, and how
+# other tools see the mount; it is not seen outside.
 MOUNT_8 = """
 mount --bind "$1" /usr/local/bin || exit 90
-mount -t fuse.mavftpfs "$2" "$3" -o "$4" || exit
+mount -t overlay none -o "lowerdir=$1:/usr/sbin" /usr/sbin || exit 90
+mount -t fuse.mavftpfs "$2" "$3" -o "ro,noatime,allow_other,uid=1000,nofail,_netdev" || exit
 grep " $3 " /proc/self/mounts
 stat -c "uid %u" "$3/README.txt" &&
-diff -r "$5/sizes" "$3/sizes" &&
+diff -r "$4/sizes" "$3/sizes" &&
 umount "$3"
-"""
-
-
-def mount_8(mount: Mount, tree: Path, program: Path, words: str) -> subprocess.CompletedProcess[str]:
-    """Mount with mount(8) and unmount with umount(8) in a namespace where `mavftpfs` is installed."""
-    program.mkdir()
-    (program / "mavftpfs").symlink_to(Path(sys.executable).parent / "mavftpfs")
-    places = (program, mount.source, mount.path, words, tree)
-    return mount.run("unshare", "--mount", "sh", "-c", MOUNT_8, "sh", *map(str, places), code=None)
-
-
-def test_mount_8_and_umount_8(field: Field, small_tree: Path, tmp_path: Path) -> None:
-    mount = field.prepare(field.sim(small_tree).source)
-    words = "ro,noatime,allow_other,uid=1000,nofail,_netdev,x-systemd.automount"
-    done = mount_8(mount, small_tree, tmp_path / "bin", words)
-    assert done.returncode == 0, done.stderr
-    line, owner = done.stdout.splitlines()
-    assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftpfs"]
-    assert {"ro", "noatime"} <= set(line.split()[3].split(","))
-    assert owner == "uid 1000"
-    wait_until("the daemon ended", lambda: not processes_in(mount.path))
-
-
-# The same for `-t mavftpfs`, whose helper mount(8) wants in /sbin; then the mount as other tools see it.
-MOUNT_BY_HELPER = """
-mount -t overlay none -o "lowerdir=$1:/usr/sbin" /usr/sbin || exit 90
-mount -t mavftpfs "$2" "$3" -o "$4" || exit
+mount -t mavftpfs "$2" "$3" -o nofail,_netdev || exit
 df -t fuse.mavftpfs --output=target | grep -x "$3"
 findmnt -n -t fuse.mavftpfs -o TARGET | grep -x "$3"
 mount -t fuse.mavftpfs | grep -c " on $3 type "
@@ -148,30 +116,22 @@ umount "$3"
 """
 
 
-def helper_in(folder: Path) -> Path:
-    """Make a directory with mount.mavftpfs and the program, as an installation has them."""
-    folder.mkdir()
+def test_mount_8_by_both_types_and_umount_8(field: Field, small_tree: Path, tmp_path: Path) -> None:
     for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
-        program = folder / name
+        program = tmp_path / name
         program.write_text(
             f"#!{sys.executable}\nimport sys\nfrom mavftpfs.cli import main\nsys.exit(main.{function}())\n"
         )
         program.chmod(0o755)
-    return folder
-
-
-def test_mount_by_its_own_type(field: Field, tmp_path: Path) -> None:
-    card = field.local("card")
-    mount = field.prepare(field.sim(card).source)
-    places = (helper_in(tmp_path / "sbin"), mount.source, mount.path, "nofail,_netdev")
-    done = mount.run("unshare", "--mount", "sh", "-c", MOUNT_BY_HELPER, "sh", *map(str, places), code=None)
+    mount = field.prepare(field.sim(small_tree).source)
+    places = (tmp_path, mount.source, mount.path, small_tree)
+    done = mount.run("unshare", "--mount", "sh", "-c", MOUNT_8, "sh", *places, code=None)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == [
-        str(mount.path),
-        str(mount.path),
-        "1",
-    ]
-    wait_until("the daemon ended", lambda: not processes_in(mount.path))
+    line, *others = done.stdout.splitlines()
+    assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftpfs"]
+    assert {"ro", "noatime"} <= set(line.split()[3].split(","))
+    assert others == ["uid 1000", str(mount.path), str(mount.path), "1"]
+    wait_until("the daemons ended", lambda: not processes_in(mount.path))
 
 
 def test_auto_unmount_clears_after_a_kill(field: Field, small_tree: Path) -> None:

@@ -37,7 +37,6 @@ class Scene:
 
     expected: Path
     mount: Mount
-    vehicle: UdpVehicle
 
     @property
     def path(self) -> Path:
@@ -61,7 +60,7 @@ def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path, short
         vehicle = module_field.mavsdk(expected, BAD_LINK if kind.endswith("bad-link") else ())
     else:
         vehicle = module_field.sim(expected, kind)
-    return Scene(expected, module_field.mount(vehicle.source, "ro"), vehicle)
+    return Scene(expected, module_field.mount(vehicle.source, "ro"))
 
 
 def bytes_of(*argv: str | Path) -> bytes:

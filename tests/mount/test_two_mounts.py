@@ -77,6 +77,8 @@ def test_two_mounts_at_once_confirm_nothing_wrong(field: Field, kind: str) -> No
             field.mount(f"udpin:{HOST}:{ports[n]}", *options, f"source_system={255 - n}") for n in (1, 2)
         ]
         fill_at_once(mounts, FOLDERS[kind], card)
+        for mount in mounts:
+            assert "another FTP client of vehicle 1/1 is heard" in mount.alive().text()
         assert [mount.unmount() for mount in mounts] == [0, 0]
     finally:
         router.stop()

@@ -1,6 +1,6 @@
 """Random system calls, each made on a mount and on a local directory; stops at the first difference.
 
-    python lockstep.py MOUNTED LOCAL CARD --seed 7 --count 500 [--keep-names]
+    python lockstep.py MOUNTED LOCAL CARD --seed 7 --count 500
 
 MOUNTED: a directory of the mount. LOCAL: a directory of a local disk. CARD: where MOUNTED lies on the
 vehicle, seen without the mount; `-` if that cannot be seen. The calls follow from the seed alone, so what
@@ -29,6 +29,8 @@ TAIL = 40
 LARGE = 30_000
 WAYS = (
     os.O_RDONLY,
+    os.O_RDONLY | os.O_CREAT,
+    os.O_RDONLY | os.O_TRUNC,
     os.O_WRONLY,
     os.O_RDWR,
     os.O_RDWR | os.O_CREAT,
@@ -223,11 +225,6 @@ class Side:
             self.name_of(number) is None for number in self.slots.values()
         )
 
-    def needs_rename(self, call: Call) -> bool:
-        """Return whether a server that cannot rename cannot do this: it keeps no open file without a name."""
-        is_open = call.name == "unlink" and call.args[0] in map(self.name_of, self.slots.values())
-        return is_open or call.name in ("rename", "move")
-
     def take_back(self, call: Call) -> None:
         """Undo a call that removed or replaced an empty directory."""
         if call.name == "move":
@@ -321,14 +318,11 @@ def main() -> int:
     parser.add_argument("card")
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--count", type=int, required=True)
-    parser.add_argument("--keep-names", action="store_true", help="make no call that needs renaming")
     args = parser.parse_args()
     mounted, local = Side(args.mounted), Side(args.local)
     done: list[str] = []
 
     def run(call: Call) -> bool:
-        if args.keep_names and local.needs_rename(call):
-            return True
         found = difference(mounted, local, args.card, call)
         done.append(str(call))
         if found is not None:
