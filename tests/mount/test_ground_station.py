@@ -110,8 +110,6 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
     work_on(mount, root, station)
     results = station.results()
     assert results["parameters"] == PARAMETERS
-    assert results["mission_result"] == 0
-    assert len(results["mission"]) == 12
     assert bytes.fromhex(results["file"]) in (b"", CONTENT), "the vehicle has one session for both"
     assert mount.unmount() == 0
     assert flown.stop() == 0

@@ -40,16 +40,13 @@ NAMES = (
     b"Fsub/dir\t4",
 )
 
-MAX_RESIDENT = 150 << 20
-"""Bytes; far above what a capped listing needs, far below what an endless one would take."""
-
 
 def card() -> MemoryTree:
     """What the vehicle has."""
     tree = MemoryTree()
     for name in GOOD_NAMES:
         tree.add(b"/names/" + os.fsencode(name), GOOD)
-    for name in ("endless", "same", "refused"):
+    for name in ("same", "refused"):
         tree.add_directory(f"/{name}".encode())
     return tree
 
@@ -59,8 +56,6 @@ def listing(request: Payload) -> list[Payload] | None:
     if request.opcode != Opcode.LIST_DIRECTORY:
         return None
     match request.data.strip(b"/\0"):
-        case b"endless":
-            names = [b"Fendless%09d\t4" % (request.offset + step) for step in range(8)]
         case b"same":
             names = [b"Fsame_for_ever\t4"]
         case b"names":
@@ -88,14 +83,6 @@ def test_only_usable_names_enter_the_tree(liar: Mount) -> None:
     assert out.strip() == ascii(sorted(GOOD_NAMES))
     for name in sorted(GOOD_NAMES):
         assert liar.read_bytes(liar.path / "names" / name) == GOOD
-
-
-@pytest.mark.holds("promise 8")
-def test_endless_listings_end_with_an_error(liar: Mount) -> None:
-    error = liar.errno_of("os.listdir(sys.argv[1])", liar.path / "endless", timeout=120)
-    assert error in {"EIO", "ETIMEDOUT"}
-    assert liar.alive().peak_memory() < MAX_RESIDENT
-    assert liar.run("cat", liar.path / "names/good.txt").stdout == GOOD.decode()
 
 
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:

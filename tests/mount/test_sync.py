@@ -30,9 +30,6 @@ from tests.support.neighbours import Beating
 from tests.support.places import start_place
 from tests.support.vehicles import HOST, PROJECT, Program, free_udp_port
 
-SLOW = ("--rate", "20000", "--delay", "0.01")
-"""So that progress is drawn before the first file is here: five times a second, if the machine has time."""
-
 FAR = ("--delay", "0.2")
 """So that a growing log has grown between its last read and the next question, on a busy machine too."""
 
@@ -340,21 +337,6 @@ def test_what_goes_with_watch_only_is_said(tmp_path: Path) -> None:
 
 
 # -- terminals ------------------------------------------------------------------------------------
-
-
-def test_progress_has_one_total_and_the_file_at_work(field: Field, tmp_path: Path) -> None:
-    columns, rows = 80, 8
-    vehicle = field.sim(field.local("card"), "px4", SLOW)
-    for number in range(12):  # more than a small terminal has rows
-        write_log(vehicle.root / "log" / f"{number:02}{'_long' * 12}.ulg", 10_000, number, number)
-    screen = terminal.mavftpfs("sync", vehicle.source, tmp_path / "logs", columns=columns, rows=rows)
-    assert screen.finish() == 0
-    assert max(map(len, screen.lines)) <= columns
-    totals = [line for line in screen.lines if "/12 files" in line]
-    assert "0/12 files" in totals[0]
-    assert any("kB/s" in line and "left" in line for line in totals)
-    assert screen.lines[-1].startswith("12 new (120.0 kB), 0 here already")
-    assert screen.raw.count("verified by") == 12
 
 
 @pytest.mark.parametrize("command", ["sync", "put"])

@@ -107,16 +107,10 @@ def test_rsync_twice_transfers_once(scene: Scene, tmp_path: Path) -> None:
 
 WRITES = (
     "open(sys.argv[1] + '/new.txt', 'w')",
-    "open(sys.argv[1] + '/README.txt', 'a')",
     "os.truncate(sys.argv[1] + '/README.txt', 0)",
     "os.mkdir(sys.argv[1] + '/new')",
-    "os.rmdir(sys.argv[1] + '/empty')",
     "os.unlink(sys.argv[1] + '/README.txt')",
-    "os.rename(sys.argv[1] + '/README.txt', sys.argv[1] + '/other.txt')",
-    "os.symlink('README.txt', sys.argv[1] + '/sym')",
-    "os.link(sys.argv[1] + '/README.txt', sys.argv[1] + '/hard')",
     "os.chmod(sys.argv[1] + '/README.txt', 0o600)",
-    "os.utime(sys.argv[1] + '/README.txt', (1, 1))",
 )
 
 

@@ -1,9 +1,9 @@
-"""A simulated vehicle that a ground station can work with: telemetry, parameters, a mission; as a process.
+"""A simulated vehicle that a ground station can work with: telemetry and parameters; as a process.
 
     python -m tests.support.flown DIR --link pty --rate 5760 --record FILE
 
 The arguments are those of `mavftpfs sim`. --record: each frame that went out or came in, a line each: `>` or
-`<`, and the frame in hex. Parameters and mission speak the classic protocols, by pymavlink.
+`<`, and the frame in hex. Parameters speak the classic protocol, by pymavlink.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ class FlownVehicle(SimVehicle):
         super().__init__(*args, **keywords)
         self._splitter = Splitter(stream=False)
         self._parser = dialect.MAVLink(None)
-        self._mission: list[Any] = []
-        self._expected = 0
         self._to_tell: list[int] = []
         self._tell_at = float("inf")
 
@@ -70,9 +68,6 @@ class FlownVehicle(SimVehicle):
     def next_deadline(self) -> float:
         return min(super().next_deadline(), self._tell_at)
 
-    def _say(self, *message: Any) -> None:
-        self._ready.append(self.framer.encode(*message))
-
     def _parameter(self, number: int) -> bytes:
         name = list(PARAMETERS)[number]
         value = PARAMETERS[name]
@@ -87,35 +82,9 @@ class FlownVehicle(SimVehicle):
             number = list(PARAMETERS).index(message.param_id)
         self._ready.append(self._parameter(number))
 
-    def _on_mission_count(self, message: Any, now: float) -> None:
-        self._mission, self._expected = [], message.count
-        self._say("mission_request_int", message.get_srcSystem(), message.get_srcComponent(), 0, 0)
-
-    def _on_mission_item(self, message: Any, now: float) -> None:
-        target = (message.get_srcSystem(), message.get_srcComponent())
-        if message.seq == len(self._mission):
-            self._mission.append(message)
-        if len(self._mission) < self._expected:
-            self._say("mission_request_int", *target, len(self._mission), 0)
-        else:
-            self._say("mission_ack", *target, 0, 0)
-
-    def _on_mission_list(self, message: Any, now: float) -> None:
-        self._say("mission_count", message.get_srcSystem(), message.get_srcComponent(), len(self._mission), 0)
-
-    def _on_mission_request(self, message: Any, now: float) -> None:
-        item = self._mission[message.seq]
-        fields = [getattr(item, name) for name in item.fieldnames]
-        fields[:2] = [message.get_srcSystem(), message.get_srcComponent()]
-        self._say("mission_item_int", *fields)
-
     _ANSWERS: ClassVar[dict[int, Callable[[Any, Any, float], None]]] = {
         20: _on_parameter_read,
         21: _on_parameter_list,
-        43: _on_mission_list,
-        44: _on_mission_count,
-        51: _on_mission_request,
-        73: _on_mission_item,
     }
 
 

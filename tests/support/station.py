@@ -1,4 +1,4 @@
-"""pymavlink as a ground station, in a process of its own: parameters, a mission, its own FTP client.
+"""pymavlink as a ground station, in a process of its own: parameters, its own FTP client.
 
     python -m tests.support.station PORT REMOTE --record FILE [--key HEX]
 
@@ -25,7 +25,6 @@ from mavftpfs.link.frames import Splitter
 
 VEHICLE = (1, 1)
 PATIENCE = 60.0
-ITEMS = 12
 
 
 class RecordedStation(mavutil.mavudp):  # type: ignore[misc]
@@ -77,40 +76,6 @@ def parameters(station: RecordedStation) -> dict[str, float]:
     return dict(found.values())
 
 
-def upload_mission(station: RecordedStation) -> int:
-    """Put a mission on the vehicle; return what it says."""
-    station.mav.mission_count_send(*VEHICLE, ITEMS)
-    while True:
-        kinds = ["MISSION_REQUEST_INT", "MISSION_ACK"]
-        message = station.recv_match(type=kinds, blocking=True, timeout=PATIENCE)
-        assert message is not None, "the vehicle asks for no item"
-        if message.get_type() == "MISSION_ACK":
-            return int(message.type)
-        place = (473977418 + message.seq, 85455938, 50.0)
-        station.mav.mission_item_int_send(*VEHICLE, message.seq, 3, 16, 0, 1, 0, 0, 0, 0, *place)
-
-
-def download_mission(station: RecordedStation) -> list[int]:
-    """Return the latitudes of the mission on the vehicle."""
-    station.mav.mission_request_list_send(*VEHICLE)
-    message = station.recv_match(type="MISSION_COUNT", blocking=True, timeout=PATIENCE)
-    assert message is not None, "no mission"
-    found = []
-    for number in range(message.count):
-        station.mav.mission_request_int_send(*VEHICLE, number)
-        found.append(mission_item(station, number).x)
-    return found
-
-
-def mission_item(station: RecordedStation, number: int) -> Any:
-    """Return one item; those that another station with the same id asked for come here, too."""
-    while True:
-        item = station.recv_match(type="MISSION_ITEM_INT", blocking=True, timeout=PATIENCE)
-        assert item is not None, f"item {number} does not come"
-        if item.seq == number:
-            return item
-
-
 def fetch(station: RecordedStation, remote: str) -> str:
     """Fetch a file by pymavlink's own client; return it in hex."""
     with tempfile.TemporaryDirectory() as folder:
@@ -139,8 +104,6 @@ def main() -> int:
     if args.key is None:
         beating.start()
     facts: dict[str, Any] = {"parameters": parameters(station)}
-    facts["mission_result"] = upload_mission(station)
-    facts["mission"] = download_mission(station)
     if args.remote:
         facts["file"] = fetch(station, args.remote)
     stop.set()
