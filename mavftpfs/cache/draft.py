@@ -125,8 +125,6 @@ class Draft:
             name away.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
-        sent_in_place: under its own name the card has bytes of it, or an old file that we may have emptied
-            (cards that cannot rename).
     """
 
     def __init__(self, content: Content, base: Known | None) -> None:
@@ -137,7 +135,8 @@ class Draft:
         self.taken_if_gone: set[bytes] = set()
         self.state = State.DIRTY if base is None else State.CLEAN
         self.sending: SendBuffer | None = None
-        self.sent_in_place = False
+        self._in_place = False  # the present attempt, or the last one
+        self._sent_in_place = False  # by an earlier attempt
         self._held = ExtentSet()
 
     # --- what it is
@@ -146,6 +145,13 @@ class Draft:
     def whole(self) -> bool:
         """Whether all bytes of it are here."""
         return self._held.covers(0, min(self.base_limit, self.size))
+
+    @property
+    def sent_in_place(self) -> bool:
+        """Whether under its own name the card may have bytes of it, or an old file that we may have emptied
+        (cards that cannot rename)."""
+        sending = self.sending
+        return self._sent_in_place or (self._in_place and sending is not None and sending.handed_out > 0)
 
     @property
     def unacked(self) -> int:
@@ -256,10 +262,10 @@ class Draft:
         """Start to send a whole draft to an empty file. in_place: under the file's own name, so the old
         content there does not count from now on. progress: see SendBuffer."""
         self.on(Event.BEGUN)
+        self._in_place = in_place
         if in_place and self.base is not None:
-            self.sent_in_place, self.base_limit = True, 0
-        read = self._bytes_in_place if in_place else self.local_bytes
-        self.sending = SendBuffer(read, self.size, progress)
+            self._sent_in_place, self.base_limit = True, 0
+        self.sending = SendBuffer(self.local_bytes, self.size, progress)
         return self.sending
 
     def give_up(self) -> None:
@@ -284,7 +290,7 @@ class Draft:
         self.on(Event.PLACED)
         self.base, self.base_limit = Known(self.size, crc32=crc32), self.size
         self.taken_if_gone.clear()
-        self.sent_in_place = False
+        self._sent_in_place = False
         self.content.mark_unneeded()
 
     def lose_base(self, *, though_rewritten: bool = False) -> None:
@@ -309,7 +315,7 @@ class Draft:
             self.taken_if_gone.clear()
         self.state = after
         if after is not State.SENDING:
-            self.sending = None
+            self._sent_in_place, self.sending = self.sent_in_place, None
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
@@ -321,11 +327,6 @@ class Draft:
             assert self.whole
 
     # --- inside
-
-    def _bytes_in_place(self, start: int, stop: int) -> bytes:
-        """Return bytes that are about to be sent under the file's own name: it was made by us."""
-        self.sent_in_place = True
-        return self.local_bytes(start, stop)
 
     def _tell_changed(self, start: int, stop: int) -> None:
         if self.sending is not None:

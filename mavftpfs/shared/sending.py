@@ -28,6 +28,7 @@ class SendBuffer:
         todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
             bytes ACKed before it was last closed. All other bytes are on their way.
         has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
+        handed_out: one past the highest byte that ever was.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
         reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
@@ -44,7 +45,7 @@ class SendBuffer:
         self.has_checkpoint = self.overtaken = self.growing = False
         self._progress = progress
         self._read = read
-        self._handed_out = 0  # one past the highest byte
+        self.handed_out = 0
         self.reached = 0
         self._ahead = (0, b"")
 
@@ -55,7 +56,7 @@ class SendBuffer:
 
     def on_changed(self, start: int, size: int) -> None:
         """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
-        self.overtaken |= start < self._handed_out
+        self.overtaken |= start < self.handed_out
         if size > self.size:
             self.todo.add(self.size, size)
         else:
@@ -85,7 +86,7 @@ class SendBuffer:
             at, ahead = start, self._read(start, max(stop, min(first[1], start + AHEAD)))
             self._ahead = (at, ahead)
         self.todo.discard(start, stop)
-        self._handed_out = max(self._handed_out, stop)
+        self.handed_out = max(self.handed_out, stop)
         return start, ahead[start - at : stop - at]
 
     def on_acked(self, offset: int, count: int) -> None:
