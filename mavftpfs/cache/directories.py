@@ -169,7 +169,7 @@ class Directories:
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
         self._on_listed, self._on_swept = on_listed, on_swept
         self.sweeps = 0
-        self.rebooted()
+        self._forget_server()
 
     def __len__(self) -> int:
         return len(self._known)
@@ -285,6 +285,9 @@ class Directories:
         """Expire all listings, and forget what was learnt of the server."""
         for path in self._known.keys() | self._sweeps.keys():
             self.expire(path)
+        self._forget_server()
+
+    def _forget_server(self) -> None:
         self.tells_times = False
         self._root_proven = self._options.root == ROOT
         self._dot_refused = False
@@ -314,25 +317,25 @@ class Directories:
             As ask, but None where its directory is gone. ListingIncomplete: see Directory.has.
         """
         parent, _ = split(path)
-        known, began = self.known(parent), None
+        known, not_before = self.known(parent), None
         if known is not None and within:
-            began = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
+            not_before = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
         try:
-            return (await self.ask(parent, began=began)).has(path)
+            return (await self.ask(parent, not_before=not_before)).has(path)
         except (NotFound, NotADirectory):
             return None
 
-    async def ask(self, path: bytes, *, began: float | None = None) -> Directory:
-        """Return a directory's listing that begins now, or that began at the time `began` or later.
+    async def ask(self, path: bytes, *, not_before: float | None = None) -> Directory:
+        """Return a directory's listing that begins now, or that did not begin before a time.
 
         Raises:
             NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
         """
-        since = self.clock() if began is None else began
+        since = self.clock() if not_before is None else not_before
         for _ in range(SWEEP_TRIES):
             sweep = self._sweeps.get(path)
             if sweep is None or sweep.void or sweep.began < since:
-                known = None if began is None else self.known(path)
+                known = None if not_before is None else self.known(path)
                 if known is not None and known.listed_at >= since and self._is_fresh(known):
                     return known
                 self.expire(path)

@@ -1,7 +1,8 @@
 """Open regular files: close-to-open consistency over cached blocks. Layer: cache.
 
 At open it is decided whether the version in the cache is still the vehicle's file:
-- It is if a fresh listing shows its size and mtime.
+- It is if a fresh listing shows its size and mtime. For a file that we wrote this proves nothing: others may
+  have replaced it before any listing told its time.
 - It is if that was proven (by an open reply or a listing) less than `dir_timeout` ago, and no later listing
   contradicts. Then the vehicle is not asked.
 - Else the file is opened on the vehicle, and a new version starts with the size in the reply: equal sizes
@@ -269,7 +270,7 @@ class Files:
         """Compare a version with a listing that began after its file was opened on the vehicle."""
         path = version.path
         try:
-            directory = await self._directories.ask(split(path)[0], began=version.opened_at)
+            directory = await self._directories.ask(split(path)[0], not_before=version.opened_at)
         except (NotFound, NotADirectory):
             self.kill(version)
             return
@@ -295,7 +296,7 @@ class Files:
                 version.mtime = entry.mtime
 
     def on_listed(self, path: bytes, directory: Directory) -> None:
-        """Compare the open versions of a directory with any new listing of it."""
+        """Compare the open versions of a directory with a new listing that began after their last proof."""
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and not version.replaced

@@ -1,8 +1,8 @@
 """Versions of remote files: what is known of them, their bytes, and the budget of all. Layer: cache.
 
 A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
-one version share its bytes and its remote reader. When another file turns out to have the path, the version
-is REPLACED: its handles get FileChanged, and later opens start a new version.
+one version share its bytes and its remote reader. When another file turns out to have the path, or we
+write it, the version is REPLACED: its handles get FileChanged, and later opens start a new version.
 
 A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
 is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is

@@ -77,7 +77,7 @@ class Engine:
         flow: Flow,
         *,
         op_deadline: float = OP_DEADLINE,
-        on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None,
+        on_unexplained: Callable[[Payload, float], None] = lambda reply, lateness: None,
         on_late: Callable[[Payload, float], None] = lambda reply, sent_at: None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)

@@ -253,8 +253,8 @@ class Connection:
         self.engine.flow.alone = False
         self.scheduler.on_another_client(payload, newcomer=newcomer)
 
-    def _on_unexplained(self, reply: Payload, late: float) -> None:
-        self.scheduler.on_unexplained(reply, late)
+    def _on_unexplained(self, reply: Payload, lateness: float) -> None:
+        self.scheduler.on_unexplained(reply, lateness)
 
     def _on_late(self, reply: Payload, sent_at: float) -> None:
         self.scheduler.on_late(reply, sent_at)

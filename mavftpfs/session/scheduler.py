@@ -426,13 +426,14 @@ class Scheduler:
             self.server.abandon()  # what we read or write would be its file
         self.server.wake()
 
-    def on_unexplained(self, reply: Payload, late: float) -> None:
-        """An answer came that no request of ours explains. An older open that was carried out once more may
+    def on_unexplained(self, reply: Payload, lateness: float) -> None:
+        """An answer came that no request of ours explains. lateness: seconds since its request went out, 0 if
+        that is not known. An older open that was carried out once more may
         have put its file in the place of ours (MAVSDK); all else is no other file's."""
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         other = opens and session is not None and session.seq != reply.seq
-        self.doubt.late.saw(late, self.clock())
+        self.doubt.late.saw(lateness, self.clock())
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
         if other:
             self.server.abandon()
