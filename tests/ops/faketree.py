@@ -34,12 +34,11 @@ class FakeFile:
 
     tree: FakeTree
     content: bytes
-    direct_io: bool = False
-    keep_cache: bool = False
     closed: bool = False
     writable: bool = False
     path: bytes = b""
     made: bool = False
+    direct_io = keep_cache = False
 
     @property
     def size(self) -> int:
@@ -99,8 +98,6 @@ class FakeTree:
     failing: dict[str | tuple[str, bytes], BaseException] = field(default_factory=dict)
     delays: dict[str, float] = field(default_factory=dict)
     short_read: int | None = None
-    direct_io: bool = False
-    keep_cache: bool = False
     opened: list[FakeFile] = field(default_factory=list)
     times: dict[bytes, int] = field(default_factory=dict)
     left: list[bytes] = field(default_factory=list)
@@ -155,7 +152,7 @@ class FakeTree:
         if self.kind_of(path) is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         content = b"" if truncate else self.files[path]
-        file = FakeFile(self, content, self.direct_io, self.keep_cache, writable=write, path=path)
+        file = FakeFile(self, content, writable=write, path=path)
         self.opened.append(file)
         return file
 

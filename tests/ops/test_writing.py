@@ -39,11 +39,12 @@ def attributes(**values: int) -> EntryAttributes:
     return entry
 
 
-async def test_fsync_of_a_read_handle_is_about_the_file() -> None:
+async def test_a_read_handle_cannot_write_and_its_fsync_is_about_the_file() -> None:
     tree = some_tree()
     ops = operations(tree)
     info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
     await ops.fsync(info.fh, True)
+    assert await failure(ops.write(info.fh, 0, b"x")) == errno.EBADF
     tree.error = NoSpace("the card is full")
     await ops.flush(info.fh)
     assert await failure(ops.fsync(info.fh, False)) == errno.ENOSPC

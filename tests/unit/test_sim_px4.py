@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import CLIENT, DIR, FIVE, OTHER, A, Client, ack, nak
+from tests.support.sim_client import DIR, FIVE, OTHER, A, Client, ack, nak
 
 
 def client(profile: str = "px4", tree: MemoryTree | None = None, **changes: Any) -> Client:
@@ -47,16 +47,6 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     assert {p.opcode for p in packets} == {Opcode.ACK}
     assert c.server.open_sessions == 0
     assert c.now - sent_at > 10
-
-
-def test_of_2026_an_open_takes_the_place_of_another_clients_file() -> None:
-    c = client("px4-2026")
-    c.open(A)
-    c.source = OTHER
-    assert ack(c.ask(Opcode.OPEN_FILE_RO, FIVE))
-    c.source = CLIENT
-    assert ack(c.ask(Opcode.READ_FILE, size=10)) == b"\x05"
-    assert c.server.open_sessions == 1
 
 
 def test_of_2026_an_answer_is_repeated_for_the_client_that_asked_only() -> None:
