@@ -53,9 +53,9 @@ def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Fiel
     assert "log.bin" in listed
     (facts,) = json.loads(command("hub", "--json", source)[0])
     assert len({tuple(client["address"]) for client in facts["clients"]}) == 2
-    heard = one.status()["link"]["received_bytes"]
-    assert reads_right(two, cards[1])
-    assert one.status()["link"]["received_bytes"] - heard < len(CONTENT) / 2, "not what others get"
+    heard = two.status()["link"]["received_bytes"]
+    assert reads_right(one, cards[0])
+    assert two.status()["link"]["received_bytes"] - heard < len(CONTENT) / 2, "not what others get"
     for mount, root in ((one, cards[0]), (two, cards[1])):
         assert reads_right(mount, root)
         mount.run("cp", root / "log.bin", mount.path / "copy.bin")
