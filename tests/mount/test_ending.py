@@ -147,15 +147,6 @@ def test_a_mount_that_the_kernel_aborted_is_gone(field: Field, big_tree: Path) -
         assert not mounted_at(mount.path)
 
 
-def test_a_busy_mount_refuses_umount_and_goes_on(field: Field, big_tree: Path) -> None:
-    mount = field.mount(field.sim(big_tree).source)
-    with mount.started("sleep", "600", cwd=mount.path):
-        refusal = mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path, code=None)
-        assert refusal.returncode == 3
-        assert "in use" in refusal.stderr
-        assert mount.run("cat", mount.path / "dir3/small.txt").stdout == "small 3\n"
-
-
 @pytest.mark.holds("promise 5", "fault reboot")
 def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
     card = field.local("card")

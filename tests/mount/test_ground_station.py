@@ -104,13 +104,11 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
     root, port = flown_card(field), free_udp_port()
     rate = ["--rate", "5760"] if kind == "pty" else []
     link = "pty" if kind == "pty" else f"udpout:{HOST}:{free_udp_port()}"
-    station = Station(field, port, "/log.bin")
+    station = Station(field, port)
     flown = Flown(field, root, link, *rate)
     mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
     work_on(mount, root, station)
-    results = station.results()
-    assert results["parameters"] == PARAMETERS
-    assert bytes.fromhex(results["file"]) in (b"", CONTENT), "the vehicle has one session for both"
+    assert station.results()["parameters"] == PARAMETERS
     assert mount.unmount() == 0
     assert flown.stop() == 0
     heard = recorded(station.record, "<")

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -311,24 +310,6 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path) -> None:
     assert "a mount has this vehicle now" in out
     (home,) = (path for path in local.iterdir() if path.is_dir())
     assert filecmp.cmpfiles(card, home, ["1.BIN", "2.BIN"], shallow=False) == (["1.BIN", "2.BIN"], [], [])
-
-
-@pytest.mark.holds("promise 9")
-def test_a_transfer_by_a_mount_lets_go(field: Field, tmp_path: Path) -> None:
-    root, local = field.local("card"), tmp_path / "logs"
-    vehicle = field.counted_sim(root, "px4")
-    write_log(root / "fs/microsd/log/1.ulg", 400_000, 1, 1)
-    mount = field.mount(vehicle.source, "bwlimit=10000")
-    watch = watching(field, mount.path, local)
-    wait_until("some of the log came", lambda: any(part.stat().st_size for part in local.rglob("*.part")))
-    vehicle.do(vehicle.vehicle.arm)
-    wait_until("that is noticed", lambda: "the transfer waits" in watch.text())
-    wait_until("its session is closed", lambda: not vehicle.sessions())
-    asked = vehicle.asked()
-    time.sleep(2.0)
-    assert vehicle.asked() == asked
-    assert watch.stop() == 0
-    assert watch.text().count("is armed") == 1
 
 
 def test_what_goes_with_watch_only_is_said(tmp_path: Path) -> None:

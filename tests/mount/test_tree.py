@@ -15,7 +15,7 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
 from tests.support.takingturns import taking_turns
-from tests.support.trees import COMPARE, SMALL_SIZES, build_tree, differing
+from tests.support.trees import COMPARE, differing
 from tests.support.vehicles import UdpVehicle
 
 BAD_LINK = ("--seed", "7", "--loss", "0.05", "--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.01")
@@ -23,9 +23,6 @@ VEHICLES = taking_turns(
     (*PROFILES, "mavsdk-server", "mavsdk-server-bad-link"), soak=("px4-nuttx", "mavsdk", "mavsdk-server")
 )
 """The library's own server says more about MAVSDK than a simulated one."""
-
-QUICK = ("px4", "px4-nuttx", "px4-2026", "spec", "mavsdk-server")
-"""Servers and links over which ten tools can read a megabyte, and hundreds of files."""
 
 DD_STEPS = ((1, 100, 37), (238, 5, 3), (241, 7, 11), (4097, 3, 2), (65537, 2, 1))
 """(block size, skip, count): none is a multiple of a chunk or a page."""
@@ -44,23 +41,16 @@ class Scene:
         return self.mount.path
 
 
-@pytest.fixture(scope="module")
-def short_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The reference tree without its largest files, and with fewer of them."""
-    return build_tree(tmp_path_factory.mktemp("short"), sizes=(*SMALL_SIZES, 131073), many=60)
-
-
 @pytest.fixture(scope="module", params=VEHICLES)
-def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path, short_tree: Path) -> Scene:
+def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path) -> Scene:
     """The reference tree, mounted from the vehicle that the parameter names."""
     kind: str = request.param
     vehicle: UdpVehicle
-    expected = tree if kind in QUICK else short_tree
     if kind.startswith("mavsdk-server"):
-        vehicle = module_field.mavsdk(expected, BAD_LINK if kind.endswith("bad-link") else ())
+        vehicle = module_field.mavsdk(tree, BAD_LINK if kind.endswith("bad-link") else ())
     else:
-        vehicle = module_field.sim(expected, kind)
-    return Scene(expected, module_field.mount(vehicle.source, "ro"))
+        vehicle = module_field.sim(tree, kind)
+    return Scene(tree, module_field.mount(vehicle.source, "ro"))
 
 
 def bytes_of(*argv: str | Path) -> bytes:

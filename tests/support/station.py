@@ -1,6 +1,6 @@
-"""pymavlink as a ground station, in a process of its own: parameters, its own FTP client.
+"""pymavlink as a ground station, in a process of its own: it downloads the parameters.
 
-    python -m tests.support.station PORT REMOTE --record FILE [--key HEX]
+    python -m tests.support.station PORT --record FILE [--key HEX]
 
 Listens on the loopback, and prints a line of JSON on what it got; --record: each frame that came in or went
 out, as `tests.support.flown` writes it.
@@ -11,15 +11,12 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from pymavlink.mavftp import MAVFTP
 
 from mavftpfs.link.frames import Splitter
 
@@ -76,21 +73,10 @@ def parameters(station: RecordedStation) -> dict[str, float]:
     return dict(found.values())
 
 
-def fetch(station: RecordedStation, remote: str) -> str:
-    """Fetch a file by pymavlink's own client; return it in hex."""
-    with tempfile.TemporaryDirectory() as folder:
-        local = Path(folder) / "file"
-        ftp = MAVFTP(station, *VEHICLE)
-        ftp.cmd_get([remote, str(local)])
-        ftp.process_ftp_reply("OpenFileRO", timeout=PATIENCE)
-        return local.read_bytes().hex() if local.exists() else ""
-
-
 def main() -> int:
     """Work as the arguments say."""
     parser = argparse.ArgumentParser()
     parser.add_argument("port", type=int)
-    parser.add_argument("remote", nargs="?")
     parser.add_argument("--record", type=Path, required=True)
     parser.add_argument("--key", type=bytes.fromhex)
     args = parser.parse_args()
@@ -103,13 +89,11 @@ def main() -> int:
     beating = threading.Thread(target=beat, args=(station, stop))
     if args.key is None:
         beating.start()
-    facts: dict[str, Any] = {"parameters": parameters(station)}
-    if args.remote:
-        facts["file"] = fetch(station, args.remote)
+    found = parameters(station)
     stop.set()
     if args.key is None:
         beating.join()
-    print(json.dumps(facts), flush=True)
+    print(json.dumps({"parameters": found}), flush=True)
     return 0
 
 

@@ -11,9 +11,9 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-AWKWARD_SIZES = (0, 1, 238, 239, 240, 478, 35850, 40152, 119500, 131073, 1_000_000)
+AWKWARD_SIZES = (0, 1, 238, 239, 240, 478, 35850, 40152, 119500, 131073)
 """Around one chunk (239), exact bursts of MAVSDK (150 * 239), PX4 (168 * 239) and ArduPilot (500 * 239),
-one byte more than a kernel read, and a megabyte."""
+and one byte more than a kernel read."""
 
 SMALL_SIZES = tuple(size for size in AWKWARD_SIZES if size <= 40152)
 
@@ -29,7 +29,7 @@ NAMES = (
 )
 """Names that a shell, a URL or a decoder may trip over; none differs from another by case alone."""
 
-MANY = 300
+MANY = 60
 DEPTH = 12
 
 
