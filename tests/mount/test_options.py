@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, mounted_at, processes_in, wait_until
+from tests.support.mounts import Mount, abort_mount, install_programs, mounted_at, processes_in, wait_until
 
 
 def mount_line(path: Path) -> list[str]:
@@ -117,12 +116,7 @@ umount "$3"
 
 
 def test_mount_8_by_both_types_and_umount_8(field: Field, small_tree: Path, tmp_path: Path) -> None:
-    for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
-        program = tmp_path / name
-        program.write_text(
-            f"#!{sys.executable}\nimport sys\nfrom mavftpfs.cli import main\nsys.exit(main.{function}())\n"
-        )
-        program.chmod(0o755)
+    install_programs(tmp_path)
     mount = field.prepare(field.sim(small_tree).source)
     places = (tmp_path, mount.source, mount.path, small_tree)
     done = mount.run("unshare", "--mount", "sh", "-c", MOUNT_8, "sh", *places, code=None)

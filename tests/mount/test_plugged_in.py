@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ import pytest
 import mavftpfs
 from mavftpfs.cli import install
 from tests.mount.conftest import Field
-from tests.support.mounts import abort_mount, mounted_at, wait_until
+from tests.support.mounts import abort_mount, install_programs, mounted_at, wait_until
 from tests.support.vehicles import PROJECT
 
 
@@ -39,10 +38,7 @@ def run(*words: str) -> None:
 def test_the_unit_mounts_and_unmounts(field: Field, tiny_tree: Path, tmp_path: Path) -> None:
     vehicle = field.sim(tiny_tree, link="pty")
     device = vehicle.source.partition(",")[0].removeprefix("/dev/")
-    program = tmp_path / "mavftpfs"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mavftpfs "$@"\n')
-    program.chmod(0o755)
-    unit = install._unit(program, "mavftpfs@.service")
+    unit = install._unit(install_programs(tmp_path), "mavftpfs@.service")
     mountpoint = tmp_path / f"drone-{device.replace('/', '-')}"
 
     def take(key: str) -> None:
@@ -86,13 +82,7 @@ class Installation:
         self.copy, self.packages, self.programs = folder / "copy", folder / "library", folder / "bin"
         shutil.copytree(PROJECT / "mavftpfs", self.packages / "mavftpfs")
         self.programs.mkdir()
-        for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
-            program = self.programs / name
-            program.write_text(
-                f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(self.packages)!r})\n"
-                f"from mavftpfs.cli import main\nsys.exit(main.{function}())\n"
-            )
-            program.chmod(0o755)
+        install_programs(self.programs, self.packages)
 
     def run(self, *steps: str, code: int = 0) -> dict[str, list[str]]:
         """Run the steps of a script; return what its lines say, by their first words."""

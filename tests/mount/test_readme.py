@@ -6,14 +6,13 @@ import json
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import COMMAND_TIMEOUT, abort_mount, mounted_at
+from tests.support.mounts import COMMAND_TIMEOUT, abort_mount, install_programs, mounted_at
 from tests.support.vehicles import HOST, PROJECT
 
 README = (PROJECT / "README.md").read_text()
@@ -52,8 +51,7 @@ class Home:
         (self.card / "APM/scripts").mkdir(parents=True)
         (self.card / "APM/scripts/hover.lua").write_text("return 1\n")
         (path / "params.txt").write_text("param set COM_DISARM_LAND 2\n")
-        (path / "mavftpfs").write_text(f'#!/bin/sh\nexec {sys.executable} -m mavftpfs "$@"\n')
-        (path / "mavftpfs").chmod(0o755)
+        install_programs(path)
 
     def run(self, line: str) -> str:
         """Run a line of README in a shell and return its output; it must succeed."""

@@ -82,6 +82,18 @@ def command(*words: object, code: int = 0) -> tuple[str, str]:
     return said, complained
 
 
+def install_programs(folder: Path, library: Path = PROJECT) -> Path:
+    """Make the two programs of an installation; return the first. library: where their package is."""
+    for name, function in (("mount.mavftpfs", "mount_helper"), ("mavftpfs", "main")):
+        program = folder / name
+        program.write_text(
+            f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(library)!r})\n"
+            f"from mavftpfs.cli import main\nsys.exit(main.{function}())\n"
+        )
+        program.chmod(0o755)
+    return program
+
+
 def _hung(*_: object) -> NoReturn:
     raise AssertionError("the command hung")
 
