@@ -104,13 +104,17 @@ def fleet(field: Field) -> Fleet:
     return Fleet(field)
 
 
-def mount_all(fleet: Fleet, *options: str) -> Mounts:
+def mount_all(fleet: Fleet, *systems: int) -> Mounts:
+    """Launch these vehicles and mount all; returns once they are mounted."""
+    for system in systems:
+        fleet.launch(system)
     folder = fleet.field.local("mount")
     path = folder / "mnt"
     path.mkdir()
-    mounts = Mounts(fleet.source, path, folder, ("all", *options))
+    mounts = Mounts(fleet.source, path, folder, ("all",))
     fleet.field._stack.callback(mounts.finish)
     mounts.start()
+    mounts.await_up(*map(str, systems))
     return mounts
 
 
@@ -172,23 +176,8 @@ def test_before_the_first_heartbeat_nothing_reads_as_empty(fleet: Fleet) -> None
     assert mounts.unmount() == 0
 
 
-def test_what_was_heard_stays_and_is_not_empty_when_it_is_lost(fleet: Fleet) -> None:
-    fleet.launch(1)
-    mounts = mount_all(fleet, "op_deadline=2")
-    mounts.await_up("1")
-    fleet.vehicles[1].kill()
-    os.kill(mounts.pids()["1"], signal.SIGKILL)
-    wait_until("its mount is gone", lambda: mounts.states()["1"] in ("failed", "starting"))
-    wait_until("it is taken away", lambda: not mounted_at(mounts.path / "1"))
-    assert mounts.run("ls", mounts.path).stdout.split() == ["1"]
-    assert mounts.errno_of("os.listdir(sys.argv[1])", mounts.path / "1") == "EAGAIN"
-
-
 def test_a_killed_mount_of_one_comes_back_and_the_others_go_on(fleet: Fleet) -> None:
-    for system in PROFILES:
-        fleet.launch(system)
-    mounts = mount_all(fleet)
-    mounts.await_up("1", "2", "3")
+    mounts = mount_all(fleet, *PROFILES)
     before = mounts.pids()
     fleet.vehicles[2].left_alone = True
     os.kill(before["2"], signal.SIGKILL)
@@ -197,13 +186,16 @@ def test_a_killed_mount_of_one_comes_back_and_the_others_go_on(fleet: Fleet) -> 
     mounts.await_up("2")
     assert mounts.read_bytes(mounts.path / "2/log/1.bin") == (fleet.cards[2] / "log/1.bin").read_bytes()
     assert mounts.pids()["1"] == before["1"]
+    fleet.vehicles[3].kill()
+    os.kill(before["3"], signal.SIGKILL)
+    wait_until("its mount is gone", lambda: mounts.states()["3"] in ("failed", "starting"))
+    wait_until("it is taken away", lambda: not mounted_at(mounts.path / "3"))
+    assert sorted(mounts.run("ls", mounts.path).stdout.split()) == ["1", "2", "3"]
+    assert mounts.errno_of("os.listdir(sys.argv[1])", mounts.path / "3") == "EAGAIN", "it is not empty"
 
 
 def test_a_killed_supervisor_leaves_the_mounts_and_loses_nothing(fleet: Fleet) -> None:
-    for system in (1, 2):
-        fleet.launch(system)
-    mounts = mount_all(fleet)
-    mounts.await_up("1", "2")
+    mounts = mount_all(fleet, 1, 2)
     mounts.alive().kill()
     for system in (1, 2):
         log = f"{system}/log/2.bin"
@@ -219,7 +211,6 @@ def test_a_killed_supervisor_leaves_the_mounts_and_loses_nothing(fleet: Fleet) -
 
 
 def test_a_component_is_looked_for_when_it_is_named(field: Field, fleet: Fleet) -> None:
-    fleet.launch(1)
     card = field.local("camera")
     (card / "photo.jpg").write_bytes(b"photo" * 1000)
     record = field.local("record") / "frames"
@@ -227,8 +218,7 @@ def test_a_component_is_looked_for_when_it_is_named(field: Field, fleet: Fleet) 
     argv = ["tests.support.flown", str(card), "--record", str(record), *words]
     camera = Program("camera", [*argv, "--telemetry", "500"], field.local("output"))
     try:
-        mounts = mount_all(fleet)
-        mounts.await_up("1")
+        mounts = mount_all(fleet, 1)
         assert mounts.errno_of("os.stat(sys.argv[1])", mounts.path / "1-77") == "ENOENT"
         assert mounts.errno_of("os.stat(sys.argv[1])", mounts.path / "log") == "ENOENT"
         mounts.run("stat", mounts.path / "1-100")
@@ -241,9 +231,7 @@ def test_a_component_is_looked_for_when_it_is_named(field: Field, fleet: Fleet) 
 
 
 def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
-    fleet.launch(1)
-    mounts = mount_all(fleet)
-    mounts.await_up("1")
+    mounts = mount_all(fleet, 1)
     assert "0.bin" in command("ls", mounts.path, "/log")[0], "there is only one"
     fleet.launch(2)
     mounts.await_up("1", "2")
@@ -262,13 +250,16 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
     assert len(json.loads(command("status", "--json", mounts.path)[0])["vehicles"]) == 2
     lines = command("status", mounts.path)[0].splitlines()
     assert lines[0] == f"{mounts.path}: 2 vehicles of {fleet.source}"
+    with Beating(fleet.port, (Address(1, 1), 2, 12)):
+        wait_until("a second one is known", lambda: bool(mounts.facts()["vehicles"][0]["link"]["second"]))
+        for words in (("status", mounts.path), ("scan", fleet.source), ("hub", fleet.source)):
+            assert "a second vehicle" in command(*words)[0]
+        assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
+    assert "give each a system id of its own" in mounts.alive().text()
 
 
 def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Fleet) -> None:
-    for system in (1, 2):
-        fleet.launch(system)
-    mounts = mount_all(fleet)
-    mounts.await_up("1", "2")
+    mounts = mount_all(fleet, 1, 2)
     nothing_can_be_made_beside_the_vehicles(mounts)
     with mounts.started("sleep", "100", cwd=mounts.path / "1") as holder:
         said = command("umount", mounts.path, code=3)[1]
@@ -296,18 +287,6 @@ def nothing_can_be_made_beside_the_vehicles(mounts: Mounts) -> None:
     ):
         assert mounts.errno_of(code, mounts.path) in ("EROFS", "EBUSY")
     assert mounts.run("df", mounts.path).stdout
-
-
-def test_two_vehicles_with_one_id_are_said(fleet: Fleet) -> None:
-    fleet.launch(1)
-    mounts = mount_all(fleet)
-    mounts.await_up("1")
-    with Beating(fleet.port, (Address(1, 1), 2, 12)):
-        wait_until("it is known", lambda: bool(mounts.facts()["vehicles"][0]["link"]["second"]))
-        for words in (("status", mounts.path), ("scan", fleet.source), ("hub", fleet.source)):
-            assert "a second vehicle" in command(*words)[0]
-        assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
-    assert "give each a system id of its own" in mounts.alive().text()
 
 
 def test_all_and_a_target_exclude_each_other(fleet: Fleet) -> None:

@@ -24,9 +24,6 @@ VEHICLES = taking_turns(
 )
 """The library's own server says more about MAVSDK than a simulated one."""
 
-DD_STEPS = ((1, 100, 37), (238, 5, 3), (241, 7, 11), (4097, 3, 2), (65537, 2, 1))
-"""(block size, skip, count): none is a multiple of a chunk or a page."""
-
 
 @dataclass
 class Scene:
@@ -61,14 +58,6 @@ def bytes_of(*argv: str | Path) -> bytes:
 @pytest.mark.holds("promise 1", "rule 14.32", "rule 14.36")
 def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
     scene.mount.run(*COMPARE, scene.expected, scene.path, timeout=240)
-
-
-def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path) -> None:
-    for block, skip, count in DD_STEPS:
-        numbers = (f"bs={block}", f"skip={skip}", f"count={count}", "status=none")
-        name, copy = "sizes/131073.bin", tmp_path / "piece"
-        scene.mount.run("dd", f"if={scene.path / name}", f"of={copy}", *numbers)
-        assert copy.read_bytes() == bytes_of("dd", f"if={scene.expected / name}", *numbers)
 
 
 def test_find_and_ls_and_du_agree_with_the_disk(scene: Scene) -> None:

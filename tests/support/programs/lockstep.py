@@ -200,8 +200,7 @@ class Side:
     def on_rename(self, old: str, new: str) -> None:
         os.rename(self.place(old), self.place(new))
 
-    def on_move(self, old: str, new: str) -> None:
-        os.rename(self.place(old), self.place(new))
+    on_move = on_rename
 
     def on_unlink(self, path: str) -> None:
         os.unlink(self.place(path))
