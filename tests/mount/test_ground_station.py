@@ -28,13 +28,15 @@ STATION = Address(255, 190)
 
 
 class Flown(Program):
-    """A vehicle that a ground station can fly. record: each frame on its link."""
+    """A vehicle that a ground station can fly, with a log on its card. record: each frame on its link."""
 
-    def __init__(self, field: Field, root: Path, link: str, *options: str) -> None:
-        folder = field.local("vehicle")
+    def __init__(self, field: Field, *options: str, link: str = "") -> None:
+        folder, self.root = field.local("vehicle"), field.local("card")
+        (self.root / "log.bin").write_bytes(CONTENT)
         self.record = folder / "frames"
+        link = link or f"udpout:{HOST}:{free_udp_port()}"
         words = ["--link", link, "--record", str(self.record), "--telemetry", "1000", *options]
-        argv = ["tests.support.flown", str(root), *words]
+        argv = ["tests.support.flown", str(self.root), *words]
         super().__init__("flown", argv, folder)
         field.own(self)
         wait_until("the vehicle speaks", lambda: bool(self.output.read_text()))
@@ -73,18 +75,12 @@ def assert_passed_on(sent: list[Frame], got: list[Frame], least: int) -> None:
     assert [frame.data for frame in got] == expected
 
 
-def flown_card(field: Field) -> Path:
-    root = field.local("card")
-    (root / "log.bin").write_bytes(CONTENT)
-    return root
-
-
 def forwarded(port: int) -> str:
     return f"forward=udpout:{HOST}:{port}"
 
 
-def work_on(mount: Mount, root: Path, station: Process) -> int:
-    """Copy files to and from the vehicle as long as a station works; return how often."""
+def work_on(mount: Mount, root: Path, station: Process) -> None:
+    """Copy files to and from the vehicle as long as a station works."""
     turns = 0
     while station.running or turns == 0:
         turns += 1
@@ -96,18 +92,15 @@ def work_on(mount: Mount, root: Path, station: Process) -> int:
         mount.run("cp", mount.folder / "up", mount.path / f"up{turns}")
         assert (root / f"up{turns}").read_bytes() == data
         (root / "log.bin").touch()  # so that it is read anew
-    return turns
 
 
 @pytest.mark.parametrize("kind", ["pty", "udp"])
 def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field: Field, kind: str) -> None:
-    root, port = flown_card(field), free_udp_port()
-    rate = ["--rate", "5760"] if kind == "pty" else []
-    link = "pty" if kind == "pty" else f"udpout:{HOST}:{free_udp_port()}"
+    port = free_udp_port()
     station = Station(field, port)
-    flown = Flown(field, root, link, *rate)
+    flown = Flown(field, "--rate", "5760", link="pty") if kind == "pty" else Flown(field)
     mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
-    work_on(mount, root, station)
+    work_on(mount, flown.root, station)
     assert station.results()["parameters"] == PARAMETERS
     assert mount.unmount() == 0
     assert flown.stop() == 0
@@ -121,15 +114,15 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
 
 
 def test_signed_frames_pass_unchanged(field: Field) -> None:
-    root, port = flown_card(field), free_udp_port()
+    port = free_udp_port()
     key = field.local("key") / "key"
     key.write_bytes(KEY)
     key.chmod(0o600)
     station = Station(field, port, "--key", KEY.hex())
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--key", KEY.hex())
+    flown = Flown(field, "--key", KEY.hex())
     mount = field.mount(flown.source, forwarded(port), f"signing_key={key}", "dir_timeout=0")
     second = field.mount(flown.source, f"signing_key={key}", "dir_timeout=0")
-    work_on(mount, root, station)
+    work_on(mount, flown.root, station)
     assert station.results()["parameters"] == PARAMETERS
     assert second.read_bytes(second.path / "log.bin") == CONTENT
     assert [one.unmount() for one in (mount, second)] == [0, 0]
@@ -162,19 +155,8 @@ class Pest(Neighbour):
                 time.sleep(0.002)  # about 2500 a second
 
 
-def harms_nothing(field: Field, mount: Mount, root: Path) -> None:
-    """Check that files go both ways."""
-    for turn in range(3):
-        local = mount.folder / f"copy{turn}"
-        mount.run("cp", mount.path / "log.bin", local)
-        assert local.read_bytes() == CONTENT
-        mount.run("cp", local, mount.path / f"up{turn}")
-        assert (root / f"up{turn}").read_bytes() == CONTENT
-        (root / "log.bin").touch()
-
-
 def test_endpoints_that_flood_harm_nobody(field: Field) -> None:
-    root, other = flown_card(field), free_udp_port()
+    other = free_udp_port()
     station = Framer(STATION, stream=False)
     floods = [
         station.encode("attitude", 1, 0.1, 0.2, 0.3, 0, 0, 0),
@@ -184,22 +166,22 @@ def test_endpoints_that_flood_harm_nobody(field: Field) -> None:
     ]
     ports = [free_udp_port() for _ in floods]
     work = Station(field, other)
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    flown = Flown(field)
     with ExitStack() as stack:
         pests = [stack.enter_context(Pest(*pest)) for pest in zip(ports, floods, strict=True)]
         mount = field.mount(flown.source, *map(forwarded, [*ports, other]), "dir_timeout=0")
-        harms_nothing(field, mount, root)
+        work_on(mount, flown.root, work)
         assert work.results()["parameters"] == PARAMETERS
         assert all(pest.sent > 1000 for pest in pests)
 
 
 def test_two_stations_with_one_id_both_work(field: Field) -> None:
-    root, ports = flown_card(field), [free_udp_port(), free_udp_port()]
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    ports = [free_udp_port(), free_udp_port()]
+    flown = Flown(field)
     stations = [Station(field, port) for port in ports]
     mount = field.mount(flown.source, *map(forwarded, ports), "dir_timeout=0")
-    harms_nothing(field, mount, root)
     for station in stations:
+        work_on(mount, flown.root, station)
         assert station.results()["parameters"] == PARAMETERS
 
 
@@ -230,8 +212,8 @@ class Listener(Neighbour):
 
 @pytest.mark.parametrize("way", ["umount", "kill"])
 def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) -> None:
-    root, port = flown_card(field), free_udp_port()
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}", "--armed")
+    port = free_udp_port()
+    flown = Flown(field, "--armed")
     with Listener(port) as listener:
         mount = field.mount(flown.source, forwarded(port))
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 2)
@@ -259,8 +241,8 @@ def test_in_flight_the_stations_link_outlives_the_mount(field: Field, way: str) 
 
 
 def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
-    root, port = flown_card(field), free_udp_port()
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    port = free_udp_port()
+    flown = Flown(field)
     with Listener(port) as listener:
         mount = field.mount(flown.source, forwarded(port))
         wait_until("the station hears the vehicle", lambda: len(listener.beats) > 1)
@@ -272,8 +254,7 @@ def test_on_the_ground_the_hub_ends_with_the_mount(field: Field) -> None:
 
 
 def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
-    root = flown_card(field)
-    flown = Flown(field, root, f"udpout:{HOST}:{free_udp_port()}")
+    flown = Flown(field)
     place = field.local("place")
     taken = free_udp_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
