@@ -23,7 +23,6 @@ from tests.support.vehicles import PROJECT
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
-SLOW = ("--rate", "60000")
 
 
 def logged(mount: Mount, text: str) -> None:
@@ -31,27 +30,19 @@ def logged(mount: Mount, text: str) -> None:
     wait_until(f"{text!r} in the log", lambda: text in mount.alive().text())
 
 
-def news(mount: Mount) -> list[str]:
-    """Return the log's lines about the vehicle, without durations."""
-    lines = mount.alive().text().splitlines()
-    return [re.sub(r" (for|after) [0-9].*", r" \1 TIME", line) for line in lines if "vehicle" in line]
-
-
 def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     mount = field.mount(vehicle.source)
-    vehicle.react(signal.SIGUSR1)
-    logged(mount, "is armed")
-    vehicle.react(signal.SIGUSR1)
-    logged(mount, "1/1 is disarmed")
-    vehicle.react(signal.SIGUSR2)
-    logged(mount, "is lost")
+    arm, cut, reboot = signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR
+    for number, text in ((arm, "is armed"), (arm, "1/1 is disarmed"), (cut, "is lost")):
+        vehicle.react(number)
+        logged(mount, text)
     assert ": PX4 1/1, disarmed, LOST: last heard " in command("status", mount.path)[0]
-    vehicle.react(signal.SIGUSR2)
-    logged(mount, "is back")
-    vehicle.react(signal.SIGPWR)
-    logged(mount, "restarted")
-    assert news(mount) == [
+    for number, text in ((cut, "is back"), (reboot, "restarted")):
+        vehicle.react(number)
+        logged(mount, text)
+    lines = [line for line in mount.alive().text().splitlines() if "vehicle" in line]
+    assert [re.sub(r" (for|after) [0-9].*", r" \1 TIME", line) for line in lines] == [
         "mavftpfs: vehicle 1/1 is armed: nothing is written to it until it is disarmed",
         "mavftpfs: vehicle 1/1 is disarmed",
         "mavftpfs: vehicle 1/1 is lost: no heartbeat for TIME",
@@ -68,7 +59,7 @@ def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
     name = "log/2026-11-20-with-a-rather-long-name-for-a-folder/10_32_15.ulg"
     (card / name).parent.mkdir(parents=True)
     (card / name).write_bytes(os.urandom(3_000_000))
-    mount = field.mount(field.sim(card, options=SLOW).source)
+    mount = field.mount(field.sim(card, options=("--rate", "60000")).source)
     with mount.started("cat", mount.path / name):
         wait_until("it is read", lambda: mount.bytes_read() > 0)
         screen = terminal.mavftpfs("status", "--watch", mount.path)
