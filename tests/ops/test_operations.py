@@ -277,14 +277,16 @@ async def test_every_handler_ends_in_time(name: str, autojump_clock: trio.testin
     ops.inodes.check_invariants()
 
 
-async def test_a_big_read_on_a_slow_radio_gets_the_time_it_needs(
+@pytest.mark.holds("promise 2")
+async def test_a_checksum_and_a_big_read_on_a_slow_radio_get_the_time_they_need(
     autojump_clock: trio.testing.MockClock,
 ) -> None:
     """128 KiB at 1.2 kB/s are 110 s; that the link makes progress is the tree's to judge."""
     tree = FakeTree({b"/a.txt": bytes(131072)})
-    ops, _, fh = await prepared(tree)
-    tree.delays = {"read": 110.0}
+    ops, ino, fh = await prepared(tree)
+    tree.delays = {"read": 110.0, "crc32": 119.0}
     assert len(await ops.read(fh, 0, 131072)) == 131072
+    assert len(await ops.getxattr(ino, XATTR_CRC32, CTX)) == 8
     tree.delays = {"read": 10_000.0}
     assert await failure(ops.read(fh, 0, 131072)) == errno.ETIMEDOUT
 
@@ -315,14 +317,6 @@ async def test_the_kernel_s_reads_ahead_end_with_the_program_that_closed_a_descr
         expected = sorted([(began + (5.0 if errno_then else 20.0), errno_then), (began + 20.0, 0)])
         assert sorted(ends) == expected
         ends.clear()
-
-
-@pytest.mark.holds("promise 2")
-async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockClock) -> None:
-    tree = some_tree()
-    ops, ino, _ = await prepared(tree)
-    tree.delays = {"crc32": 119.0}
-    assert len(await ops.getxattr(ino, XATTR_CRC32, CTX)) == 8
 
 
 # -- the directory of several vehicles -----------------------------------------------------------------
