@@ -69,17 +69,14 @@ class Client:
 
     def receive(self, seconds: float = 1.0) -> list[Payload]:
         """Let time pass and return the replies of that time."""
-        return [decode_reply(wire) for wire in self.receive_raw(seconds)]
-
-    def receive_raw(self, seconds: float = 1.0) -> list[bytes]:
-        """Let time pass and return the wire bytes of the replies."""
         stop = self.now + seconds
         wires: list[bytes] = []
         while (due := self.server.next_deadline()) is not None and due <= stop:
             self.now = max(self.now, due)
             wires += [wire for _, wire in self.server.outgoing(self.now)]
         self.now = stop
-        return wires + [wire for _, wire in self.server.outgoing(stop)]
+        wires += [wire for _, wire in self.server.outgoing(stop)]
+        return [decode_reply(wire) for wire in wires]
 
     def ask(self, opcode: int, data: bytes = b"", *, wait: float = 0.05, **fields: Any) -> Payload:
         """Send a request and return its one reply."""
@@ -97,10 +94,6 @@ class Client:
         reply = self.ask(opcode, path, session=session)
         assert reply.opcode == Opcode.ACK, reply
         return reply
-
-    def listing(self, path: bytes, offset: int = 0, opcode: int = Opcode.LIST_DIRECTORY) -> bytes:
-        """Return one page of a listing."""
-        return self.ask(opcode, path, offset=offset).data
 
 
 def nak(reply: Payload) -> bytes:
