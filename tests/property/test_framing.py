@@ -70,19 +70,6 @@ def test_fast_decoding_of_several_is_pymavlinks(
         assert singly(out) == wanted
 
 
-@given(addresses, addresses, payloads, st.booleans())
-def test_all_ways_in_give_the_same_value(
-    source: Address, target: Address, payload: bytes, signed: bool
-) -> None:
-    value = FtpRun(source, target, [payload])
-    key = KEY if signed else None
-    framer = Framer(Address(9, 9), stream=True, signing_key=key)
-    frame = reference_frame(source, target, payload, key=key)
-    assert feed(framer, frame) == [value]
-    if not signed:
-        assert feed(framer, reference_frame(source, target, payload, old=True)) == [value]
-
-
 @pytest.mark.holds("fault corrupt")
 @given(addresses, payloads, st.integers(0, 265), st.integers(1, 255))
 def test_no_changed_byte_gets_through(target: Address, payload: bytes, at: int, flip: int) -> None:

@@ -18,7 +18,6 @@ from mavftpfs.protocol.payload import (
     PAYLOAD_SIZE,
     Opcode,
     Payload,
-    decode_request,
 )
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError
@@ -47,15 +46,6 @@ PAYLOADS = st.builds(
 
 
 # --- codec, checksum, listings, extents
-
-
-@given(PAYLOADS)
-def test_encode_then_decode(payload: Payload) -> None:
-    payload = payload._replace(size=len(payload.data))
-    wire = payload.encode()
-    assert len(wire) == PAYLOAD_SIZE
-    assert decode_reply(wire) == payload
-    assert decode_request(wire)._replace(data=payload.data) == payload
 
 
 @given(st.binary(max_size=300) | st.binary(min_size=PAYLOAD_SIZE, max_size=PAYLOAD_SIZE))

@@ -169,12 +169,6 @@ def test_a_client_whose_vehicle_was_not_heard_yet_speaks_to_all(net: Net) -> Non
     assert net.sides(hello(CLIENT), MOUNT) == {PORT}
 
 
-def test_clients_of_one_vehicle_see_each_others_sessions(net: Net) -> None:
-    net.router.focus(OTHER, 1)
-    assert net.sides(ftp(CLIENT, ONE), MOUNT) == {PORT, OTHER}
-    assert net.sides(ftp(ONE, CLIENT), PORT, AT_ONE) == {MOUNT, OTHER}
-
-
 def test_a_client_that_wants_only_heartbeats_is_told_those_of_all(net: Net) -> None:
     net.router.focus(OTHER, BEATS)
     assert OTHER not in net.sides(ftp(ONE, EVERYBODY), PORT, AT_ONE)
@@ -194,15 +188,6 @@ def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> 
     assert net.router.senders.doubles() == {}
 
 
-def test_a_vehicle_that_is_back_on_the_port_is_told_to_the_endpoint_that_spoke_for_it(net: Net) -> None:
-    net.now += PATIENCE + 1
-    net.send(attitude(ONE), EAST)
-    assert net.sides(attitude(ONE), PORT, AT_ONE) == set(), "it counts where it was heard last"
-    assert net.send(ftp(FAR, ONE), WEST, AT_WEST) == {TO_EAST, TO_MOUNT}, "and frames for it go there alone"
-    net.now += PATIENCE + 1
-    assert EAST in net.sides(attitude(ONE), PORT, AT_ONE)
-
-
 def test_what_cannot_be_proven_passes_on_its_way_but_teaches_nothing(net: Net) -> None:
     data = bytearray(beat(ONE, armed=True).data)
     data[-1] ^= 1
@@ -217,17 +202,6 @@ def test_what_cannot_be_proven_passes_on_its_way_but_teaches_nothing(net: Net) -
 
 def made_up(number: int) -> Address:
     return Address(10 + number % 240, 1 + number // 240)
-
-
-def test_made_up_senders_of_one_side_crowd_nobody_out(net: Net) -> None:
-    for number in range(3 * MOST_SENDERS):
-        net.send(attitude(made_up(number)), WEST, AT_WEST)
-        net.now += 0.001
-    assert STATION in net.router.senders
-    assert net.send(ftp(ONE, STATION), PORT, AT_ONE) >= {Place(EAST, None)}
-    late = Address(255, 77)
-    net.send(beat(late, autopilot=8), EAST)
-    assert net.send(ftp(ONE, late), PORT, AT_ONE) >= {Place(EAST, None)}
 
 
 @pytest.mark.holds("promise 1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
+from mavftpfs.protocol.url import MftpUrl, parse_url
 from mavftpfs.shared.errors import UsageError
 
 
@@ -62,8 +62,3 @@ def test_errors(text: str, says: str) -> None:
         parse_url(text)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_is_url() -> None:
-    assert is_url("mftp://a")
-    assert not is_url("/mftp://a")
