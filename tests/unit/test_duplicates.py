@@ -119,17 +119,6 @@ def test_two_answers_to_one_of_two_requests() -> None:
     assert engine.stats.unexplained == 1
 
 
-def test_work_may_take_its_time() -> None:
-    engine = make()
-    request = ask(engine, Opcode.CALC_FILE_CRC32, 0.0)
-    assert again(engine, 20.0) == [request]
-    engine.receive(ack(request, bytes(4)), 20.1)
-    engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, 20.2)), 20.3)
-    engine.receive(ack(request, bytes(4)), 35.0)
-    assert engine.stats.unknown
-    assert engine.stats.unexplained == 0
-
-
 def test_little_is_remembered() -> None:
     engine = make()
     request = asked_twice(engine)

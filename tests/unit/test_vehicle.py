@@ -86,6 +86,7 @@ def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
     assert not vehicle.lost(40.0)
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize(
     "story",
     [
@@ -97,6 +98,10 @@ def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
             [(4.0, LANDED, True), (4.1, OURS, False), (8.0, LANDED, False), (8.1, FLIES, True)],
             id="seldom heard, it is disarmed when it tells its id",
         ),
+        pytest.param(
+            [(10.0, LANDED, True), (11.0, FLIES, True), (12.0, OURS, True)],
+            id="but not if it was armed again meanwhile",
+        ),
     ],
 )
 def test_when_a_vehicle_in_flight_counts_as_armed(story: list[tuple[float, Message, bool]]) -> None:
@@ -106,23 +111,6 @@ def test_when_a_vehicle_in_flight_counts_as_armed(story: list[tuple[float, Messa
     for now, message, armed in story:
         vehicle.on_message(message, now)
         assert vehicle.armed is armed, now
-
-
-@pytest.mark.holds("promise 9")
-@pytest.mark.parametrize("beats", [True, False])
-def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beats: bool) -> None:
-    """The target is a component; beats: it sends heartbeats of its own."""
-    target = Address(PILOT.system, 191)
-    vehicle = listener(component=191)
-    ours = version(target)
-    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
-    if beats:
-        vehicle.on_message(heartbeat(target, autopilot=8), 0.0)
-    vehicle.on_message(ours, 0.0)
-    vehicle.on_message(heartbeat(PILOT), 10.0)
-    assert vehicle.armed
-    vehicle.on_message(ours, 10.1)
-    assert not vehicle.armed
 
 
 def test_a_component_cannot_disarm_the_autopilot() -> None:
