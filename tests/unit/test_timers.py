@@ -130,11 +130,6 @@ def test_long_work_does_not_make_small_files_wait() -> None:
     assert timers.wait(work(0.06)) < 0.5
 
 
-def test_without_a_round_trip_known_waits_double_at_once() -> None:
-    timers = Timers()
-    assert [timers.wait(path(sends)) for sends in (1, 2, 3)] == [1.0, 2.0, 3.0]
-
-
 def test_the_round_trip_is_that_of_what_moved_last() -> None:
     """A link may become slow while a program only writes."""
     timers = Timers()

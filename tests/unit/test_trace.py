@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from pymavlink import mavutil
 
+from mavftpfs.client.connect import open_sinks
+from mavftpfs.client.options import Options
 from mavftpfs.client.trace import REPLY, JsonTrace, TlogWriter, text_line
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
@@ -78,8 +80,12 @@ def test_tlog_is_readable_by_pymavlink(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_made_is_the_users_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="No such file or directory"):
-        TlogWriter(tmp_path / "nowhere" / "trace")
+    options = Options(tlog=str(tmp_path / "nowhere" / "tlog"))
+    with (
+        pytest.raises(UsageError, match="No such file or directory"),
+        open_sinks(options, debug=False, tell=print),
+    ):
+        pass
 
 
 def test_a_full_disk_is_said_once_and_breaks_nothing(caplog: pytest.LogCaptureFixture) -> None:

@@ -153,7 +153,9 @@ async def test_stat_open_and_read_agree(here: Rig, tree: Tree) -> None:
     assert await handle.read(0, 4096) == b"SERIAL0 on"
     assert await handle.read(8, 4096) == b"on"
     assert await handle.read(10, 4096) == b""
+    assert await tree.crc32(UARTS) == crc32(SYS[b"uarts.txt"]), "that of what a reader gets"
     assert here.count(OPEN) == 1
+    assert here.count(Opcode.CALC_FILE_CRC32) == 0
     handle.close()
     handle.close()
     with pytest.raises(LocalProtocolError):
@@ -207,33 +209,17 @@ async def test_a_large_file_is_not_read_to_answer_stat(here: Rig, tree: Tree) ->
     assert len(await read_file(tree, path)) == 200_000
 
 
-async def test_a_file_beyond_the_limit_is_an_error_to_open_but_not_to_stat(here: Rig) -> None:
-    tree = here.mount(at_file_limit=5)
-    stat = await tree.stat(UARTS)
-    assert (stat.size, stat.valid_for) == (LIE, 0.0)
-    with pytest.raises(DataUnproven):
-        await tree.open(UARTS)
-    assert b"uarts.txt" in await names(tree, b"/@SYS")
-
-
-async def test_checksum_of_what_a_reader_gets(here: Rig, tree: Tree) -> None:
-    assert await tree.crc32(UARTS) == crc32(SYS[b"uarts.txt"])
-    assert here.count(Opcode.CALC_FILE_CRC32) == 0
-
-
 # --- odd names
 
 
 async def test_absent_names_are_remembered_for_a_while(here: Rig, tree: Tree) -> None:
-    for _ in range(2):
-        with pytest.raises(NotFound):
-            await tree.stat(b"/@PARAM/none")
-    assert here.count(OPEN) == 1
-    assert tree.negative_valid_for(b"/@PARAM/none") == 2.0
-    await trio.sleep(21)
-    with pytest.raises(NotFound):
-        await tree.stat(b"/@PARAM/none")
-    assert here.count(OPEN) == 2
+    for asked in (1, 2):
+        for _ in range(2):
+            with pytest.raises(NotFound):
+                await tree.stat(b"/@PARAM/none")
+        assert here.count(OPEN) == asked
+        assert tree.negative_valid_for(b"/@PARAM/none") == 2.0
+        await trio.sleep(21)
 
 
 async def test_names_that_cannot_be_cost_nothing(here: Rig, tree: Tree) -> None:
@@ -268,14 +254,20 @@ async def test_what_is_listed_but_not_found_is_hidden(here: Rig, tree: Tree) -> 
     assert b"uarts.txt" in await names(tree, b"/@SYS")
 
 
-async def test_other_refusals_do_not_hide(here: Rig, tree: Tree) -> None:
-    here.faults.refuse(OPEN, NakCode.FAIL, times=99)
+@pytest.mark.parametrize(("limit", "error"), [(5, DataUnproven), (1 << 20, FtpNak)])
+async def test_what_cannot_be_read_is_an_error_to_open_but_is_shown(
+    here: Rig, limit: int, error: type[Exception]
+) -> None:
+    """It is too long, or refused."""
+    if error is FtpNak:
+        here.faults.refuse(OPEN, NakCode.FAIL, times=99)
+    tree = here.mount(at_file_limit=limit)
+    stat = await tree.stat(UARTS)
+    assert (stat.size, stat.valid_for) == (LIE, 0.0)
+    with pytest.raises(error):
+        await tree.open(UARTS)
     listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
     assert (listed.size, listed.valid_for) == (LIE, 0.0)
-    assert b"uarts.txt" in await names(tree, b"/@SYS")
-    assert (await tree.stat(UARTS)).size == LIE
-    with pytest.raises(FtpNak):
-        await tree.open(UARTS)
 
 
 # --- slow and lost links
