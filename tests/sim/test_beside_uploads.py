@@ -104,24 +104,6 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str) -> Non
 
 
 @pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str) -> None:
-    here = Rig(profile, FILES, SLOW)
-    data = content(300_000, 4)
-    async with here.mounted(b"/d") as tree:
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(copy, tree, b"big", data)
-            await trio.sleep(10)
-            with trio.fail_after(5):
-                assert await read_file(here.connection, here.root + b"/d/other") == b"q" * 3000
-            with trio.fail_after(10):
-                await copy(tree, b"small", b"b" * 1000)
-        assert here.connection.store.traits.wo_truncates is False, "learnt on the way"
-    assert here.data(b"/d/big") == data
-    assert here.data(b"/d/small") == b"b" * 1000
-
-
-@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""

@@ -166,16 +166,6 @@ async def test_a_session_that_vanished_raises_it() -> None:
         reader.close()
 
 
-async def test_a_restart_raises_it() -> None:
-    here = Rig("px4", {b"/d": None}, CLEAN)
-    async with here.connected() as connection:
-        await trio.sleep(5)
-        here.vehicle.reboot(trio.current_time())
-        await trio.sleep(5)
-        assert connection.vehicle.reboots == 1
-        assert connection.store.in_doubt()
-
-
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(profile: str) -> None:
     """The same RENAME, carried out once more, would take the next file of the name."""

@@ -18,7 +18,7 @@ from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN, OtherClients
-from mavftpfs.session.scheduler import Scheduler, SessionUser
+from mavftpfs.session.scheduler import SessionUser
 from mavftpfs.session.serversession import REOPENS, SILENCE_ARDUPILOT, SILENCE_PX4, STALL
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
@@ -92,28 +92,6 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(profile
             await sink.wait_for(start, start + step)
         assert trio.current_time() - began < 1.2 * steps * rtt
         reader.close()
-
-
-@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str) -> None:
-    small = {b"/d/s%d" % index: bytes([index]) * 100 for index in range(200)}
-    here = Rig(profile, {b"/d/big": content(1_200_000), **small}, LinkSettings(rate=60_000.0, delay=0.015))
-    async with here.connected() as connection, trio.open_nursery() as nursery:
-        sink = MemorySink(1_200_000)
-        reader = await connection.store.open_reader(path(profile, "big"), sink)
-        reader.want(0, 1_200_000, demand=True)
-        await trio.sleep(2)
-
-        async def read_small() -> None:
-            for name, data in small.items():
-                assert await read_file(connection, name) == data
-
-        began, before = trio.current_time(), sink.have.total
-        with trio.move_on_after(15):
-            await read_small()
-        copied = (sink.have.total - before) / (trio.current_time() - began)
-        assert copied > {"px4": 4_000, "ardupilot": 1_800}[profile]  # half of it without the rule
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -191,30 +169,6 @@ async def test_no_vehicle_says_what_was_heard() -> None:
 
 
 # --- names that are being changed
-
-ROUNDS = 10_000
-
-
-@pytest.mark.holds("fault overlap")
-async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = Rig("px4", {b"/big": content(20_000), b"/changing": b"old"}, LinkSettings(rate=5760.0, delay=0.02))
-    rounds = 0
-    choose = Scheduler.next_user
-
-    def counted(queue: Scheduler) -> object:
-        nonlocal rounds
-        rounds += 1
-        assert rounds < ROUNDS, "it goes round without a moment in between"
-        return choose(queue)
-
-    monkeypatch.setattr(Scheduler, "next_user", counted)
-    async with here.connected() as connection, trio.open_nursery() as nursery:
-        scheduler = connection.scheduler
-        async with scheduler.excluded(b"/changing"):
-            nursery.start_soon(connection.store.stat_size, b"/changing")
-            await trio.sleep(0.1)
-            assert await read_file(connection, b"/big") == content(20_000)
-    assert rounds < 100
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
@@ -589,18 +543,7 @@ async def test_a_file_with_fewer_bytes_than_its_size_is_an_error_and_no_doubt(pr
 
 
 @pytest.mark.holds("fault idle close")
-async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end() -> None:
-    here = Rig("px4", {b"/d/f": DATA}, LINK)
-    async with here.connected() as connection:
-        here.faults.at(
-            Opcode.READ_FILE, lambda: here.another_asks(Opcode.TERMINATE_SESSION, heard=False), times=10_000
-        )
-        with trio.fail_after(100), pytest.raises(SessionLost):
-            await read_file(connection, path("px4", "f"))
-        assert here.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
-
-
-async def test_each_read_has_as_many_turns() -> None:
+async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end_of_each_read() -> None:
     """The second one failed with the first session that it lost."""
     async with rig("px4", {b"/d/f": DATA}, link=LINK) as here:
         file = await here.mount().open(b"/d/f")

@@ -107,44 +107,13 @@ async def test_what_interrupts_it_is_bridged(profile: str, probed: bool, interru
     assert here.data(b"/d/new") == data
 
 
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_opened_before_the_news_of_a_restart_is_closed(profile: str) -> None:
-    """The upload goes on at once, in a session that is forgotten when the boot time tells of the restart."""
-    data = content(80_000)
-    here = Rig(profile, {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        await trio.sleep(5)
-        async with under_way(connection, profile, data):
-            here.vehicle.reboot(trio.current_time(), beat_after=0.9)
-            began = trio.current_time()
-        assert connection.vehicle.reboots == 1
-        assert trio.current_time() - began < 9
-    assert here.data(b"/d/new") == data
-    assert here.server.open_sessions == 0
-
-
 async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session() -> None:
     """PX4 says NAK 2 with errno 0 to a write whose session another ground station reset meanwhile."""
-    data = content(60_000)
-    here = Rig("px4", {b"/d": None}, PLAIN)
-    server = here.server
-    outgoing, refused = server.outgoing, []
-
-    def without_errno(now: float) -> list[tuple[Address, bytes]]:
-        replies = []
-        for source, wire in outgoing(now):
-            if wire[3] == Opcode.NAK and wire[5] == Opcode.WRITE_FILE:
-                wire = wire[:4] + bytes([2]) + wire[5:12] + bytes([NakCode.FAIL_ERRNO, 0]) + wire[14:]
-                refused.append(now)
-            replies.append((source, wire))
-        return replies
-
-    server.outgoing = without_errno  # type: ignore[method-assign]
-    async with here.connected() as connection, under_way(connection, "px4", data) as source:
-        here.another_asks(Opcode.RESET_SESSIONS, heard=False)
-    assert refused
-    assert source.all_proven
-    assert here.data(b"/d/new") == data
+    async with uploading(content(3000)) as (here, source, upload):
+        here.faults.refuse(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 0, nth=3)
+        await upload.finish()
+        assert source.all_proven
+    assert here.data(b"/d/new") == bytes(source.content)
 
 
 @pytest.mark.holds("rule 14.23")
@@ -560,25 +529,3 @@ async def test_an_upload_that_is_given_up_is_closed_soon(profile: str, pause: fl
         assert here.server.open_sessions == unknown
         assert source.todo.total == left
         assert upload not in connection.scheduler.users
-
-
-@pytest.mark.parametrize("leaves", [False, True])
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_who_stops_waiting_does_not_stop_the_upload_and_who_leaves_terminates_it(
-    profile: str, leaves: bool
-) -> None:
-    data = content(40_000)
-    here = Rig(profile, {b"/d": None}, PLAIN)
-    async with here.connected() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, profile, source)
-        with trio.move_on_after(1) as impatience:
-            await upload.finish()
-        assert impatience.cancelled_caught
-        assert here.server.open_sessions == 1
-        if not leaves:
-            await trio.sleep(20)
-            assert source.all_proven
-            assert here.server.open_sessions == 0
-            assert here.data(b"/d/new") == data
-    assert here.server.open_sessions == 0
