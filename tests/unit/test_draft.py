@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import TRANSITIONS, Draft, Event, State, Where
+from mavftpfs.cache.draft import Draft, Event, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.sameness import Known
@@ -43,28 +43,6 @@ def sent(sending: SendBuffer, limit: int = 7) -> list[tuple[int, bytes]]:
 
 
 # --- states
-
-
-def test_every_state_is_in_the_table_and_can_be_left() -> None:
-    assert TRANSITIONS.keys() == set(State)
-    reached = {state for events in TRANSITIONS.values() for state in events.values()}
-    assert reached == set(State)
-    for state in State:
-        assert any(after is not state for after in TRANSITIONS[state].values())
-
-
-@pytest.mark.parametrize("state", State)
-@pytest.mark.parametrize("event", Event)
-def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) -> None:
-    draft = draft_over(b"base")
-    draft.state = state
-    if event in TRANSITIONS[state]:
-        draft.on(event)
-        assert draft.state is TRANSITIONS[state][event]
-    else:
-        with pytest.raises(LocalProtocolError):
-            draft.on(event)
-        assert draft.state is state
 
 
 def test_after_a_comparison_that_failed_no_base_counts_any_more() -> None:
@@ -116,15 +94,6 @@ def test_what_was_handed_out_may_not_change(change: Callable[[Draft], None]) -> 
     change(draft)
     assert sending.overtaken
     assert sending.next_chunk(9) is None, "two copies under way could land in the wrong order"
-
-
-def test_a_late_upload_of_an_earlier_attempt_changes_nothing() -> None:
-    draft, early = sending_of(b"abc")
-    early.next_chunk(9)
-    draft.give_up()
-    late = draft.begin(in_place=False)
-    early.on_acked(0, 3)
-    assert late.unacked == 3
 
 
 def test_bytes_fetched_ahead_are_not_stale() -> None:

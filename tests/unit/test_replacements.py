@@ -39,12 +39,6 @@ def test_that_the_new_file_is_not_there_stays_known(placed: bool | None, then: b
     assert not replacements
 
 
-def test_a_single_rename_was_interrupted() -> None:
-    replacements = Replacements()
-    replacements.on_interrupted(FILE)
-    assert list(replacements) == [(FILE, Replacement())]
-
-
 def test_records_follow_the_directory() -> None:
     replacements = Replacements()
     replacements.put(FILE, Replacement(ASIDE, placed=False))

@@ -1,33 +1,23 @@
-"""WriteTransfer: step by step against replies written by hand, and whole under adversarial links."""
+"""WriteTransfer, step by step."""
 
 from __future__ import annotations
 
 import random
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenRequest, Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import MAX_OFFSET, WriteTransfer
 from mavftpfs.shared.errors import (
     FtpNak,
     LocalProtocolError,
-    MavftpfsError,
     RemoteProtocolError,
     SessionLost,
 )
-from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.tree import MemoryTree
-from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import ack, nak, sent
 from tests.support.transfers import MemorySource
-from tests.support.virtual import VirtualLink
 
 CONTENT = random.Random(5).randbytes(239 * 6 + 11)
 
@@ -196,71 +186,3 @@ def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, 
     engine.start(transfer, 0.0)
     assert sent(engine, 0.0) == []
     assert isinstance(transfer.error, LocalProtocolError)
-
-
-# --- under adversarial links, against every server
-
-
-@pytest.mark.parametrize("profile", sorted(PROFILES))
-@settings(max_examples=12, deadline=None)
-@given(
-    seed=st.integers(0, 2**16),
-    size=st.integers(0, 6000),
-    chunk=st.sampled_from([1, 50, 200, 238, 239]),
-    loss=st.sampled_from([0.0, 0.05, 0.2, 0.4]),
-    duplicate=st.sampled_from([0.0, 0.1]),
-    reorder=st.sampled_from([0.0, 0.1]),
-    in_flight=st.sampled_from([None, 1, 3]),
-    cut_short=st.sampled_from([None, 0.3, 2.0]),
-)
-def test_what_is_acked_is_on_the_card(
-    profile: str,
-    seed: int,
-    size: int,
-    chunk: int,
-    loss: float,
-    duplicate: float,
-    reorder: float,
-    in_flight: int | None,
-    cut_short: float | None,
-) -> None:
-    content = random.Random(seed).randbytes(size if chunk > 1 else size % 300)
-    tree = MemoryTree()
-    path = b"/fs/microsd/f"
-    tree.add_directory(b"/fs/microsd")
-    server = FtpServer(tree, PROFILES[profile], rng=random.Random(seed))
-    line = LinkSettings(rate=100_000.0, delay=0.01, loss=loss, duplicate=duplicate, reorder=reorder)
-    link = VirtualLink(server, line, seed=seed)
-    opened = OpenRequest(Opcode.CREATE_FILE, path, session=link.engine.home_session)
-    link.run(opened)
-    if opened.error is not None:  # its ACK was lost and the repetition refused: not what is tested here
-        return
-    link.engine.session = opened.session
-    source = MemorySource(content)
-    transfer = WriteTransfer(opened.session, source, ChunkSize(chunk), in_flight=in_flight)
-    link.engine.start(transfer, link.now)
-    if cut_short is not None:
-        end = link.now + cut_short
-        link.run_until(lambda: transfer.starved or transfer.done or link.now >= end)
-    else:
-        link.run_until(lambda: transfer.starved or transfer.done)
-    if profile == "px4-nuttx" and isinstance(transfer.error, FtpNak) and transfer.error.code == 9:
-        assert source.in_flight.empty  # after 2 s without requests; the session layer knows what to do
-        return
-    assert transfer.error is None
-    if cut_short is None:
-        assert source.acked.total == len(content)
-    transfer.finish()
-    link.engine.remove(transfer)
-    assert source.in_flight.empty
-    assert source.acked.total + source.todo.total == len(content)
-    close(link, opened.session)
-    stored = tree.data(path)
-    for start, stop in source.acked:
-        assert stored[start:stop] == content[start:stop]
-
-
-def close(link: VirtualLink, session: int) -> None:
-    terminate = Simple(Opcode.TERMINATE_SESSION, session=session)
-    link.run(terminate)
-    assert terminate.error is None or isinstance(terminate.error, MavftpfsError)
