@@ -326,8 +326,12 @@ class WriteTransfer(Operation):
         return nak
 
     def takes_back(self, request: Request, now: float) -> bool:
-        """See Operation: the bytes of a chunk that was too long go out in shorter ones."""
-        if request is self._listing or not self.chunks.on_lost(request.size, request.sent_at, now):
+        """See Operation: the bytes of a chunk that was too long go out in shorter ones. None goes out again
+        before the root was listed, where it is to be."""
+        if request is self._listing:
+            return False
+        too_long = self.chunks.on_lost(request.size, request.sent_at, now)
+        if not too_long and not self._disturbed:
             return False
         del self._unanswered[request]
         offset, data = request.offset, request.data
