@@ -95,13 +95,3 @@ def test_close_ends_the_calls_of_other_threads_and_leaves_the_context_whole() ->
     with pytest.raises(Closed, match="the connection to here is closed"):
         loop.call(trio.lowlevel.checkpoint)
     loop.post(trio.lowlevel.checkpoint)
-
-
-def test_a_context_that_cannot_be_entered_says_why() -> None:
-    @asynccontextmanager
-    async def refusing() -> AsyncIterator[str]:
-        raise ConnectionRefusedError("nobody is there")
-        yield ""
-
-    with pytest.raises(ConnectionRefusedError, match="nobody is there"):
-        LoopThread(refusing, "here")

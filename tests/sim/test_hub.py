@@ -104,22 +104,6 @@ async def running(
             await first.aclose()
 
 
-async def test_an_endpoint_that_cannot_be_opened_yet_is_tried_again(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
-) -> None:
-    taken = free_udp_port()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind((HOST, taken))
-        async with running(tmp_path, f"udpin:{HOST}:{taken}", again=True) as here:
-            await trio.sleep(20)
-            (endpoint,) = (await here.status())["endpoints"]
-            assert "in use" in endpoint["problem"]
-            other.close()
-            await trio.sleep(5)
-            (endpoint,) = (await here.status())["endpoints"]
-            assert endpoint["problem"] is None
-
-
 class SlowNames(trio.abc.HostnameResolver):
     """A name server that takes three seconds for a name that is known, and for one that is not."""
 

@@ -5,13 +5,8 @@ from __future__ import annotations
 import os
 import socket
 import tty
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import (
-    AbstractAsyncContextManager,
-    AsyncExitStack,
-    asynccontextmanager,
-    contextmanager,
-)
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -142,7 +137,6 @@ async def test_udpout_listens_to_its_host_only() -> None:
             stranger.sendto(b"evil", sender)
             vehicle.sendto(b"good", sender)
             assert await link.receive() == [b"good"]
-            assert not isinstance(link, StreamLink)
 
 
 async def test_ipv6() -> None:
@@ -188,6 +182,8 @@ async def test_closing_wakes_the_receiver(source: str) -> None:
         (f"tcp:{HOST}:1", "nothing listens on port 1"),
         ("tcp:no-such-host.invalid:1", "no-such-host.invalid"),
         ("udpout:no-such-host.invalid:1", "host 'no-such-host.invalid' is unknown"),
+        ("udpin:a..b:5760", "is no host name"),
+        ("tcp:\N{SNOWMAN}.example:5760", "is no host name"),
         ("/dev/null", "/dev/null is no serial port"),
         ("/proc", "/proc is no serial port"),
     ],
@@ -341,25 +337,10 @@ async def opened_pty(baud: int = 115200) -> AsyncIterator[tuple[StreamLink, int]
         os.close(slave)
 
 
-@asynccontextmanager
-async def opened_tcp() -> AsyncIterator[tuple[StreamLink, int]]:
-    """Open a link to which somebody connected; also returns the other end."""
-    async with opened(f"tcpin:{HOST}:0") as link:
-        assert isinstance(link, StreamLink)
-        with socket.create_connection((HOST, parse_source(link.description).port)) as peer:
-            peer.sendall(b"x")
-            await link.receive()
-            peer.setblocking(False)
-            yield link, peer.fileno()
-
-
-@pytest.mark.parametrize("opened_stream", [opened_pty, opened_tcp])
-async def test_frames_that_go_out_together_are_one_write(
-    opened_stream: Callable[[], AbstractAsyncContextManager[tuple[StreamLink, int]]],
-) -> None:
+async def test_frames_that_go_out_together_are_one_write() -> None:
     """A system call for each frame is a tenth of what a chunk costs."""
     frames = [bytes([n]) * 266 for n in range(10)]
-    async with opened_stream() as (link, other):
+    async with opened_pty() as (link, other):
         link.send_nowait(frames)
         assert (link.stats.writes, link.stats.sent_bytes) == (1, 10 * 266)
         got = b""
@@ -390,6 +371,9 @@ async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:
     master, slave = os.openpty()
     device.symlink_to(os.ttyname(slave))
     async with opened(f"{device},57600") as link:
+        with trio.move_on_after(0.1):  # a read of nothing must not look like the end (VMIN 0 would)
+            await link.receive()
+            pytest.fail("nothing was sent")
         os.write(master, b"before")
         assert await read_bytes(link, 6) == b"before"
         device.unlink()
@@ -445,20 +429,3 @@ async def test_cancelling_receive_loses_nothing() -> None:
             while len(got) < 200:
                 got += await link.receive()
         assert [int.from_bytes(c, "big") for c in got] == list(range(200))
-
-
-async def test_serial_waits_without_spinning() -> None:
-    """A read of nothing must not look like the end (pyserial's VMIN 0 would)."""
-    async with opened_pty() as (link, _):
-        with trio.move_on_after(0.1):
-            await link.receive()
-            pytest.fail("nothing was sent")
-        assert link.connected
-
-
-@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
-@pytest.mark.parametrize("host", ["a..b", "\N{SNOWMAN}.example"])
-async def test_what_cannot_be_a_host_name_is_said(kind: str, host: str) -> None:
-    with pytest.raises(LinkClosed, match="is no host name"):
-        async with opened(f"{kind}:{host}:5760"):
-            pass

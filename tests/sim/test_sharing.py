@@ -6,7 +6,6 @@ import os
 import resource
 import signal
 import socket
-import stat
 import sys
 import tempfile
 import time
@@ -138,19 +137,6 @@ async def until(condition: Callable[[], bool]) -> None:
 # -- who has the port -----------------------------------------------------------------------------
 
 
-async def test_a_program_alone_starts_no_hub_and_a_second_one_does(port: Port) -> None:
-    async with port.shared() as one:
-        await port.hears(one)
-        assert await trio.to_thread.run_sync(port.hub) is None
-        async with port.shared() as two:
-            await port.hears(two)
-            assert await trio.to_thread.run_sync(port.hub) is not None
-            assert one.seat is not None
-            assert two.seat is not None
-            assert {one.seat.own, two.seat.own} == {US, Address(254, 192)}
-        await port.hears(one)
-
-
 async def test_the_last_client_of_a_killed_hub_has_the_port_itself_and_keeps_its_seat(port: Port) -> None:
     async with plain_nursery() as nursery:
         _, first = await nursery.start(port.run_program)
@@ -192,6 +178,9 @@ async def test_an_endpoint_that_is_taken_when_its_hub_was_killed_does_not_cut_th
             await port.hears(link)
             (facts,) = await trio.to_thread.run_sync(ports.statuses, port.source)
             assert "in use" in facts["endpoints"][0]["problem"]
+        with trio.fail_after(60):
+            while facts["endpoints"][0]["problem"]:
+                (facts,) = await trio.to_thread.run_sync(ports.statuses, port.source)
 
 
 async def test_programs_that_begin_at_once_all_share_the_port(port: Port) -> None:
@@ -282,19 +271,6 @@ def fill_queue(place: str, stack: ExitStack) -> None:
 
 
 # -- doors ----------------------------------------------------------------------------------------
-
-
-def test_a_door_is_its_users_alone_and_no_other_file_gets_its_mode(
-    runtime: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The umask is that of the whole process: other threads make files meanwhile."""
-    monkeypatch.setattr(os, "umask", None)
-    door = open_door("port")
-    place = runtime / "mavftpfs" / f"port{ALONE}"
-    assert stat.S_IMODE(place.lstat().st_mode) == 0o600
-    assert stat.S_IMODE(place.parent.lstat().st_mode) == 0o700
-    door.remove()
-    assert not place.exists()
 
 
 async def test_where_the_first_directory_has_no_room_the_door_is_in_the_next_one(
