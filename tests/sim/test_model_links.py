@@ -76,7 +76,7 @@ async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any
         model = Model(mount(here, seed), here.files, (RequestTimeout, FtpNak))
         for call in sequence:
             await model.do(*call)
-            await model.check()
+            await model.do("check")
         await model.end()
         assert model.failures <= FAILURES
     assert profile in LEAKS or here.server.open_sessions == 0
@@ -193,7 +193,7 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
         await trio.sleep(20.0)
         for model in models:
             while model.handles:
-                await model.on_close(0)
+                await model.do("close", 0)
         for model in models:
             await model.end()
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, Payload, decode_request
+from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, decode_request
 from mavftpfs.sim.vehicle import FtpServer
+from tests.support.replies import nak
 
 STATION = Address(255, 190)
 """Another client of the vehicle, whose requests do not count."""
@@ -18,20 +20,24 @@ _TAKING = (Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME)
 
 @dataclass
 class _Meeting:
-    """What happens at the nth of the requests of a kind from now on, and at `times` - 1 more after it."""
+    """What happens at the nth of the requests of a kind from now on, and at `times` - 1 more after it.
 
-    opcode: Opcode
-    nth: int
-    times: int
-    action: Callable[[], object]
+    opcode: None for all kinds."""
+
+    opcode: Opcode | None
+    nth: int = 1
+    times: int = 1
+    action: Callable[[], object] = lambda: None
     nak: bytes | None = None
     drop: bool = False
+    twice: bool = False
 
     def comes(self, opcode: int) -> bool:
         """Count a request; return whether this one is meant."""
-        if opcode == self.opcode:
-            self.nth -= 1
-        return opcode == self.opcode and -self.times < self.nth <= 0
+        if self.opcode not in (None, opcode):
+            return False
+        self.nth -= 1
+        return -self.times < self.nth <= 0
 
     @property
     def over(self) -> bool:
@@ -41,7 +47,7 @@ class _Meeting:
 
 class Faults:
     """Stands before a simulated vehicle's FTP server. Of each change of a name it asserts that neither that
-    file nor one below it is open (promise 6).
+    file nor one below it is open (promise 6). Requests of another client pass as they are.
 
     Attributes:
         requests: opcodes of ours that reached the server so far. asked: the same with their times.
@@ -57,12 +63,9 @@ class Faults:
         self.refused: list[int] = []
         self._cut_after: int | None = None
         self._lose: list[int] = []
-        self._deaf: set[int] = set()
-        self._counted: dict[int, Callable[[], None]] = {}
         self._meetings: list[_Meeting] = []
         self._naks: list[tuple[Address, bytes]] = []
         self.spoil = 0
-        self._repeated: set[int] = set()
         self._server = server
         self._taking: set[bytes] = set()
         self.orphans = False
@@ -80,7 +83,7 @@ class Faults:
 
     def ignore(self, opcode: Opcode) -> None:
         """Have requests of this kind neither executed nor answered."""
-        self._deaf.add(int(opcode))
+        self._meetings.append(_Meeting(opcode, times=sys.maxsize, drop=True))
 
     def at(
         self,
@@ -102,50 +105,45 @@ class Faults:
         number: the errno that goes with FAIL_ERRNO."""
         if number is not None:
             assert code == NakCode.FAIL_ERRNO
-        nak = bytes([code]) if number is None else bytes([code, number])
-        self._meetings.append(_Meeting(opcode, nth, times, lambda: None, nak))
+        codes = bytes([code]) if number is None else bytes([code, number])
+        self._meetings.append(_Meeting(opcode, nth, times, nak=codes))
 
-    def after(self, count: int, action: Callable[[], None]) -> None:
+    def after(self, count: int, action: Callable[[], object]) -> None:
         """Do something when `count` more requests came to the server, before the last of them is executed."""
-        self._counted[len(self.requests) + count] = action
+        self._meetings.append(_Meeting(None, count, action=action))
 
     def repeat(self, count: int) -> None:
         """Have the request arrive twice that comes after `count` - 1 more ones."""
-        self._repeated.add(len(self.requests) + count)
+        self._meetings.append(_Meeting(None, count, twice=True))
 
     def call_off(self) -> None:
         """Let what was to happen at certain requests not happen any more."""
-        self._counted.clear()
         self._meetings.clear()
-        self._repeated.clear()
 
     def times(self, opcode: Opcode) -> list[float]:
         """Return when requests of this kind came."""
         return [now for now, asked in self.asked if asked == opcode]
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
-        self._execute(wire, source, now)
-        if len(self.requests) in self._repeated:
-            self._repeated.remove(len(self.requests))
-            self._execute(wire, source, now)
-
-    def _execute(self, wire: bytes, source: Address, now: float) -> None:
-        if self._is_cut() or wire[_OPCODE] in self._deaf:
+        if self._is_cut():
             return
         self._require_closed(wire)
-        if source != STATION:
-            self.requests.append(wire[_OPCODE])
-            self.asked.append((now, wire[_OPCODE]))
-        self._counted.pop(len(self.requests), lambda: None)()
+        if source == STATION:
+            self._handle(wire, source, now)
+            return
+        self.requests.append(wire[_OPCODE])
+        self.asked.append((now, wire[_OPCODE]))
         met = [meeting for meeting in self._meetings if meeting.comes(wire[_OPCODE])]
         self._meetings = [meeting for meeting in self._meetings if not meeting.over]
         for meeting in met:
             meeting.action()
         naks = [meeting.nak for meeting in met if meeting.nak is not None]
         if naks:
-            self._naks.append((source, _refusal(decode_request(wire), naks[0])))
+            self._naks.append((source, nak(decode_request(wire), *naks[0]).encode()))
         elif not any(meeting.drop for meeting in met):
             self._handle(self._spoiled(wire), source, now)
+        if any(meeting.twice for meeting in met):
+            self._on_request(wire, source, now)
 
     def _require_closed(self, wire: bytes) -> None:
         if self.orphans or wire[_OPCODE] not in _TAKING or wire in self._taking:
@@ -176,10 +174,3 @@ class Faults:
 
     def _is_cut(self) -> bool:
         return self._cut_after is not None and len(self.requests) >= self._cut_after
-
-
-def _refusal(request: Payload, data: bytes) -> bytes:
-    reply = Payload(
-        (request.seq + 1) & 0xFFFF, request.session, Opcode.NAK, len(data), request.opcode, data=data
-    )
-    return reply.encode()

@@ -123,7 +123,10 @@ class Model:
 
     async def do(self, call: str, *args: Any) -> None:
         """Make one call on both."""
-        await getattr(self, "on_" + call)(*args)
+        try:
+            await getattr(self, "on_" + call)(*args)
+        except self.excused:
+            self.failures += 1
 
     # --- calls
 
@@ -133,9 +136,6 @@ class Model:
         except AlreadyExists:
             assert exclusive
             assert path in self.names
-            return
-        except self.excused:
-            self.failures += 1
             return
         assert not (exclusive and path in self.names)
         file = self.names.setdefault(path, File())
@@ -147,9 +147,6 @@ class Model:
         except NotFound:
             assert path not in self.names
             return
-        except self.excused:
-            self.failures += 1
-            return
         file = self.names[path]
         if mode == "t":
             file.resize(0)
@@ -157,14 +154,9 @@ class Model:
 
     async def on_write(self, index: int, offset: int, data: bytes) -> None:
         handle = self.handle(index, writes=True)
-        if handle is None:
-            return
-        try:
+        if handle is not None:
             assert await handle.real.write(offset, data) == len(data)
-        except self.excused:
-            self.failures += 1
-            return
-        handle.file.write(offset, data)
+            handle.file.write(offset, data)
 
     async def on_append(self, index: int, data: bytes) -> None:
         handle = self.handle(index, writes=True)
@@ -173,14 +165,9 @@ class Model:
 
     async def on_resize(self, index: int, size: int) -> None:
         handle = self.handle(index, writes=True)
-        if handle is None:
-            return
-        try:
+        if handle is not None:
             await handle.real.truncate(size)
-        except self.excused:
-            self.failures += 1
-            return
-        handle.file.resize(size)
+            handle.file.resize(size)
 
     async def on_read(self, index: int, offset: int, size: int) -> None:
         handle = self.handle(index)
@@ -191,11 +178,8 @@ class Model:
         except (FileChanged, NotFound):
             assert self.excused, "nothing went wrong, so an open file is readable"
             assert handle.file not in self.names.values(), "only a file without a name may be gone"
-            return
-        except self.excused:
-            self.failures += 1
-            return
-        assert data == handle.file.data[offset : offset + size]
+        else:
+            assert data == handle.file.data[offset : offset + size]
 
     async def on_flush(self, index: int) -> None:
         await self.confirm(index, lambda handle: handle.real.flush(), empty_too=False)
@@ -206,8 +190,10 @@ class Model:
     async def on_close(self, index: int) -> None:
         handle = self.handle(index)
         if handle is not None:
-            await self.confirm(index, lambda handle: handle.real.release())
-            self.handles.remove(handle)
+            try:
+                await self.confirm(index, lambda handle: handle.real.release())
+            finally:
+                self.handles.remove(handle)
 
     async def on_rename(self, old: bytes, new: bytes) -> None:
         before = dict(self.names)
@@ -219,9 +205,8 @@ class Model:
             assert old not in self.names
             return
         except self.excused:
-            self.failures += 1
             await self.adopt_either(before, self.renamed(old, new))
-            return
+            raise
         self.names = self.renamed(old, new)
 
     async def on_unlink(self, path: bytes) -> None:
@@ -233,8 +218,8 @@ class Model:
         except FileBusy:
             assert any(handle.file is self.names[path] for handle in self.handles)
         except self.excused:
-            self.failures += 1
             await self.adopt_either(dict(self.names), without)
+            raise
         else:
             self.names = without
 
@@ -245,9 +230,9 @@ class Model:
         except NotFound:
             assert file is None
         except self.excused:
-            self.failures += 1
             if file is not None and (await self.size(path)) == size:
                 file.resize(size)  # taken or done after all
+            raise
         else:
             assert file is not None
             file.resize(size)
@@ -267,11 +252,7 @@ class Model:
         handle = self.handle(index)
         if handle is None:
             return
-        try:
-            await ask(handle)
-        except self.excused:
-            self.failures += 1
-            return
+        await ask(handle)
         named = [path for path, file in self.names.items() if file is handle.file]
         if handle.writes and named and (empty_too or handle.file.data):
             assert self.card()[named[0]] == handle.file.data
@@ -302,14 +283,10 @@ class Model:
                 return
         raise AssertionError(f"neither before nor after: {shown}")
 
-    async def check(self) -> None:
+    async def on_check(self) -> None:
         """What the tree shows is the model."""
-        try:
-            shown = dict(await self.tree.list(b"/d"))
-            below = dict(await self.tree.list(b"/d/sub"))
-        except self.excused:
-            self.failures += 1
-            return
+        shown = dict(await self.tree.list(b"/d"))
+        below = dict(await self.tree.list(b"/d/sub"))
         sizes = {b"/d/" + name: stat.size for name, stat in shown.items() if name != b"sub"}
         sizes |= {b"/d/sub/" + name: stat.size for name, stat in below.items()}
         assert sizes == {path: len(file.data) for path, file in self.names.items()}
@@ -317,11 +294,11 @@ class Model:
     async def end(self) -> None:
         """Close and deliver everything: the card is the model."""
         while self.handles:
-            await self.on_close(0)
+            await self.do("close", 0)
         assert await self.tree.drain(300) == []
         for _ in range(3):  # listings, and time to clean up what they show
             self.tree.forget_caches()
-            await self.check()
+            await self.do("check")
             await trio.sleep(20)
         assert self.card() == {path: file.data for path, file in self.names.items()}
         status = self.tree.status()

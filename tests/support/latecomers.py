@@ -5,6 +5,7 @@ or at an exact time.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 
 import trio
 
@@ -58,7 +59,19 @@ class Latecomer:
 
 def come_late(here: Rig, seconds: float, opcode: Opcode, nth: int = 1) -> trio.Event:
     """Have the nth request of a kind executed only so long after it came; the event is set then."""
-    handle, left, came = here.server.handle, [nth], trio.Event()
+    numbers = count(1)
+
+    def chosen(wire: bytes) -> bool:
+        return wire[_OPCODE] == opcode and next(numbers) == nth
+
+    return come_again(here, seconds, chosen, at_once=False)
+
+
+def come_again(
+    here: Rig, seconds: float, chosen: Callable[[bytes], bool], *, at_once: bool = True
+) -> trio.Event:
+    """Have requests executed so long after they came, where they are chosen; at_once: then, too."""
+    handle, came = here.server.handle, trio.Event()
     here.faults.orphans = True
 
     async def later(wire: bytes, source: Address) -> None:
@@ -68,29 +81,11 @@ def come_late(here: Rig, seconds: float, opcode: Opcode, nth: int = 1) -> trio.E
         came.set()
 
     def on_request(wire: bytes, source: Address, now: float) -> None:
-        left[0] -= wire[_OPCODE] == opcode
-        if wire[_OPCODE] == opcode and left[0] == 0:
+        late = chosen(wire)
+        if late:
             here.nursery.start_soon(later, wire, source)
-        else:
+        if at_once or not late:
             handle(wire, source, now)
 
     here.server.handle = on_request  # type: ignore[method-assign]
     return came
-
-
-def come_again(here: Rig, seconds: float, chosen: Callable[[bytes], bool]) -> None:
-    """Have requests executed once more so long after they came, where they are chosen."""
-    handle = here.server.handle
-    here.faults.orphans = True
-
-    async def again(wire: bytes, source: Address) -> None:
-        await trio.sleep(seconds)
-        handle(wire, source, trio.current_time())
-        here.link.kick()
-
-    def on_request(wire: bytes, source: Address, now: float) -> None:
-        if chosen(wire):
-            here.nursery.start_soon(again, wire, source)
-        handle(wire, source, now)
-
-    here.server.handle = on_request  # type: ignore[method-assign]

@@ -48,7 +48,6 @@ class LyingServer(FtpServer):
         super().__init__(*args, **kwargs)
         self._asked: dict[int, Payload] = {}
         self._forged: list[tuple[Address, bytes]] = []
-        self._forged_at = 0.0
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Take a request."""
@@ -62,7 +61,6 @@ class LyingServer(FtpServer):
             super().handle(wire, source, now)
         else:
             self._forged += [(source, reply.encode()) for reply in replies]
-            self._forged_at = now
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
         """Take requests."""
@@ -84,10 +82,6 @@ class LyingServer(FtpServer):
             else:
                 out += [(target, changed.encode()) for changed in self.change(request, reply)]
         return out
-
-    def next_deadline(self) -> float | None:
-        """Return when something is to be sent."""
-        return self._forged_at if self._forged else super().next_deadline()
 
 
 class CrowdedLink(MemoryLink):
