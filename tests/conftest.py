@@ -22,7 +22,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.session.scheduler import Scheduler, Turn
 from tests.support.clocks import use_virtual_time
 
-TIERS = ("unit", "property", "sim", "ops", "conformance", "api", "mount")
+TIERS = ("unit", "property", "sim", "ops", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
 
 VIRTUAL = ("unit", "sim")
@@ -43,13 +43,21 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 @pytest.fixture(scope="session", autouse=True)
-def temporaries(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where programs put what they mean to remove; what a killed one leaves goes with pytest's own."""
-    path = tmp_path_factory.mktemp("t")
+def surroundings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Give all programs the same surroundings. What they leave in TMPDIR goes with pytest's own. Ctrl-C
+    and a hang-up end them, also where the tests run with these ignored (`&`, nohup). Modes are as usual, and
+    only a terminal is taken for one. Modules stay compiled, as in an installation: else each of the many
+    programs compiles all of them again."""
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, handler)
+    os.umask(0o022)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TMPDIR", str(path))
+        patch.setenv("TMPDIR", str(tmp_path_factory.mktemp("t")))
         patch.setattr(tempfile, "tempdir", None)
-        yield path
+        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "PYTHONDONTWRITEBYTECODE"):
+            patch.delenv(name, raising=False)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -59,21 +67,6 @@ def state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(path))
         yield path
-
-
-@pytest.fixture(scope="session", autouse=True)
-def surroundings() -> Iterator[None]:
-    """Give all programs the same surroundings. Ctrl-C and a hang-up end them, also where the tests run with
-    these ignored (`&`, nohup). Modes are as usual, and only a terminal is taken for one. Modules stay
-    compiled, as in an installation: else each of the many programs compiles all of them again."""
-    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-        if signal.getsignal(number) == signal.SIG_IGN:
-            signal.signal(number, handler)
-    os.umask(0o022)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "PYTHONDONTWRITEBYTECODE"):
-            patch.delenv(name, raising=False)
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,6 @@ STAT_STORM = (
     "for number in range(1000):\n"
     "    os.path.exists(sys.argv[1] + str(number % int(sys.argv[2])))'"
 )
-PROGRAMS = Path(__file__).parent / "programs"
 THUMBNAIL = (
     f"{sys.executable} -c 'import os\n"
     'file = os.open("big", os.O_RDONLY)\n'
@@ -108,7 +107,6 @@ the rename did what its ACK says."""
 SHORT = "create 1, write 1, close 1, crc 1, rename 1; 2 B"
 LOCK = "list 2, create 1, close 1, remove 1"
 VIM = "vim -es -u NONE -i NONE -c '%s/$/x/' -c wq f"
-NANO = f"{sys.executable} {PROGRAMS / 'nano_save.py'} f"
 TEN = "open 10, create 10, write 20, close 10, crc 10, rename 10; 3000 B"
 TWICE = f"{GIT} status --short; {GIT} status --short"
 
@@ -139,7 +137,6 @@ CASES = (
     Case("rm", "rm f", "remove 1", "ls -l", small),
     Case("rm -r", "rm -r ten", "list 2, remove 10, rmdir 1", "ls -l ten", ten),
     Case("vim save", VIM, f"{REWRITE}, crc 1, rename 1; 603 B", "ls -l", small),
-    Case("nano save", NANO, f"{REWRITE}, crc 1, rename 1; 606 B", "ls -l", small),
     Case("cp 10 files to it", "cp ten/* .", TEN, "cat ten/* > /dev/null; ls -l", ten, aged=True),
     # Programs that look at everything.
     Case("rsync unchanged", RSYNC, "0", RSYNC, tree),
@@ -156,7 +153,6 @@ FAT = {
     "echo > old": f"create 1, write 1, close 1, crc 1, {REPLACED}; 2 B",
     "rm -r": "list 1, remove 10, rmdir 1",
     "vim save": f"{REWRITE}, crc 1, {REPLACED}; 603 B",
-    "nano save": f"{REWRITE}, crc 1, {REPLACED}; 606 B",
 }
 ELSEWHERE = {
     "px4-nuttx": {

@@ -280,17 +280,20 @@ def card(
 
 # --- what programs do
 
+PIECE = 128 * 1024
+"""Bytes of a program's calls, as of the kernel's."""
 
-async def read_file(tree: Tree, path: bytes, step: int = 128 * 1024) -> bytes:
+
+async def read_file(tree: Tree, path: bytes) -> bytes:
     """Open, read to the end and close, as `cat` does."""
     file = await tree.open(path)
     try:
-        return b"".join([bytes(await file.read(at, step)) for at in range(0, file.size + 1, step)])
+        return b"".join([bytes(await file.read(at, PIECE)) for at in range(0, file.size + 1, PIECE)])
     finally:
         file.close()
 
 
-async def write_file(tree: Tree, path: bytes, data: bytes, step: int = 128 * 1024) -> None:
+async def write_file(tree: Tree, path: bytes, data: bytes, step: int = PIECE) -> None:
     """Make or replace a file, as `cp` does: every error shows."""
     try:
         file = await tree.create(path, exclusive=True)

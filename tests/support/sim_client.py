@@ -78,9 +78,9 @@ class Client:
         wires += [wire for _, wire in self.server.outgoing(stop)]
         return [decode_reply(wire) for wire in wires]
 
-    def ask(self, opcode: int, data: bytes = b"", *, wait: float = 0.05, **fields: Any) -> Payload:
+    def ask(self, opcode: int, data: bytes = b"", **fields: Any) -> Payload:
         """Send a request and return its one reply."""
-        replies = self.ask_all(opcode, data, wait=wait, **fields)
+        replies = self.ask_all(opcode, data, **fields)
         assert len(replies) == 1, replies
         return replies[0]
 
