@@ -56,7 +56,7 @@ class LateCopies:
         """A request took the file of this name away, or may have done so."""
         self._note(path.lower(), now, now + LEAST_REST, now)
 
-    def on_repeated(self, path: bytes, seconds: float, now: float) -> None:
+    def on_maybe_under_way(self, path: bytes, seconds: float, now: float) -> None:
         """A request that may have taken the file of this name away, or emptied it, was sent more than once
         and answered so many seconds after the first time, or was not waited for any longer."""
         self._note(path.lower(), now, now, now + max(LEAST_REST, min(MOST_REST, 2 * seconds)))
@@ -91,7 +91,7 @@ class Doubt:
     """Whether, and since when, what was ACKed is not believed without a look.
 
     Attributes:
-        late: which names rest.
+        late_copies: which names rest.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Doubt:
     ) -> None:
         """`on_raised` is called each time that what was read is in doubt, with the reason, for people."""
         self._on_raised = on_raised
-        self.late = LateCopies()
+        self.late_copies = LateCopies()
         self._clock = clock
         self._at = self._reads_at = -inf
 

@@ -433,7 +433,7 @@ class Scheduler:
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         other = opens and session is not None and session.seq != reply.seq
-        self.doubt.late.saw(lateness, self.clock())
+        self.doubt.late_copies.saw(lateness, self.clock())
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
         if other:
             self.server.abandon()
@@ -443,7 +443,7 @@ class Scheduler:
         sent_at: when it went out first. An open of an earlier file may have put that in the place of the
         present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later one.
         """
-        if sent_at >= self.server.opening_at:
+        if sent_at >= self.server.file_since:
             return  # it is the open that is closed next, or a WriteFile to the last file
         session = self.server.session
         if reply.req_opcode in OPENING:

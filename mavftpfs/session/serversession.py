@@ -99,7 +99,8 @@ class ServerSession:
         writes it now.
         maybe_open: files that may be open over there by our doing, by session id: a request was not answered
         yet, or never, or the session is not believed any more.
-        opening_at: when the last open went out; once its ACK came: when that was.
+        file_since: when the last open went out, and once its ACK came, when that was. What went out before
+        concerns an earlier file.
         others: other clients of this server.
         changed: where tasks park until something more is closed.
     """
@@ -120,7 +121,7 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
-        self.opening_at = -inf
+        self.file_since = -inf
         self.others = OtherClients()
         self._asked_sessions_at = -inf
         self._news = trio.Event()
@@ -168,11 +169,11 @@ class ServerSession:
             await self._open_with_remedies(path, opcode)
         finally:
             if opcode == Opcode.CREATE_FILE:
-                late, now = self.doubt.late, self.clock()
+                late, now = self.doubt.late_copies, self.clock()
                 late.on_made(path, now)
                 # Where nothing can be renamed a file is not compared once more under its final name.
                 if self.engine.traits.rename_works is False and (self.session is None or self.session.resent):
-                    late.on_repeated(path, now - began, now)
+                    late.on_maybe_under_way(path, now - began, now)
         if self.session is None:
             raise _lost()
         return self.session
@@ -197,7 +198,7 @@ class ServerSession:
                 self.maybe_open[asked] = path
             if not echoes:
                 self.maybe_open[0] = path
-            self.opening_at = self.clock()
+            self.file_since = self.clock()
             try:
                 await self.driver.run(operation)
             except FtpNak as nak:
@@ -226,7 +227,7 @@ class ServerSession:
             seq=operation.reply.seq,
             resent=resent or operation.retransmitted,
         )
-        self.engine.session, self.opening_at = self.session.id, self.session.opened_at
+        self.engine.session, self.file_since = self.session.id, self.session.opened_at
 
     def _may_have_opened(self, nak: FtpNak) -> bool:
         """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or

@@ -128,7 +128,7 @@ class Store:
         self._op_deadline = scheduler.server.op_deadline
         self._sent = 0
         self._under_way = 0
-        self._late = scheduler.doubt.late
+        self._late_copies = scheduler.doubt.late_copies
 
     def why_lost(self) -> str | None:
         """Return why the vehicle counts as lost (see RemoteStore)."""
@@ -270,7 +270,7 @@ class Store:
             async with self._opened(path, Opcode.CREATE_FILE) as session:
                 await self._write_in_order(session, Pieces(pieces, progress))
         finally:
-            self._late.on_changed(path, self._clock())
+            self._late_copies.on_changed(path, self._clock())
 
     async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
         server, driver = self._server, self._server.driver
@@ -308,7 +308,7 @@ class Store:
 
     async def let_rest(self, path: bytes) -> None:
         """See VehicleStore."""
-        await trio.sleep(self._late.rest(path, self._clock()))
+        await trio.sleep(self._late_copies.rest(path, self._clock()))
 
     async def remove(self, path: bytes, *, at_once: bool = False) -> None:
         """Remove what is known to be a file."""
@@ -340,7 +340,7 @@ class Store:
             )
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
-            self._late.on_placed(new)
+            self._late_copies.on_placed(new)
 
     @asynccontextmanager
     async def _changing(
@@ -361,7 +361,7 @@ class Store:
                     yield
                 finally:
                     for path in paths:
-                        self._late.on_changed(path, self._clock())
+                        self._late_copies.on_changed(path, self._clock())
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
 
@@ -385,7 +385,7 @@ class Store:
             finally:
                 self._under_way -= 1
                 if repeated:
-                    self._late.on_repeated(path, self._clock() - began, self._clock())
+                    self._late_copies.on_maybe_under_way(path, self._clock() - began, self._clock())
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(verify)
                 if outcome is Outcome.HAPPENED:

@@ -78,7 +78,7 @@ def test_a_name_rests_for_ten_minutes_after_any_copy() -> None:
 def test_a_name_whose_request_was_repeated_rests_on_any_link() -> None:
     late = LateCopies()
     for seconds, expected in ((0.1, LEAST_REST), (2.0, 4.0), (30.0, MOST_REST)):
-        late.on_repeated(b"/d/a", seconds, 0.0)
+        late.on_maybe_under_way(b"/d/a", seconds, 0.0)
         late.on_changed(b"/d/a", 0.0)
         assert late.rest(b"/d/A", 0.0) == expected
     assert late.rest(b"/d/other", 0.0) == 0.0
@@ -127,7 +127,7 @@ async def test_an_answer_that_comes_twice_raises_it() -> None:
         await trio.sleep(0.1)
         assert connection.store.in_doubt()
         assert connection.store.in_doubt(began)
-        assert 6 < connection.scheduler.doubt.late.rest(b"/d/one", trio.current_time()) < 8
+        assert 6 < connection.scheduler.doubt.late_copies.rest(b"/d/one", trio.current_time()) < 8
 
 
 @pytest.mark.holds("rule 14.12")
@@ -175,7 +175,7 @@ async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(profile
     old, new = path(profile, "old"), path(profile, "new")
     async with here.connected() as connection:
         connection.scheduler.doubt.raise_it("as if a copy had been late")
-        connection.scheduler.doubt.late.saw(1.0, trio.current_time())
+        connection.scheduler.doubt.late_copies.saw(1.0, trio.current_time())
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.CREATE_FILE)
         await connection.store.rename(old, new)
         await put(connection, old, content(400, 2))
@@ -192,7 +192,7 @@ async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
     old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
     async with here.connected() as connection:
         connection.scheduler.doubt.raise_it("as if a copy had been late")
-        connection.scheduler.doubt.late.saw(1.0, trio.current_time())
+        connection.scheduler.doubt.late_copies.saw(1.0, trio.current_time())
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
         began = trio.current_time()
         await connection.store.rename(old, new)
@@ -378,7 +378,7 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
             here.connection.scheduler.doubt.raise_it("a copy was late")
-            here.connection.scheduler.doubt.late.saw(0.5, trio.current_time())
+            here.connection.scheduler.doubt.late_copies.saw(0.5, trio.current_time())
         Latecomer(here, what, after=after, nth=nth, first=first)
         wanted = content(500, 1)
         for number in (2, 3):
@@ -408,7 +408,7 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: 
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
             here.connection.scheduler.doubt.raise_it("a copy was late")
-            here.connection.scheduler.doubt.late.saw(0.1, trio.current_time())
+            here.connection.scheduler.doubt.late_copies.saw(0.1, trio.current_time())
         renames: list[bytes] = []
 
         def is_first(wire: bytes) -> bool:
@@ -431,7 +431,7 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
         tree = here.mount()
         await write_file(tree, b"/d/k", b"x")
         here.connection.scheduler.doubt.raise_it("a copy was late")
-        here.connection.scheduler.doubt.late.saw(0.1, trio.current_time())
+        here.connection.scheduler.doubt.late_copies.saw(0.1, trio.current_time())
         await tree.list(b"/d")
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME, first=True)
         await tree.rename(b"/d/g", b"/d/f")
