@@ -92,19 +92,17 @@ class Field:
 @pytest.fixture
 def field(tmp_path: Path) -> Iterator[Field]:
     """A field for one test."""
-    with ExitStack() as stack:
-        field = Field(tmp_path)
-        stack.callback(field.close)
-        yield field
+    field = Field(tmp_path)
+    yield field
+    field.close()
 
 
 @pytest.fixture(scope="module")
 def module_field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
     """A field for all tests of a module."""
-    with ExitStack() as stack:
-        field = Field(tmp_path_factory.mktemp("field"))
-        stack.callback(field.close)
-        yield field
+    field = Field(tmp_path_factory.mktemp("field"))
+    yield field
+    field.close()
 
 
 @pytest.fixture(scope="session")
