@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +11,8 @@ import pytest
 from mavftpfs.parameters.packed import unpack
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
-from tests.support.terminal import Terminal
+from tests.support.terminal import NANO, Terminal
 
-NANO = Path(__file__).parents[1] / "support" / "programs" / "nano_save.py"
 FLOAT_NAME = {"ardupilot5": "ATC_RAT_PIT_P", "px4-2026": "MC_PITCHRATE_P"}
 INT_NAME = {"ardupilot5": "RTL_ALT", "px4-2026": "PWM_MAIN_DIS1"}
 
@@ -115,7 +113,7 @@ def test_vim_hears_of_a_bad_line(texts: Texts) -> None:
 def test_nano(texts: Texts) -> None:
     line, name = texts.line(texts.whole), texts.whole
     before = texts.told(name)
-    texts.shell(f"{sys.executable} {NANO} params.parm {line},{len(name) + 2} 1")
+    texts.shell(f"{NANO} params.parm {line},{len(name) + 2} 1")
     assert texts.told(name) == float(f"1{before:.0f}")
 
 

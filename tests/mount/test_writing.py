@@ -19,8 +19,8 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.mounts import command, wait_until
 from tests.support.places import FOLDERS, NO_RENAME, start_place
-from tests.support.request_costs import PROGRAMS
 from tests.support.takingturns import taking_turns
+from tests.support.terminal import NANO
 from tests.support.twins import Twins
 from tests.support.vehicles import PROJECT
 
@@ -122,7 +122,7 @@ def test_names(twins: Twins, step: str, kind: str) -> None:
 
 def test_vim_and_nano_save(twins: Twins) -> None:
     twins.both("seq 1 300 > vim.txt; vim -es -u NONE -i NONE -c '%s/5/five/' -c 'wq' vim.txt; cat vim.txt")
-    twins.both(f"{sys.executable} {PROGRAMS / 'nano_save.py'} nano.txt; cat nano.txt")
+    twins.both(f"{NANO} nano.txt; cat nano.txt")
 
 
 GIT = """

@@ -14,8 +14,12 @@ import sys
 import termios
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from tests.support.vehicles import PROJECT
+
+NANO = f"{sys.executable} {Path(__file__).parent / 'programs' / 'nano_save.py'}"
+"""Edits a file in nano, as a shell command: FILE [LINE,COLUMN WORD]."""
 
 _ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
