@@ -8,7 +8,7 @@ import trio
 
 from mavftpfs.link.messages import Address, FtpRun
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, request
-from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN
 from mavftpfs.session.scheduler import ReadMode
 from mavftpfs.shared.errors import (
@@ -89,25 +89,17 @@ async def test_what_has_no_size_is_read_to_its_end_over_a_bad_link(profile: str)
 
 
 async def test_an_open_reply_without_a_size_is_an_error_at_once() -> None:
-    here = Rig("px4", {b"/f": b"hello"}, LinkSettings(delay=0.02))
-    async with here.connected() as connection:
-        _hide_sizes(connection)
+    async with rig("px4", {b"/f": b"hello"}, link=LinkSettings(delay=0.02)) as here:
+        here.server.change = lambda request, reply: [
+            reply._replace(size=0, data=b"") if request.opcode == Opcode.OPEN_FILE_RO else reply
+        ]
         began = trio.current_time()
         with pytest.raises(RemoteProtocolError):
-            await read_file(connection, b"/f")
+            await read_file(here.connection, b"/f")
         assert trio.current_time() - began < 2.0
-        assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 1
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
         await trio.sleep(3)
         assert here.server.open_sessions == 0
-
-
-def _hide_sizes(connection: Connection) -> None:
-    receive = connection.engine.receive
-
-    def hiding(reply: Payload, now: float) -> None:
-        receive(reply._replace(size=0, data=b"") if reply.req_opcode == Opcode.OPEN_FILE_RO else reply, now)
-
-    connection.engine.receive = hiding  # type: ignore[method-assign]
 
 
 async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_turn() -> None:
