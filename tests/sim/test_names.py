@@ -40,17 +40,6 @@ async def listed(here: Rig) -> Tree:
 
 @pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", RENAMING)
-async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(profile: str) -> None:
-    async with rig(profile, {A: b"ours"}) as here:
-        tree = await listed(here)
-        here.put(B, b"THEIRS")
-        with pytest.raises(AlreadyExists):
-            await tree.rename(A, B, noreplace=True)
-        assert here.files() == {A: b"ours", B: b"THEIRS"}
-
-
-@pytest.mark.holds("rule 14.34")
-@pytest.mark.parametrize("profile", RENAMING)
 @pytest.mark.parametrize("was_file", [False, True])
 async def test_nothing_moves_into_what_became_a_directory(profile: str, was_file: bool) -> None:
     async with rig(profile, {A: b"ours"} | ({B: b""} if was_file else {})) as here:

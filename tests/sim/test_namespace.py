@@ -166,25 +166,6 @@ async def test_after_an_interrupted_rename_the_old_file_is_not_read(
         await file.release()
 
 
-@pytest.mark.holds("promise 1")
-@pytest.mark.parametrize("opcode", [Opcode.RENAME, Opcode.REMOVE_FILE])
-async def test_after_an_interrupted_change_of_a_name_nothing_is_remembered_of_it(opcode: Opcode) -> None:
-    """Nor of what lies below it."""
-    async with rig("px4", {b"/d/sub/x": b"old"}) as here:
-        tree = here.mount()
-        assert await read_file(tree, b"/d/sub/x") == b"old"
-        with trio.CancelScope() as scope:
-            here.faults.at(opcode, scope.cancel)
-            if opcode is Opcode.RENAME:
-                await tree.rename(b"/d/sub", b"/d/moved")
-            else:
-                await tree.unlink(b"/d/sub/x")
-        here.put(b"/d/sub/x", b"new")
-        assert await read_file(tree, b"/d/sub/x") == b"new"
-        if opcode is Opcode.RENAME:
-            assert await read_file(tree, b"/d/moved/x") == b"old"
-
-
 async def test_renames_that_are_refused(each: Rig) -> None:
     tree = each.mount()
     for old, new, error in (
@@ -221,16 +202,6 @@ async def test_who_changes_names_needs_no_room_for_reading(fat: Rig) -> None:
             await tree.mkdir(b"/d/new")
         readers.cancel_scope.cancel()
     opened.close()
-
-
-async def test_a_checksum_does_not_stay_with_the_name_of_another_file(fat: Rig) -> None:
-    """They have one size and one mtime."""
-    tree = fat.mount()
-    for name in (b"a", b"b"):
-        fat.put(b"/d/" + name, name, 1_700_000_000)
-    sums = {name: await tree.crc32(b"/d/" + name) for name in (b"a", b"b")}
-    await tree.rename(b"/d/a", b"/d/b")
-    assert await tree.crc32(b"/d/b") == sums[b"a"] != sums[b"b"]
 
 
 # --- spelling
@@ -408,14 +379,6 @@ async def test_a_finish_that_is_refused_and_cannot_be_undone(torn: Rig) -> None:
     await torn.find()
     await trio.sleep(2 * PAUSES[0])
     assert torn.data(FILE) == OLD
-
-
-async def test_who_opens_a_torn_name_gets_its_file(torn: Rig) -> None:
-    """Before the news that the link is back, too: the listing that comes first mends it."""
-    tree = torn.mount()
-    await tear(torn, tree)
-    speak(torn)
-    assert await read_file(tree, FILE) == OLD
 
 
 @pytest.mark.parametrize("moves", [False, True])

@@ -328,27 +328,6 @@ async def test_a_file_without_a_name_waits_for_no_vehicle(here: Rig, over: bool)
     assert (tree.undelivered(), tree.status()["bytes_held"]) == ([], 0)
 
 
-async def test_a_writer_who_waits_when_the_name_goes_is_let_go() -> None:
-    async with rig(link=LinkSettings(rate=20_000.0)) as here:
-        tree, written = here.mount(dirty_max=256 * KIB), trio.Event()
-        file = await tree.create(b"/new", exclusive=True)
-
-        async def write() -> None:
-            await fill(file)
-            written.set()
-
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(write)
-            await trio.sleep(20)
-            assert not written.is_set()
-            with trio.fail_after(STALL):
-                await tree.unlink(b"/new")
-                await written.wait()
-        await assert_filled(file)
-        await file.release()
-        assert here.files() == {}
-
-
 # --- a file that was replaced while it was open gives ESTALE for good
 
 OLD, LATER = b"old" * 300, b"NEW" * 300

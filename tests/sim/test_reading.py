@@ -14,8 +14,6 @@ from mavftpfs.session.scheduler import ReadMode
 from mavftpfs.shared.errors import (
     MavftpfsError,
     RemoteProtocolError,
-    RequestTimeout,
-    VehicleLost,
 )
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -66,18 +64,6 @@ async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
 
 
 @EACH
-async def test_listings_over_a_bad_link(profile: str) -> None:
-    files = {b"file %03d.bin" % number: b"x" * number for number in range(150)}
-    async with rig(profile, {b"/d/" + name: data for name, data in files.items()}, link=BAD) as here:
-        here.put_directory(b"/d/sub")
-        listing = await here.connection.store.list_directory(here.root + b"/d")
-        assert listing.complete
-        sizes = {entry.name: entry.size for entry in listing.entries if entry.name != b"sub"}
-        assert sizes == {name: len(data) for name, data in files.items()}
-        assert len(listing.entries) == len(files) + 1
-
-
-@EACH
 async def test_what_has_no_size_is_read_to_its_end_over_a_bad_link(profile: str) -> None:
     """Where a read may cross the end, the bytes are right; where it may not (MAVSDK), that is an error."""
     data = content(10_000)
@@ -100,25 +86,6 @@ async def test_an_open_reply_without_a_size_is_an_error_at_once() -> None:
         assert here.count(Opcode.OPEN_FILE_RO) == 1
         await trio.sleep(3)
         assert here.server.open_sessions == 0
-
-
-async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_turn() -> None:
-    here = Rig("ardupilot", link=LinkSettings(delay=0.02))
-    async with here.connected() as connection:
-        here.link.cut()
-        errors: list[MavftpfsError] = []
-
-        async def read() -> None:
-            with pytest.raises(MavftpfsError) as caught:
-                await connection.store.read_whole(b"/@SYS/uarts.txt", 1000)
-            errors.append(caught.value)
-
-        began = trio.current_time()
-        async with trio.open_nursery() as nursery:
-            for _ in range(5):
-                nursery.start_soon(read)
-        assert trio.current_time() - began < 40.0
-        assert [type(error) for error in errors] == [RequestTimeout, *[VehicleLost] * 4]
 
 
 @pytest.mark.holds("rule 14.31")
@@ -307,28 +274,3 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(profile: 
         assert await sink.wait_for(0, len(data)) == data
         assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
         reader.close()
-
-
-@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
-async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(profile: str) -> None:
-    """He takes it in mid-read, is heard a little later, and leaves."""
-    here = Rig(profile, link=LinkSettings(rate=100_000.0, delay=0.02))
-    root = ROOTS.get(profile, b"")
-    here.card.add(root + b"/ours", content(300_000))
-    here.card.add(root + b"/theirs", content(300_000, seed=9))
-    async with here.mounted(root or b"/") as tree, trio.open_nursery() as nursery:
-        file = await tree.open(root + b"/ours")
-        first = bytes(await file.read(0, 1000))
-
-        async def rival() -> None:
-            await trio.sleep(0.5)
-            here.another_asks(Opcode.RESET_SESSIONS, heard=False)
-            here.another_asks(Opcode.OPEN_FILE_RO, root + b"/theirs", heard=False)
-            await trio.sleep(0.3)
-            here.another_asks(Opcode.TERMINATE_SESSION)
-
-        nursery.start_soon(rival)
-        got = first + bytes(await file.read(1000, 299_000))
-        assert got == content(300_000)
-        assert here.connection.vehicle.another_client_at is not None
-        file.close()

@@ -12,7 +12,6 @@ import pytest
 import trio
 
 from mavftpfs.cache.tree import OpenFile, Tree
-from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig
@@ -245,36 +244,6 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: 
         await writer.write(0, b"whole")
         await writer.release()
         assert here.data(PATH) == b"whole"
-
-
-@pytest.mark.parametrize("successor", [SUCCESSOR, OLD + b"more"], ids=["as long", "grown"])
-async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(successor: bytes) -> None:
-    async with mounted("mavsdk") as (here, tree):
-        writer = await tree.open(PATH, write=True)
-        await writer.write(100, MID)
-        here.faults.at(Opcode.WRITE_FILE, lambda: here.faults.after(100, lambda: replace(here, successor)))
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-        assert here.data(PATH) == successor
-        assert here.litter() == []
-        writer.close()
-
-
-@pytest.mark.parametrize("profile", TIMED)
-async def test_what_was_written_is_not_read_among_bytes_of_a_successor(profile: str) -> None:
-    """The rest of the file is opened anew after its delivery."""
-    async with mounted(profile) as (here, tree):
-        writer = await tree.open(PATH, write=True)
-        await writer.write(100, MID)
-        await writer.fsync()
-        await wait_and_replace(here)
-        try:
-            assert bytes(await writer.read(0, len(OLD))) == OLD[:100] + MID + OLD[103:]
-        except FileChanged:
-            with pytest.raises(FileChanged):
-                await writer.write(0, MID)
-        await writer.release()
-        assert here.data(PATH) == SUCCESSOR
 
 
 @pytest.mark.parametrize("profile", TIMED)

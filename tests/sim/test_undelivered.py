@@ -6,7 +6,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import tempfile
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -525,38 +524,6 @@ async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
     speak(here)
     await file.release()
     assert here.data(NEW) == BIG[:65_000]
-
-
-@pytest.mark.parametrize("how", ["unlink", "rename over it"])
-async def test_removing_what_was_not_delivered_frees_its_place(here: Rig, how: str) -> None:
-    tree = here.mount(dirty_max=64 * KIB, spool_max=2 * len(BIG))
-    for _ in range(3):
-        file = await begin(here, tree)
-        with pytest.raises(MavftpfsError):
-            await file.flush()
-        file.close()
-        speak(here)
-        if how != "unlink":
-            await write_file(tree, b"/d/other", b"small")
-            await tree.rename(b"/d/other", NEW, noreplace=False)
-        await tree.unlink(NEW)
-        assert tree.status()["bytes_held_on_disk"] == 0
-
-
-async def test_nothing_stays_in_the_directory_for_temporaries(
-    here: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    tree = here.mount(dirty_max=64 * KIB)
-    file = await begin(here, tree)
-    assert os.listdir(tmp_path)
-    with pytest.raises(RequestTimeout):
-        await file.release()
-    speak(here)
-    await write_file(tree, b"/d/second", BIG)
-    assert await tree.drain(100) == []
-    assert os.listdir(tmp_path) == []
-    assert here.data(NEW) == here.data(b"/d/second") == BIG
 
 
 # --- a process that is killed
