@@ -51,21 +51,7 @@ def asked_twice(engine: Engine) -> Payload:
     return first
 
 
-def test_a_card_that_pauses_is_no_bad_path() -> None:
-    engine = make()
-    reading(engine)
-    asked = sent(engine, 0.0)
-    for now in (1.0, 2.0):
-        asked += again(engine, now)
-    assert len(asked) > 6
-    for request in asked:
-        engine.receive(chunk(request, CONTENT), 3.0)
-    assert engine.stats.spurious
-    assert engine.stats.unknown
-    assert engine.stats.unexplained == 0
-
-
-def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
+def test_a_card_that_pauses_is_no_bad_path_though_nobody_wants_its_answers_any_more() -> None:
     engine = make()
     transfer = reading(engine)
     asked = sent(engine, 0.0)
