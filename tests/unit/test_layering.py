@@ -44,34 +44,6 @@ CONTRACTS = {"cache.remote": {"session"}, "protocol.payload": {"cache"}}
 """Modules that other layers may import, too: what the caches need of the session, and the refusals' names."""
 
 PURE_LAYERS = {"shared", "protocol", "parameters", "sim"}
-PURE_MODULES = {
-    "link.addresses",
-    "link.frames",
-    "link.framing",
-    "link.fastframe",
-    "link.messages",
-    "link.peers",
-    "link.signing",
-    "link.uri",
-    "session.doubt",
-    "session.others",
-    "session.vehicle",
-    "cache.attributes",
-    "cache.options",
-    "cache.readahead",
-    "cache.replacements",
-    "cache.reserved",
-    "cache.draft",
-    "client.flights",
-    "client.options",
-    "hub.inlet",
-    "hub.outbox",
-    "hub.routing",
-    "hub.senders",
-    "mount.handles",
-    "mount.roster",
-    "mount.options",
-}
 IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
@@ -167,9 +139,16 @@ def may_import(module: Module, target: str) -> bool:
     return target_layer in LAYERS.get(module.layer, {"cli"})
 
 
+def headline(module: Module) -> str:
+    """Return the first paragraph of a module's docstring."""
+    return (ast.get_docstring(module.tree) or "").partition("\n\n")[0]
+
+
 def is_pure(module: Module) -> bool:
-    """Return whether the module may use neither trio, time, files, sockets nor the kernel."""
-    return module.name in PURE_MODULES or (module.layer in PURE_LAYERS and module.name not in IMPURE_MODULES)
+    """Return whether the module says, or all of its layer are, to use neither trio, time, files, sockets nor
+    the kernel."""
+    of_layer = module.layer in PURE_LAYERS and module.name not in IMPURE_MODULES
+    return of_layer or "; pure" in headline(module)
 
 
 def impurities(modules: Modules) -> list[str]:
@@ -241,18 +220,12 @@ def test_pure_modules_have_no_clock_and_no_io() -> None:
     assert impurities(load_package()) == []
 
 
-def headline(module: Module) -> str:
-    """Return the first paragraph of a module's docstring."""
-    return (ast.get_docstring(module.tree) or "").partition("\n\n")[0]
-
-
-def test_each_module_says_its_layer_and_whether_it_is_pure() -> None:
+def test_each_module_says_its_layer() -> None:
     modules = [
         module for module in load_package().values() if module.name not in {*LAYERS, "__init__", "__main__"}
     ]
     lost = [module.name for module in modules if f"Layer: {module.layer}" not in headline(module)]
     assert lost == []
-    assert [module.name for module in modules if "; pure" in headline(module) and not is_pure(module)] == []
 
 
 def test_each_dependency_is_known_in_one_place() -> None:
@@ -283,7 +256,7 @@ GIANT = "def f() -> None:\n" + "    pass\n" * MAX_FUNCTION_LINES
     ("checker", "modules"),
     [
         (wrong_directions, package(session__store="import mavftpfs.cache.files", cache__files="")),
-        (impurities, package(protocol__engine="from time import monotonic")),
+        (impurities, package(link__uri='"""Links. Layer: link; pure."""\nfrom time import monotonic')),
         (impurities, package(protocol__engine="import random\nx = random.random()")),
         (trespassers, package(cache__files="import pymavlink.mavutil")),
         (long_parts, package(mount__kernel=GIANT)),
