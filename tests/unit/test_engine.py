@@ -13,6 +13,7 @@ from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
+from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, chunk, nak, packet, sent
 from tests.support.transfers import MemorySink
 
@@ -139,6 +140,7 @@ def test_a_short_queue_is_forgotten_with_its_server() -> None:
     assert engine.flow.cap == 4
     engine.forget_server()
     assert engine.flow.cap > 4
+    assert engine.traits == Traits()
 
 
 @pytest.mark.holds("fault replay", "rule 14.4")

@@ -53,6 +53,10 @@ def test_what_tells_two_boards_apart(known: AutopilotVersion, told: AutopilotVer
 def test_it_may_have_restarted_while_it_was_away() -> None:
     identity = Watched()
     identity.heard(10.0)
+    assert identity.may_be_asked(1000.0), "it never told its id"
+    identity.told(version(1))
+    assert identity.may_be_asked(10.0 + ABSENCE)
+    assert not identity.may_be_asked(10.1 + ABSENCE), "not into a silence"
     assert not identity.away_since(10.0, 10.0 + ABSENCE)
     assert identity.away_since(10.0, 10.1 + ABSENCE)
     identity.heard(20.0)
@@ -67,8 +71,10 @@ def test_it_may_have_restarted_while_it_was_away() -> None:
 def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity = Watched()
     identity.told(version(1))
-    identity.doubt()
     assert not identity.told(version(2))
+    assert identity.doubts == 1
+    for _ in range(2 * MOST_UNANSWERED):
+        identity.unanswered()
     assert standing(identity) is Standing.STRANGER
     identity.doubt()  # it went: the next one may be ours
     assert standing(identity) is not Standing.STRANGER

@@ -17,6 +17,7 @@ from mavftpfs.session.scheduler import (
     LONG_WAIT,
     MAX_TURN,
     MIN_TURN,
+    RELIEF,
     USE_MEMORY,
     Scheduler,
     SessionUser,
@@ -62,6 +63,15 @@ def test_who_used_little_goes_first_until_another_waited_long() -> None:
     late = 100.0 + LONG_WAIT
     assert busy.rank(late, 0.02) < light.rank(late, 0.02)
     assert light.rank(late, 1.0) < busy.rank(late, 1.0)
+
+
+def test_who_waited_long_keeps_the_session_for_a_while() -> None:
+    user = heavy()
+    user.waiting_since = 100.0
+    began = 100.0 + LONG_WAIT
+    assert user.gives_way(0.0, began - 0.1, began, 0.02)
+    assert not user.gives_way(0.0, began, began + 0.1, 0.02)
+    assert user.gives_way(0.0, began, began + RELIEF, 0.02)
 
 
 @pytest.mark.parametrize(
