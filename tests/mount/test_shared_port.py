@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from mavftpfs.link.rendezvous import hubs
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, command, hub_of, wait_until
 from tests.support.vehicles import HOST, free_udp_port
@@ -53,6 +55,9 @@ def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Fiel
     assert "log.bin" in listed
     (facts,) = json.loads(command("hub", "--json", source)[0])
     assert len({tuple(client["address"]) for client in facts["clients"]}) == 2
+    for door in hubs():
+        modes = [stat.S_IMODE(path.lstat().st_mode) for path in (door, door.parent)]
+        assert modes == [0o600, 0o700], "the hub is its user's alone"
     heard = two.status()["link"]["received_bytes"]
     assert reads_right(one, cards[0])
     assert two.status()["link"]["received_bytes"] - heard < len(CONTENT) / 2, "not what others get"
