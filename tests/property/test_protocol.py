@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -23,13 +24,12 @@ from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import usable_name
-from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import decode_reply, sent
 from tests.support.transfers import MemorySink
-from tests.support.virtual import CLIENT, VirtualLink
 
 BYTE = st.integers(0, 255)
 PAYLOADS = st.builds(
@@ -156,25 +156,53 @@ def test_receive_never_raises(
 FIELDS = ("seq", "session", "opcode", "req_opcode", "burst_complete", "offset")
 
 
-class Vandal:
-    """Changes header fields of some replies, as a foreign or broken server would."""
+CLIENT = Address(254, 191)
+MAX_STEPS = 2_000_000
 
-    def __init__(self, server: FtpServer, rng: random.Random, share: float) -> None:
+
+class Way:
+    """An engine, a bad link and a server, on virtual time.
+
+    spoil: of so many of the replies header fields are changed, as by a foreign or broken server.
+    """
+
+    def __init__(self, server: FtpServer, settings: LinkSettings, seed: int) -> None:
         self.server = server
-        self.rng = rng
-        self.share = share
-        self.handle = server.handle
-        self.next_deadline = server.next_deadline
+        self.rng = random.Random(seed)
+        self.model = LinkModel(random.Random(seed + 1), settings)
+        self.engine = Engine(random.Random(seed + 2), Flow(), op_deadline=30.0)
+        self.now = 100.0
+        self.spoil = 0.0
 
-    def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
-        out = []
-        for target, wire in self.server.outgoing(now):
-            out.append((target, wire))
-            if target == CLIENT and self.rng.random() < self.share:
-                # In place of the right one, or beside it.
-                spoilt = (target, self._spoil(wire))
-                out = [*out, spoilt] if self.rng.random() < 0.5 else [*out[:-1], spoilt]
-        return out
+    def run_until(self, finished: Callable[[], bool]) -> None:
+        """Go on until `finished`, for 2000 s at most."""
+        end = self.now + 2000.0
+        for _ in range(MAX_STEPS):
+            self._exchange(self.now)
+            if finished():
+                return
+            deadlines = [side.next_deadline() for side in (self.engine, self.server, self.model)]
+            self.now = max(self.now, min(time for time in deadlines if time is not None))
+            assert self.now <= end
+        raise AssertionError("time does not go on")
+
+    def _exchange(self, now: float) -> None:
+        for wire in self.model.pop(Direction.TO_CLIENT, now):
+            self.engine.receive(decode_reply(wire), now)
+        deadline = self.engine.next_deadline()
+        if deadline is not None and deadline <= now:
+            self.engine.on_deadline(now)
+        self.engine.take_finished()
+        for wire in self.engine.outgoing(now):
+            self.model.push(Direction.TO_VEHICLE, wire, now)
+        for wire in self.model.pop(Direction.TO_VEHICLE, now):
+            self.server.handle(wire, CLIENT, now)
+        for _, wire in self.server.outgoing(now):
+            spoilt = self.rng.random() < self.spoil
+            if not spoilt or self.rng.random() < 0.5:
+                self.model.push(Direction.TO_CLIENT, wire, now)
+            if spoilt:  # in place of the right one, or beside it
+                self.model.push(Direction.TO_CLIENT, self._spoil(wire), now)
 
     def _spoil(self, wire: bytes) -> bytes:
         payload = decode_reply(wire)
@@ -217,13 +245,14 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
     tree.add(b"/f", content)
     server = FtpServer(tree, PROFILES[name], rng=random.Random(rng.random()))
     wire = LinkSettings(delay=0.02, loss=loss, duplicate=duplicate, reorder=reorder, jitter=0.01)
-    link = VirtualLink(server, wire, seed=seed)
+    link = Way(server, wire, seed)
     opened = OpenRequest(Opcode.OPEN_FILE_RO, b"/f", session=link.engine.home_session)
-    link.run(opened)
+    link.engine.start(opened, link.now)
+    link.run_until(lambda: opened.done)
     if opened.error is not None:
         return  # the ACK was lost and the file is open over there: the session layer's business
     link.engine.session = opened.session
-    link.server = Vandal(server, rng, spoil)
+    link.spoil = spoil
     sink = MemorySink(size)
     transfer = kind(opened.session, size, sink)
     link.engine.start(transfer, link.now)
@@ -232,11 +261,11 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
         start = rng.randrange(size + 1)
         transfer.want(start, start + rng.randrange(size + 1), rng.random() < 0.7)
         transfer.want(0, size // 2, False)
-        link.run_until(lambda: transfer.idle or transfer.done, 2000.0)
+        link.run_until(lambda: transfer.idle or transfer.done)
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = rng.random() < 0.5
     transfer.want(0, size, True)
-    link.run_until(lambda: transfer.idle or transfer.done, 2000.0)
+    link.run_until(lambda: transfer.idle or transfer.done)
     for start, stop in sink.have:
         assert bytes(sink.data[start:stop]) == content[start:stop]
     chunks = -(-size // MAX_DATA) + 8
