@@ -343,53 +343,6 @@ async def test_outside_the_whitelist_stays_refused() -> None:
     assert here.server.open_sessions == 0
 
 
-async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer() -> None:
-    data = content(200_000)
-    here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.3))
-    here.card.add(b"/etc/rc", b"#")
-    async with here.connected() as connection:
-        async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
-            await connection.store.list_directory(b"/etc")
-            await trio.sleep(5)
-            asked = here.count(Opcode.LIST_DIRECTORY)
-            with trio.move_on_after(0.05) as impatience:
-                await connection.store.list_directory(b"/etc")
-            await trio.sleep(1)
-            assert impatience.cancelled_caught
-            assert here.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
-        assert source.all_proven
-        assert source.rollbacks == 0
-    assert here.data(b"/d/new") == data
-
-
-async def test_a_crowd_of_listings_beside_an_upload_on_nuttx() -> None:
-    """Whatever slips in between arming and writing, the upload is not refused for it."""
-    data = content(40_000)
-    here = Rig("px4-nuttx", link=LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))
-    here.put_directory(b"/d")
-    here.card.add(b"/etc/init.d/rcS", b"#")
-    listed = 0
-    async with here.connected() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        async with trio.open_nursery() as nursery:
-
-            async def crowd(directory: bytes) -> None:
-                nonlocal listed
-                while True:
-                    await connection.store.list_directory(directory)
-                    listed += 1
-
-            for directory in (b"/etc", b"/etc/init.d", b"/", b"/fs"):
-                nursery.start_soon(crowd, directory)
-            await upload.finish()
-            nursery.cancel_scope.cancel()
-        assert source.all_proven
-        assert source.rollbacks == 0
-        assert listed > 10
-    assert here.data(b"/d/new") == data
-
-
 @pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("beside_a_copy", [False, True])
 @pytest.mark.parametrize("count", [1, 2])

@@ -171,18 +171,6 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing() -> No
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(here.faults.requests)
 
 
-async def test_changes_that_concern_one_another_take_turns() -> None:
-    here = made("px4", LinkSettings(delay=0.5))
-    async with here.mounted(D) as tree:
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(tree.rename, D, b"/e")
-            await trio.sleep(0.1)
-            with pytest.raises(Exception, match="does not exist"):
-                await tree.mkdir(D + b"/new")
-        await tree.mkdir(b"/e/new")
-        assert b"new" in {entry.name for entry in here.card.entries(b"/e")}
-
-
 @pytest.mark.parametrize("same", [False, True])
 async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool) -> None:
     here = made("px4")

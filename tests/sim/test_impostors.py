@@ -338,24 +338,6 @@ async def test_no_file_is_read_half_from_each(profile: str) -> None:
 
 
 @pytest.mark.holds("fault another vehicle")
-@pytest.mark.parametrize("tells", ["never", "once"])
-async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
-    tells: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Later, if it told once: it was asked for seconds."""
-    scene = Scene("px4", LinkSettings(delay=0.02))
-    silent = scene.rig.vehicle.framer.encode_heartbeat(2, 12)
-    if tells == "never":
-        monkeypatch.setattr(scene.rig.vehicle, "_version", lambda: silent)
-    async with scene.mounted() as tree:
-        monkeypatch.setattr(scene.rig.vehicle, "_version", lambda: silent)
-        await swap(scene.rig, scene.rig.vehicle, gap=4.0)
-        start = trio.current_time()
-        assert await read_through(tree, FILE) == OUR_FILE
-        assert (trio.current_time() - start > 5.0) == (tells == "once")
-
-
-@pytest.mark.holds("fault another vehicle")
 async def test_ours_is_known_again_though_nobody_was_silent(caplog: pytest.LogCaptureFixture) -> None:
     """A ground station asked the other one, which is switched on as ours is switched off."""
     caplog.set_level(logging.INFO)

@@ -19,9 +19,9 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FtpNak, LinkError, MavftpfsError, NotFound, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, LinkError, NotFound, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.rigs import KINDS, RENAMING, Rig, card, read_file, rig, write_file
+from tests.support.rigs import KINDS, RENAMING, Rig, card, read_file, rig
 from tests.support.transfers import content
 
 FILE, NEW, OTHER = b"/d/file", b"/d/new", b"/d/other"
@@ -139,31 +139,6 @@ async def test_a_file_is_opened_before_or_after_its_name_is_changed(
             assert list(here.files()) == [left]
             written = () if change == "unlink" else (base[:3] + b"mid" + base[6:], b"\0\0\0mid")
             assert here.data(left) in (base, *written)
-
-
-@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
-async def test_a_read_under_way_goes_on_when_the_file_is_renamed(profile: str) -> None:
-    one, two = content(12_000, 1), content(12_000, 2)
-
-    async def read(file: OpenFile, expected: bytes) -> None:
-        assert bytes(await file.read(0, len(expected))) == expected
-
-    for later in (0, 3, 8):
-        link = LinkSettings(rate=20_000.0, delay=0.02)
-        async with rig(profile, {FILE: one, OTHER: two}, link=link) as here:
-            tree = here.mount()
-            file, replaced = await tree.open(FILE), await tree.open(OTHER)
-            began = trio.current_time()
-            async with trio.open_nursery() as both:
-                both.start_soon(read, file, one)
-                both.start_soon(read, replaced, two)
-                await trio.sleep(later * 0.05)
-                await tree.rename(FILE, OTHER)
-            assert trio.current_time() - began < 10
-            for handle in (file, replaced):
-                await handle.release()
-            await trio.sleep(5)
-            assert here.files() == {OTHER: one}
 
 
 @pytest.mark.holds("fault overlap")
@@ -401,27 +376,6 @@ async def test_emptied_at_any_request_of_its_delivery(profile: str, write: Write
 
 
 RADIO = LinkSettings(rate=6000.0, delay=0.05)
-LONG = content(60_000)
-MOMENTS = (0.1, 1.0, 5.0, 9.0)
-"""Seconds since the delivery of that began; it takes 11 and more on the radio."""
-
-
-@pytest.mark.holds("promise 4")
-@pytest.mark.parametrize("take", TAKES)
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(profile: str, take: Take) -> None:
-    for moment in MOMENTS:
-        async with rig(profile, {OTHER: PLAIN}, link=RADIO) as here:
-            tree = here.mount()
-            file = await tree.create(FILE, exclusive=True)
-            await file.write(0, LONG)
-            async with in_the_middle(file, waiting=3, after=moment):
-                began = trio.current_time()
-                await take(tree)
-                assert trio.current_time() - began < PROMPT
-            assert trio.current_time() - began < PROMPT
-            assert bytes(await file.read(0, len(LONG) + 1)) == LONG
-            await file.release()
 
 
 @pytest.mark.holds("fault overlap")
@@ -447,28 +401,6 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> Non
         assert here.data(OTHER) == 4 * piece
 
 
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_the_old_file_stays_while_nobody_waits(profile: str) -> None:
-    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
-    async with rig(profile, {FILE: BYTES}, link=RADIO) as here:
-        tree = here.mount()
-        await tree.list(b"/d")
-        file = await begun(tree, FILE, LONG)
-        here.faults.cut_after(60)
-        with pytest.raises(MavftpfsError):
-            await file.release()
-        here.faults.cut_after(None)
-        await trio.sleep(5)
-        began = trio.current_time()
-        file = await tree.open(FILE, write=True, truncate=True)
-        assert trio.current_time() - began < PROMPT
-        await trio.sleep(100)
-        assert here.data(FILE) == BYTES
-        await file.write(0, NEWER)
-        await file.release()
-        assert here.data(FILE) == NEWER
-
-
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("path", [NEW, FILE])
 async def test_a_removal_that_was_given_up_loses_nothing(slow: Rig, path: bytes) -> None:
@@ -484,25 +416,6 @@ async def test_a_removal_that_was_given_up_loses_nothing(slow: Rig, path: bytes)
     assert slow.data(path) == data
     await file.release()
     await settle(slow, tree)
-
-
-@pytest.mark.parametrize("more", [b"", b"more"])
-@pytest.mark.parametrize("path", [NEW, FILE])
-async def test_a_delivery_that_was_given_up_at_its_very_end_goes_on(path: bytes, more: bytes) -> None:
-    """Nobody waits for the end of the upload any more, which takes nothing more."""
-    async with rig("px4", {FILE: OLD}, link=FAR) as here:
-        tree, ending = here.mount(), trio.Event()
-        file = await begun(tree, path)
-        here.faults.at(Opcode.CALC_FILE_CRC32, ending.set)
-        async with trio.open_nursery() as waiting:
-            waiting.start_soon(file.fsync)
-            await ending.wait()
-            await trio.sleep(0.06)
-            waiting.cancel_scope.cancel()
-        await file.write(len(DATA), more)
-        await file.release()
-        assert tree.undelivered() == []
-        assert here.data(path) == DATA + more
 
 
 # --- files that are emptied while what they held is on its way
@@ -523,29 +436,6 @@ async def test_emptying_waits_for_no_room(slow: Rig) -> None:
     await other.release()
     await file.release()
     assert slow.data(NEW) == b"short"
-
-
-@pytest.mark.parametrize("nth", [1, 2, 3])
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_emptying_waits_for_no_rename(profile: str, nth: int) -> None:
-    """None of the requests is answered by which a delivery gives the file its name."""
-    async with rig(profile, {FILE: OLD}, options=ConnectOptions(op_deadline=50.0)) as here:
-        tree = here.mount()
-        await write_file(tree, OTHER, b"it")
-        file = await begun(tree, FILE)
-        here.faults.at(Opcode.RENAME, lambda: None, nth=nth, times=1000, drop=True)
-        async with trio.open_nursery() as waiting:
-            waiting.start_soon(file.fsync)
-            await trio.sleep(5.0)
-            before = trio.current_time()
-            other = await tree.open(FILE, write=True, truncate=True)
-            assert trio.current_time() - before < PROMPT
-            here.faults.call_off()
-        await other.write(0, LATER)
-        await other.release()
-        await file.release()
-        await settle(here, tree)
-        assert here.files() == {FILE: LATER, OTHER: b"it"}
 
 
 @pytest.mark.parametrize("profile", RENAMING)

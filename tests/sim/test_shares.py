@@ -5,7 +5,6 @@ Virtual time, bytes compared. The targets are those of docs/benchmarks.md; scrip
 
 from __future__ import annotations
 
-from dataclasses import replace
 from statistics import mean
 
 import pytest
@@ -18,7 +17,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
 from tests.support.rigs import Rig
-from tests.support.transfers import MemorySink, MemorySource, begin_to_read, content
+from tests.support.transfers import MemorySource, begin_to_read, content
 
 LONG = 60.0
 SHORT = 10.0
@@ -264,23 +263,3 @@ async def test_a_slow_link_that_becomes_fast_is_used() -> None:
             await trio.sleep(5.0)
             assert sink.have.total - before > 0.8 * 5.0 * rate * MAX_DATA / FRAME
         reader.close()
-
-
-@pytest.mark.soak
-async def test_a_way_that_becomes_longer_for_good_is_found_out() -> None:
-    """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
-    away."""
-    loss, size = 0.02, 8 << 20
-    here = Rig("px4", {b"/d/f": content(size, 1)}, LinkSettings(rate=3000.0, delay=0.025, loss=loss))
-    async with here.connected() as connection:
-        sink = MemorySink(size)
-        reader = await connection.store.open_reader(b"/d/f", sink)
-        reader.want(0, size, demand=True)
-        await trio.sleep(20.0)
-        here.model.settings = replace(here.model.settings, rate=60_000.0, delay=0.25)
-        await trio.sleep(90.0)
-        before = sink.have.total
-        await trio.sleep(10.0)
-        share = (sink.have.total - before) / (10.0 * 60_000.0 * MAX_DATA / FRAME * (1 - loss))
-        reader.close()
-    assert share > 0.85

@@ -25,7 +25,6 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySource, content, know, path, read_file, start, under_way
 
 EVERY_PROFILE = sorted(PROFILES)
-BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
 @pytest.mark.parametrize("size", [START_AT, 200_000])
