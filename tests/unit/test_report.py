@@ -80,7 +80,7 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
     cache = {
         "reads": [READ],
         "rate": 5100.0,
-        "transfers": [WRITE, waiting],
+        "transfers": [WRITE, waiting, {**waiting, "path": "/e", "sending": True}],
         "write_rate": 300.0,
         "files_undelivered": 3,
         "bytes_undelivered": 4096,
@@ -90,12 +90,14 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
         "  reading /fs/microsd/log/2026-11-20/10_32_15.ulg: 35 % of 3.4 MB, 5.1 kB/s, 7 min 13 s left",
         "  sending /a: 75 % of 4.1 kB, 300 B/s, 3.4 s left",
         "  waiting /b: empty, the card is full",
+        "  sending /e: empty",
         "  held back: 3 files, 4.1 kB",
         "  failed /c: no",
     ]
-    assert lines({"armed": True}, {**cache, "reads": []})[1:4] == [
+    assert lines({"armed": True}, {**cache, "reads": []})[1:5] == [
         "  waiting /a: 75 % of 4.1 kB",
         "  waiting /b: empty, the card is full",
+        "  waiting /e: empty",
         "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
     ]
 
