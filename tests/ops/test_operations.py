@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import inspect
 import logging
 import os
 from collections.abc import Callable, Coroutine
@@ -207,19 +206,6 @@ async def test_unknown_attributes_never_ask_the_tree(name: bytes) -> None:
     assert await failure(ops.getxattr(ino, name, CTX)) == errno.ENODATA
     assert await failure(ops.getxattr(ino, XATTR_STATUS, CTX)) == errno.ENODATA
     assert tree.calls == []
-
-
-# -- what would change the tree -------------------------------------------------------------------
-
-
-def test_every_handler_is_ours_or_deliberately_the_library_s() -> None:
-    left = {
-        name
-        for name, value in vars(pyfuse3.Operations).items()
-        if inspect.iscoroutinefunction(value) and getattr(Operations, name) is value
-    }
-    by_the_kernel = {"access", "fsyncdir", "poll", "readlink", "removexattr", "setxattr"}
-    assert left == by_the_kernel, "their ENOSYS has the kernel answer by itself"
 
 
 # -- errors and deadlines -------------------------------------------------------------------------
