@@ -21,7 +21,7 @@ from mavftpfs.mount.handles import ROOT_INO, DirectoryHandle, Presentation
 from mavftpfs.mount.operations import UNKNOWN_SPACE, Operations
 from mavftpfs.mount.root import RootOperations
 from mavftpfs.mount.roster import Roster
-from mavftpfs.shared.errors import FtpNak, ListingIncomplete, NotFound, PathTooLong
+from mavftpfs.shared.errors import ListingIncomplete, PathTooLong
 from tests.ops.faketree import FakeTree
 
 CTX = cast(RequestContext, None)
@@ -135,18 +135,6 @@ async def test_a_directory_lists_itself_and_its_parent_and_counts_no_lookup(
     await ops.forget([(log, 1), (listing.taken[2][1], 1)])
     ops.inodes.check_invariants()
     assert len(ops.inodes) == 1
-
-
-@pytest.mark.parametrize("error", [NotFound("gone"), FtpNak(3, 10)])
-async def test_a_refused_listing_is_no_empty_directory(
-    error: BaseException, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tree, listing = some_tree(), Listing(monkeypatch)
-    ops = operations(tree)
-    fh = await ops.opendir(ROOT_INO, CTX)
-    tree.error = error
-    assert await failure(listing.read(ops, fh, 0)) == errno.EIO  # by ENOENT the C library ends without one
-    assert await failure(ops.opendir(ROOT_INO, CTX)) == errno.ENOENT
 
 
 async def test_an_incomplete_listing_is_shown_and_then_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
