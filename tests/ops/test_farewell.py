@@ -76,6 +76,16 @@ def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
         assert unknown.path.parent.name == "unknown"
 
 
+def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
+    dead = SpoolDirectory(state / "base", random.Random(1))
+    (dead.path / "000001.data").write_bytes(b"held")
+    dead.close()
+    spool = SpoolDirectory(state / "base", random.Random(2))
+    assert leftovers.rescue(spool, "tcp:x:1").startswith("1 file(s) of an earlier mount did not reach")
+    assert leftovers.rescue(spool, "tcp:x:1") == ""
+    spool.close()
+
+
 def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(self: SpoolDirectory, recovery: Path) -> list[Path]:
         raise OSError("the disk is full")
