@@ -209,14 +209,6 @@ def test_message_unknown_to_the_dialect_is_other_if_a_frame_follows() -> None:
     assert feed(framer, heartbeat()) == [Other(DRONE, 60_001), HEARTBEAT]
 
 
-def test_reset_forgets_half_a_frame() -> None:
-    framer = Framer(US, stream=True)
-    feed(framer, ftp()[:60])
-    framer.reset()
-    assert feed(framer, ftp()) == [FTP]
-    assert framer.garbage == 60
-
-
 def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     framer = Framer(US, stream=True)
 
@@ -239,15 +231,6 @@ def test_one_flipped_bit_in_a_length_hides_what_follows_only_until_given_up() ->
     assert not framer.waiting
     assert feed(framer, heartbeat()) == [HEARTBEAT]
     assert framer.on_silence() == []
-
-
-@pytest.mark.parametrize("cut", [1, 5, 9, 12, 20])
-def test_a_frame_that_never_ends_is_dropped(cut: int) -> None:
-    framer = Framer(US, stream=True)
-    feed(framer, heartbeat()[:cut])
-    assert framer.on_silence() == []
-    assert not framer.waiting
-    assert feed(framer, heartbeat()) == [HEARTBEAT]
 
 
 # ---------------------------------------------------------------------- hooks
