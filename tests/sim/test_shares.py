@@ -11,12 +11,11 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
-from tests.support.rigs import Rig
+from tests.support.rigs import Rig, read_file, write_file
 from tests.support.transfers import MemorySource, begin_to_read, content
 
 LONG = 60.0
@@ -68,21 +67,6 @@ def test_a_radio_of_57600_baud_is_written_and_little_in_vain(profile: str, loss:
         assert result.requests <= 1.05 / (1 - loss) ** 2
 
 
-async def copy(tree: Tree, here: Rig, case: Case, data: bytes) -> None:
-    """Read, or write, as cp does."""
-    path = b"/d/log.bin"
-    if case.direction == "read":
-        file = await tree.open(path)
-        assert b"".join([bytes(await file.read(at, 1 << 17)) for at in range(0, len(data), 1 << 17)]) == data
-        file.close()
-        return
-    file = await tree.create(path, exclusive=True)
-    await file.write(0, data)
-    await file.flush()
-    await file.release()
-    assert here.data(path) == data
-
-
 def serial_share(case: Case, seed: int) -> float:
     """Return the share of the limit that one run through the caches reaches on a serial port."""
     link = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=SHORT_QUEUE)
@@ -95,10 +79,14 @@ def serial_share(case: Case, seed: int) -> float:
     async def run() -> float:
         async with here.mounted(b"/d", verify="size") as tree:
             began = trio.current_time()
-            await copy(tree, here, case, data)
+            if case.direction == "write":
+                await write_file(tree, b"/d/log.bin", data)
+            else:
+                assert await read_file(tree, b"/d/log.bin") == data
             return trio.current_time() - began
 
     took = trio.run(run, clock=MockClock(autojump_threshold=0))
+    assert here.data(b"/d/log.bin") == data
     return len(data) / took / case.limit_beside(here.vehicle.server.firmware.pauses)
 
 
