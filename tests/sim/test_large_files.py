@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import errno
+from collections.abc import Iterable
 from struct import pack
 
 import pytest
 
-from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import FtpNak
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.tree import DEFAULT_MTIME, Entry, Kind, MemoryTree, Stat, TreeFile
+from tests.support.replies import ack, nak
 from tests.support.rigs import rig
 
 GIB = 1 << 30
 SIZE = 4 * GIB - 5
 """The largest sizes that fit the 32 bits of an open's reply."""
 
-STAT = Stat(Kind.FILE, SIZE, DEFAULT_MTIME)
+HUGE = b"/d/huge"
 WIDTH = 8
 READS = (
     (0, 1000),
@@ -40,65 +40,31 @@ def expected(offset: int, count: int) -> bytes:
     return words[offset - first * WIDTH : stop - first * WIDTH]
 
 
-class HugeFile:
-    """An open file that is computed, not stored; implements TreeFile for reading."""
-
-    def read(self, offset: int, size: int) -> bytes:
-        return expected(offset, size) if offset < SIZE else b""
-
-    def write(self, offset: int, data: bytes) -> int:
-        raise AssertionError("nobody writes here")
-
-    def size(self) -> int:
-        return SIZE
-
-    def resize(self, size: int) -> None:
-        raise AssertionError("nobody writes here")
-
-    def close(self) -> None:
-        pass
-
-
-class HugeTree(MemoryTree):
-    """Every file is of nearly 4 GiB."""
-
-    def entries(self, path: bytes) -> list[Entry]:
-        return [
-            entry if entry.stat.kind is Kind.DIRECTORY else Entry(entry.name, STAT)
-            for entry in super().entries(path)
-        ]
-
-    def stat(self, path: bytes) -> Stat:
-        found = super().stat(path)
-        return found if found.kind is Kind.DIRECTORY else STAT
-
-    def open(
-        self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
-    ) -> TreeFile:
-        return super().open(path, write=True, create=True) if write else HugeFile()
-
-
-@asynccontextmanager
-async def huge(profile: str) -> AsyncIterator[OpenFile]:
-    """Open such a file."""
-    path = b"/d/huge"
-    async with rig(profile, {path: b""}, link=LinkSettings(delay=0.01), card=HugeTree()) as here:
-        tree = here.mount(cache_size=1 << 20)
-        assert (await tree.stat(path)).size == SIZE
-        file = await tree.open(path)
-        assert file.size == SIZE
-        yield file
-        await file.release()
-
-
 @pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize(
-    ("profile", "reach"),
-    [("px4", SIZE), ("px4-nuttx", SIZE), ("mavsdk", SIZE), ("ardupilot", 2 * GIB), ("ardupilot5", 2 * GIB)],
+    ("profile", "reach"), [("px4", SIZE), ("px4-nuttx", SIZE), ("mavsdk", SIZE), ("ardupilot5", 2 * GIB)]
 )
 async def test_any_place_of_a_huge_file_can_be_read_or_is_an_error(profile: str, reach: int) -> None:
-    """ArduPilot's offsets are signed 32 bits (AP_Filesystem::lseek)."""
-    async with huge(profile) as file:
+    """reach: ArduPilot's offsets are signed 32 bits (AP_Filesystem::lseek)."""
+
+    def change(request: Payload, reply: Payload) -> Iterable[Payload]:
+        if request.opcode in (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME):
+            listed = reply.data.replace(b"Fhuge\t0", b"Fhuge\t%d" % SIZE)
+            return [reply._replace(data=listed, size=len(listed))]
+        if request.opcode == Opcode.OPEN_FILE_RO:
+            return [reply._replace(data=SIZE.to_bytes(4, "little"))]
+        if request.opcode != Opcode.READ_FILE:
+            return [reply]
+        if request.offset + request.size > reach < SIZE:
+            return [nak(request, NakCode.FAIL_ERRNO, errno.EINVAL)]
+        return [ack(request, expected(request.offset, request.size))]
+
+    async with rig(profile, {HUGE: b""}, link=LinkSettings(delay=0.01)) as here:
+        here.server.change = change
+        tree = here.mount(cache_size=1 << 20)
+        assert (await tree.stat(HUGE)).size == SIZE
+        file = await tree.open(HUGE)
+        assert file.size == SIZE
         for offset, count in READS:
             if reach == SIZE or offset + count <= reach:
                 assert bytes(await file.read(offset, count)) == expected(offset, count)
@@ -107,3 +73,4 @@ async def test_any_place_of_a_huge_file_can_be_read_or_is_an_error(profile: str,
                     await file.read(offset, count)
         assert bytes(await file.read(SIZE, 10)) == b""
         assert bytes(await file.read(4096, 1000)) == expected(4096, 1000)
+        await file.release()
