@@ -409,31 +409,6 @@ async def test_all_older_versions_are_lost(there: Rig) -> None:
         await file.release()
 
 
-async def test_what_we_write_ourselves_loses_nobody(there: Rig) -> None:
-    """Also where listings show the new file before its delivery is over."""
-    tree = there.mount()
-    reader, writer = await opened(tree), await tree.open(FILE, write=True)
-
-    async def look() -> None:
-        while True:
-            tree.forget_caches()
-            await (await tree.open(FILE)).release()
-            assert bytes(await reader.read(0, 3)) == b"new"
-            await trio.sleep(0.01)
-
-    async with trio.open_nursery() as both:
-        await writer.write(0, b"new")
-        both.start_soon(look)
-        await writer.fsync()
-        await writer.write(100, b"newer")
-        await writer.truncate(500)
-        await writer.fsync()
-        both.cancel_scope.cancel()
-    for file in (writer, reader):
-        await file.release()
-    assert there.data(FILE) == b"new" + OLD[3:100] + b"newer" + OLD[105:500]
-
-
 @pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])
 async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(there: Rig, look: str) -> None:

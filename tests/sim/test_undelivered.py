@@ -359,25 +359,6 @@ async def test_a_rename_that_did_not_happen_is_no_reason_once_its_file_went_othe
         assert here.files() == {FILE: OLD + b"more"}
 
 
-@pytest.mark.parametrize("carried_out", [False, True])
-async def test_an_append_survives_a_removal_that_did_not_happen(carried_out: bool) -> None:
-    """If it did happen, the append is refused, as there is no file."""
-    async with mounted("px4", {FILE: OLD}) as (here, tree):
-        file = await tree.open(FILE, write=True)
-        await file.write(0, OLD)
-        silence(here, carried_out=carried_out, opcode=Opcode.REMOVE_FILE)
-        with pytest.raises(OutcomeUnknown):
-            await tree.unlink(FILE)
-        speak(here)
-        if carried_out:
-            with pytest.raises(FileChanged):
-                await file.release()
-        else:
-            await file.write(len(OLD), b"more")
-            await file.release()
-            assert here.files() == {FILE: OLD + b"more"}
-
-
 async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree: Tree) -> None:
     asked: list[float] = []
     here.faults.at(Opcode.CREATE_FILE, lambda: asked.append(trio.current_time()), times=10_000, drop=True)

@@ -75,12 +75,11 @@ class Rig:
         seed: int = 1,
         telemetry: float = 0.0,
         serial: bool = False,
-        card: MemoryTree | None = None,
     ) -> None:
         """files: None for a directory. telemetry: bytes per second. serial: the link is a serial port."""
         self.profile = profile
         self.root = ROOTS.get(profile, b"")
-        self.card = card or MemoryTree(clock=wall)
+        self.card = MemoryTree(clock=wall)
         self.vehicle = SimVehicle(self.card, PROFILES[profile], rng=Random(seed), telemetry=telemetry)
         self.server = LyingServer(self.card, PROFILES[profile], rng=Random(seed))
         self.vehicle.server = self.server
