@@ -55,7 +55,7 @@ class Station(Program):
         wait_until("the station listens", lambda: "ready" in self.output.read_text())
 
     def results(self) -> Any:
-        """Wait for its end; return what it got."""
+        """Wait for its end; return the parameters that it got."""
         assert self.wait(200) == 0, self.text()
         return json.loads(self.output.read_text().splitlines()[-1])
 
@@ -101,7 +101,7 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
     flown = Flown(field, "--rate", "5760", link="pty") if kind == "pty" else Flown(field)
     mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
     work_on(mount, flown.root, station)
-    assert station.results()["parameters"] == PARAMETERS
+    assert station.results() == PARAMETERS
     assert mount.unmount() == 0
     assert flown.stop() == 0
     heard = recorded(station.record, "<")
@@ -123,7 +123,7 @@ def test_signed_frames_pass_unchanged(field: Field) -> None:
     mount = field.mount(flown.source, forwarded(port), f"signing_key={key}", "dir_timeout=0")
     second = field.mount(flown.source, f"signing_key={key}", "dir_timeout=0")
     work_on(mount, flown.root, station)
-    assert station.results()["parameters"] == PARAMETERS
+    assert station.results() == PARAMETERS
     assert second.read_bytes(second.path / "log.bin") == CONTENT
     assert [one.unmount() for one in (mount, second)] == [0, 0]
     assert flown.stop() == 0
@@ -171,7 +171,7 @@ def test_endpoints_that_flood_harm_nobody(field: Field) -> None:
         pests = [stack.enter_context(Pest(*pest)) for pest in zip(ports, floods, strict=True)]
         mount = field.mount(flown.source, *map(forwarded, [*ports, other]), "dir_timeout=0")
         work_on(mount, flown.root, work)
-        assert work.results()["parameters"] == PARAMETERS
+        assert work.results() == PARAMETERS
         assert all(pest.sent > 1000 for pest in pests)
 
 
@@ -182,7 +182,7 @@ def test_two_stations_with_one_id_both_work(field: Field) -> None:
     mount = field.mount(flown.source, *map(forwarded, ports), "dir_timeout=0")
     for station in stations:
         work_on(mount, flown.root, station)
-        assert station.results()["parameters"] == PARAMETERS
+        assert station.results() == PARAMETERS
 
 
 # -- the end of the mount ---------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
     python -m tests.support.station PORT --record FILE [--key HEX]
 
-Listens on the loopback, and prints a line of JSON on what it got; --record: each frame that came in or went
+Listens on the loopback, and prints them as a line of JSON; --record: each frame that came in or went
 out, as `tests.support.flown` writes it.
 """
 
@@ -93,7 +93,7 @@ def main() -> int:
     stop.set()
     if args.key is None:
         beating.join()
-    print(json.dumps({"parameters": found}), flush=True)
+    print(json.dumps(found), flush=True)
     return 0
 
 
