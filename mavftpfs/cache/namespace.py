@@ -11,7 +11,6 @@ closed. Where the card cannot rename (LittleFS), the change of the name is refus
 
 from __future__ import annotations
 
-import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
 
@@ -36,8 +35,6 @@ from mavftpfs.shared.errors import (
     PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
-
-log = logging.getLogger("mavftpfs.cache")
 
 RECENT = 2.0
 """Seconds for which a listing is recent enough to change a name by. So the removal of many files does not

@@ -23,7 +23,6 @@ MAGIC = 0x671B
 MAGIC_DEFAULTS = 0x671C
 """Of a file in which defaults may follow values."""
 
-MAX_NAME = 16
 HEADER = struct.Struct("<HHH")
 _DEFAULT = 1
 _MAX_SHARED = 15

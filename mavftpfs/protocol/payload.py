@@ -87,13 +87,6 @@ class Payload(NamedTuple):
         return _HEADER.pack(*self[:7]) + self.data + _ZEROS[HEADER_SIZE + len(self.data) :]
 
 
-def request(
-    seq: int, opcode: int, *, session: int = 0, offset: int = 0, data: bytes = b"", size: int | None = None
-) -> Payload:
-    """Build a request; `size` is len(data) unless given (ReadFile puts the wanted count there)."""
-    return Payload(seq, session, opcode, len(data) if size is None else size, 0, 0, offset, data)
-
-
 Fields: TypeAlias = tuple[int, int, int, int, int, int, int, bytes]
 """What a Payload has, as a plain tuple; `data` is the whole field of 239 bytes, and `size` is not checked."""
 

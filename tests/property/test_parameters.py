@@ -7,7 +7,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, MAX_NAME, pack_upload, unpack
+from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, pack_upload, unpack
 from mavftpfs.parameters.text import parse, render_all, render_changed, render_qgc
 from mavftpfs.parameters.values import Kind, Parameter, fit, float_text, same
 from mavftpfs.shared.errors import RemoteProtocolError
@@ -16,6 +16,7 @@ from mavftpfs.sim.parameters import Selection, Table
 
 FLOATS = st.floats(width=32)
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_"
+MAX_NAME = 16
 NAMES = st.text(LETTERS, min_size=1, max_size=MAX_NAME).filter(lambda name: not name.isdecimal())
 
 

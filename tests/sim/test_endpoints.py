@@ -18,11 +18,12 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Heartbeat, Message
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.arguments import add_arguments, link_settings
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from tests.support.replies import request
 from tests.support.vehicles import free_udp_port
 
 pytestmark = pytest.mark.real_time

@@ -7,7 +7,7 @@ import pytest
 import trio
 
 from mavftpfs.link.messages import Address, FtpRun
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, request
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN
 from mavftpfs.session.scheduler import ReadMode
@@ -17,6 +17,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.replies import request
 from tests.support.rigs import Rig, rig
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import ROOTS, MemorySink, begin_to_read, content, read_file

@@ -11,7 +11,7 @@ import trio
 
 from mavftpfs.cache.delivery import START_AT
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.serversession import REOPENS
 from mavftpfs.session.upload import Upload
@@ -20,6 +20,7 @@ from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 from tests.support.faults import STATION
+from tests.support.replies import request
 from tests.support.rigs import Rig, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import MemorySource, content, know, path, read_file, start, under_way

@@ -16,6 +16,13 @@ def decode_reply(wire: bytes) -> Payload:
     return reply_of(fields)
 
 
+def request(
+    seq: int, opcode: int, *, session: int = 0, offset: int = 0, data: bytes = b"", size: int | None = None
+) -> Payload:
+    """Build a request; `size` is len(data) unless given (ReadFile puts the wanted count there)."""
+    return Payload(seq, session, opcode, len(data) if size is None else size, 0, 0, offset, data)
+
+
 def sent(engine: Engine, now: float) -> list[Payload]:
     """Return what the engine sends now, decoded; `data` is cut to `size` where it is data."""
     requests = []

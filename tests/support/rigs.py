@@ -25,7 +25,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import subscribe
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
@@ -36,6 +36,7 @@ from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.faults import STATION, Faults
 from tests.support.lying import LyingServer
 from tests.support.memory import MemoryLink
+from tests.support.replies import request
 from tests.support.transfers import ROOTS
 
 GOOD_LINK = LinkSettings()

@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, Payload, request
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.pseudo import VirtualTrees
 from mavftpfs.sim.tree import MemoryTree, Tree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.replies import decode_reply
+from tests.support.replies import decode_reply, request
 
 CLIENT = Address(255, 190)
 OTHER = Address(254, 191)

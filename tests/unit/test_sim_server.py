@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.replies import decode_reply
+from tests.support.replies import decode_reply, request
 from tests.support.sim_client import CLIENT, DIR, FIVE, OTHER, A, small_tree
 
 PATHS = [

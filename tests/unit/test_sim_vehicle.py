@@ -16,12 +16,12 @@ from mavftpfs.link.messages import (
     StorageInformation,
     SystemTime,
 )
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.frames import feed
-from tests.support.replies import decode_reply
+from tests.support.replies import decode_reply, request
 
 T = TypeVar("T")
 US = Address(254, 191)

@@ -15,8 +15,9 @@ from mavftpfs.client.options import Options
 from mavftpfs.client.trace import REPLY, JsonTrace, TlogWriter, text_line
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import UsageError
+from tests.support.replies import request
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()

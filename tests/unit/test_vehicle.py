@@ -14,8 +14,9 @@ from mavftpfs.link.messages import (
     StorageInformation,
     SystemTime,
 )
-from mavftpfs.protocol.payload import Opcode, Payload, request
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.session.vehicle import CLIENT_MEMORY, SILENCE_LIMIT, Vehicle
+from tests.support.replies import request
 
 pytestmark = pytest.mark.holds("fault boot time asked")
 

@@ -9,7 +9,7 @@ import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import NakCode, Opcode, crc32, request
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
@@ -24,6 +24,7 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.model import EntryKind
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.pseudo import VirtualTrees
+from tests.support.replies import request
 from tests.support.rigs import Rig, card, read_file, rig
 
 LIE = 100_000
