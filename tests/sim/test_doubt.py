@@ -94,6 +94,14 @@ def test_what_was_made_rests_no_longer_than_its_copy_may_be_late() -> None:
     assert late.rest(b"/d/a", 1.05) == 0.0
 
 
+def test_few_names_are_remembered() -> None:
+    late = LateCopies()
+    for number in range(1000):
+        late.on_changed(b"/%d" % number, float(number))
+        late.on_made(b"/%d" % number, float(number))
+    assert len(late._names) == MOST_REST + 1
+
+
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(profile: str, loss: float) -> None:
@@ -265,7 +273,6 @@ async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
 # --- bytes that were ACKed and are not on the card
 
 
-DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
 OPCODE = 3
 
 READY = 0.011
@@ -550,45 +557,6 @@ async def test_an_open_whose_caller_was_cancelled_comes_late(profile: str, laten
             await connection.store.stat_size(path(profile, "one"))
         await read_or_doubt(connection, path(profile, "two"), files[b"/d/two"])
         assert came.is_set()
-
-
-@pytest.mark.holds("promise 2")
-@pytest.mark.parametrize("profile", ["px4", "px4-2026", "mavsdk"])
-async def test_a_write_that_we_repeated_comes_into_the_last_round_trip_of_the_next_file(profile: str) -> None:
-    """Its ACK comes when that file's Terminate is on its way. A file of this size is not compared unasked."""
-    for lateness in (0.385, 0.405, 0.425, 0.445):
-        async with rig(profile, {b"/d/k": b"x"}, link=LinkSettings(delay=0.025)) as here:
-            tree = here.mount(verify_max=1000)
-            for number in range(2):
-                await write_file(tree, b"/d/k%d" % number, content(100_000, 5))
-            come_late(here, lateness, Opcode.WRITE_FILE, nth=3)
-            for number in (1, 2):
-                await write_file(tree, b"/d/%d" % number, content(20_000, number))
-            for number in (1, 2):
-                assert here.data(b"/d/%d" % number) == content(20_000, number)
-
-
-@pytest.mark.parametrize("verify", ["auto", "size", "none"])
-async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str) -> None:
-    here = Rig("px4", {b"/d/k": b"x"}, DOUBLING)
-    async with here.mounted(b"/d", verify=verify, verify_max=50_000) as tree:
-        came = trio.Event()
-
-        def is_first(wire: bytes) -> bool:
-            first = wire[OPCODE] == Opcode.WRITE_FILE and not came.is_set()
-            if first:
-                came.set()
-            return first
-
-        come_again(here, 0.15, is_first)
-        file = await tree.create(b"/d/new", exclusive=True)
-        await file.write(0, b"B" * 100_000)
-        await came.wait()
-        await trio.sleep(0.08)
-        await file.write(0, b"C" * 100)
-        await file.flush()
-        assert here.data(b"/d/new")[:200] == b"C" * 100 + b"B" * 100
-        file.close()
 
 
 @pytest.mark.holds("rule 14.39")
