@@ -73,6 +73,15 @@ class Standing(Enum):
 class Identity:
     """Tells the vehicle from another one at its address, by the unique id.
 
+    | what happens | standing |
+    |---|---|
+    | it was silent, it restarted, or the link was reopened | DOUBTED, if it ever told its id |
+    | it answers from another network address | DOUBTED |
+    | it tells the id that is known, or the first one | TRUSTED |
+    | it tells another id | STRANGER |
+    | while DOUBTED it is heard, and answers none of MOST_UNANSWERED questions | TRUSTED: not all tell an id |
+    | the same, at another network address, and it told its id before | STRANGER |
+
     Attributes:
         standing: of the one that answers now. Only a trusted one is asked for files.
         left_at: when it was heard last before it was away, the last time.
