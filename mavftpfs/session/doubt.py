@@ -58,7 +58,8 @@ class LateCopies:
 
     def on_maybe_under_way(self, path: bytes, seconds: float, now: float) -> None:
         """A request that may have taken the file of this name away, or emptied it, was sent more than once
-        and answered so many seconds after the first time, or was not waited for any longer."""
+        and answered so many seconds after the first time; or it was not answered, and is not waited for any
+        longer."""
         self._note(path.lower(), now, now, now + max(LEAST_REST, min(MOST_REST, 2 * seconds)))
 
     def on_made(self, path: bytes, now: float) -> None:

@@ -370,21 +370,21 @@ class Store:
     async def _perform(self, path: bytes, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; look what became of it if its answer may not be that to its first execution. path:
         the name that a late copy of it would harm."""
+        error: FtpNak | RequestTimeout
         for last in (False, True):
             self._under_way += 1
             self._sent += 1
-            began, repeated = self._clock(), False
+            began, under_way = self._clock(), True  # until it is answered, and was sent once
             try:
-                repeated = (await self._server.ask(make, changes=True)).retransmitted
+                under_way = (await self._server.ask(make, changes=True)).retransmitted
                 return
-            except (FtpNak, RequestTimeout) as failure:
-                error, repeated = failure, isinstance(failure, FtpNak) and failure.retransmitted
-            except trio.Cancelled:
-                repeated = True  # it may be on the way, as one that is repeated
-                raise
+            except FtpNak as nak:
+                error, under_way = nak, nak.retransmitted
+            except RequestTimeout as timeout:
+                error = timeout
             finally:
                 self._under_way -= 1
-                if repeated:
+                if under_way:
                     self._late_copies.on_maybe_under_way(path, self._clock() - began, self._clock())
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(verify)

@@ -18,7 +18,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, Doubt, LateCopies
-from mavftpfs.shared.errors import MavftpfsError, SessionBusy
+from mavftpfs.shared.errors import MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support import rigs
@@ -511,6 +511,20 @@ async def test_a_change_of_a_name_whose_caller_was_cancelled_comes_late(
                 await connection.store.rename(name, path(profile, "f~"))
             else:
                 await connection.store.remove(name)
+        await put(connection, name, content(400, 2))
+        await came.wait()
+        await trio.sleep(READY)
+        assert here.card.data(name) == content(400, 2)
+
+
+@pytest.mark.holds("promise 2")
+async def test_a_removal_without_an_answer_comes_late() -> None:
+    here = Rig("px4", {b"/d/f": content(500, 1)}, LinkSettings(delay=0.01))
+    name = path("px4", "f")
+    async with here.connected(ConnectOptions(op_deadline=3.0)) as connection:
+        came = come_again(here, 4.0, lambda wire: wire[OPCODE] == Opcode.REMOVE_FILE, at_once=False)
+        with pytest.raises(RequestTimeout):
+            await connection.store.remove(name)
         await put(connection, name, content(400, 2))
         await came.wait()
         await trio.sleep(READY)
