@@ -238,18 +238,6 @@ async def test_everything_works_up_to_200_bytes(profile: str, length: int, name:
         assert here.files() == {}
 
 
-@pytest.mark.holds("fault odd listing")
-@pytest.mark.parametrize(("length", "name"), [(118, 40), (119, 90), (200, 198)])
-@pytest.mark.parametrize("profile", taking_turns(PROFILES))
-async def test_the_first_change_may_be_an_append(profile: str, length: int, name: int) -> None:
-    """What is tried out beforehand needs names of its own."""
-    async with rig(profile) as here:
-        path = long_path(here, length, name=name)
-        here.put(path, OLD)
-        await append(here.mount(inplace=True), path, NEW)
-        assert here.files() == {path: OLD + NEW}
-
-
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
 async def test_a_path_too_long_for_names_beside_it_is_not_written(profile: str) -> None:
     async with rig(profile) as here:

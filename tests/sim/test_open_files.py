@@ -366,30 +366,6 @@ async def require_lost(reader: OpenFile) -> None:
 
 
 @pytest.mark.holds("promise 5")
-async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(there: Rig) -> None:
-    """The kernel keeps no pages of the new file meanwhile: it would give them to readers of the old one."""
-    tree = there.mount()
-    lost = await reader_of_another(there, tree)
-    later = await tree.open(FILE)
-    await require_lost(lost)
-    writer = await tree.open(FILE, write=True)
-    await require_lost(lost)
-    assert later.direct_io
-    assert writer.direct_io
-    await writer.write(0, b"mid")
-    await require_lost(lost)
-    await writer.fsync()
-    await require_lost(lost)
-    for file in (later, writer):
-        assert bytes(await file.read(0, 900)) == b"mid" + LATER[3:]
-        await file.release()
-    await require_lost(lost)
-    await lost.release()
-    assert there.data(FILE) == b"mid" + LATER[3:]
-    assert not (await tree.open(FILE)).direct_io
-
-
-@pytest.mark.holds("promise 5")
 async def test_all_older_versions_are_lost(there: Rig) -> None:
     """Also the one that was opened before the file grew."""
     tree = there.mount()

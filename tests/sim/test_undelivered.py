@@ -397,23 +397,6 @@ async def test_a_refusal_is_not_repeated_before_there_is_news(here: Rig, tree: T
     assert tree.undelivered() == []
 
 
-async def test_an_open_file_is_left_to_its_program(here: Rig, tree: Tree) -> None:
-    file = await tree.create(NEW, exclusive=True)
-    await file.write(0, b"content")
-    fall_silent(here)
-    with pytest.raises(RequestTimeout):
-        await file.fsync()
-    speak(here)
-    await trio.sleep(100)
-    assert tree.undelivered() == [NEW]
-    fall_silent(here)
-    with pytest.raises(RequestTimeout):
-        await file.release()
-    speak(here)
-    await trio.sleep(2 * PAUSES[1])
-    assert tree.undelivered() == []
-
-
 # --- a local disk that fails or is full
 
 
