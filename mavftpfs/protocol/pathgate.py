@@ -68,6 +68,8 @@ class PathGate:
         if paths or not self._writes:
             transfer.on_paths()
         self._clear = not (paths if self._writes else any(r.op is transfer for r in flying))
+        if not self._clear:
+            self._began = now  # a turn lasts from the moment at which something may go out
 
     def keeps(self, op: Operation) -> bool:
         """Return whether an operation is to wait."""

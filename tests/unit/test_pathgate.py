@@ -67,6 +67,16 @@ def test_a_path_waits_for_the_writes_on_their_way_and_the_next_writes_for_a_list
     assert card.answer(LEAST + 0.4) == writes
 
 
+def test_a_turn_begins_when_the_other_kind_is_answered() -> None:
+    card = Card()
+    card.sends(0.0)
+    writes = card.out
+    card.ask(Opcode.RENAME, 0.0)
+    for now in (1.1, 2.2):
+        assert card.sends(now * LEAST) == [], "the writes are still on their way"
+    assert card.answer(2.3 * LEAST, writes) == [Opcode.RENAME]
+
+
 def test_a_checksum_and_a_terminate_wait_for_nothing() -> None:
     card = Card()
     card.sends(0.0)
