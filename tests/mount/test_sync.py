@@ -290,18 +290,18 @@ def test_a_vehicle_that_is_lost_under_a_mount_is_waited_for_on_the_screen(
     field: Field, tmp_path: Path, command: str
 ) -> None:
     vehicle = field.sim(field.local("card"), "px4", ("--rate", "10000"))
-    write_log(vehicle.root / "log" / "a.ulg", 50_000, 1, 1)
+    files = [(vehicle.root / "log" if command == "sync" else tmp_path) / name for name in ("a", "b")]
+    for file in files:
+        write_log(file, 30_000, 1, 1)
     mount = field.mount(vehicle.source, "op_deadline=3600")
-    words = (
-        [mount.path, tmp_path / "logs"] if command == "sync" else [mount.path, tmp_path / "a.bin", "/a.bin"]
-    )
-    write_log(tmp_path / "a.bin", 50_000, 2, 1)
+    words = [mount.path, tmp_path / "logs"] if command == "sync" else [mount.path, *files, "/"]
     screen = terminal.mavftpfs(command, *words, columns=100, rows=8)
     screen.read_until(lambda shown: "kB/s" in shown.raw)
     vehicle.react(signal.SIGUSR2)  # the link is cut
     screen.read_until(lambda shown: "waiting for the vehicle" in shown.raw)
     vehicle.react(signal.SIGUSR2)
     assert screen.finish() == 0
+    assert "0/2 files" in screen.raw
 
 
 def test_ls_on_a_terminal_and_in_a_pipe(field: Field) -> None:
