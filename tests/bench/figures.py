@@ -47,6 +47,47 @@ LINKS: dict[str, LinkShape | None] = {
 """The links of the bench; `unshaped` is the loopback itself."""
 
 
+REAL_MAVSDK = "mavsdk-real"
+"""The MAVSDK library's own server; every other name is a profile of the simulator."""
+
+WINDOWS = {"ardupilot": 5, REAL_MAVSDK: 32}
+LOOPBACK_WINDOW = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What everybody does. size, peers_size: bytes. timeout: seconds."""
+
+    server: str
+    link: str
+    direction: Direction
+    size: int
+    peers_size: int
+    timeout: float
+
+    @property
+    def shape(self) -> LinkShape | None:
+        """The link, None for the bare loopback."""
+        return LINKS[self.link]
+
+    @property
+    def window(self) -> int:
+        """Requests in flight that fill the link and that the server can hold: for clients that must be
+        told."""
+        server = WINDOWS.get(self.server, 10_000)
+        if self.shape is None:
+            return min(server, LOOPBACK_WINDOW)
+        return min(server, max(4, int(1.5 * self.shape.rate * self.shape.rtt / 266)))
+
+    @property
+    def patience(self) -> float:
+        """Seconds after which a request is lost, for clients that must be told: twice a full window's
+        trip."""
+        if self.shape is None:
+            return 0.25
+        return 0.1 + 2 * (self.shape.rtt + self.window * 277 / self.shape.rate)
+
+
 @dataclass(frozen=True, slots=True)
 class Measured:
     """What came of a transfer. seconds: from the first call to the last. cpu: seconds, user and system, of

@@ -17,22 +17,17 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.bench import record, tables
 from tests.bench.cases import Direction
-from tests.bench.figures import BARE, LINKS, US, LinkShape, Measured, Outcome, Run, as_json, summarise
+from tests.bench.figures import BARE, LINKS, REAL_MAVSDK, US, Cell, Measured, Outcome, Run, as_json, summarise
 from tests.bench.peers import PINS, Client, Job, clients, install
 from tests.support.mounts import wait_until
 from tests.support.vehicles import HOST, Process, free_udp_port
 
-REAL_MAVSDK = "mavsdk-real"
-"""The MAVSDK library's own server; every other name is a profile of the simulator."""
-
-WINDOWS = {"ardupilot": 5, REAL_MAVSDK: 32}
-LOOPBACK_WINDOW = 64
 READY_TIMEOUT = 90.0
 
 CELLS = (
@@ -47,40 +42,6 @@ CELLS = (
     ("ardupilot", "57600"),
 )
 """Server and link."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """What everybody does. size, peers_size: bytes. timeout: seconds."""
-
-    server: str
-    link: str
-    direction: Direction
-    size: int
-    peers_size: int
-    timeout: float
-
-    @property
-    def shape(self) -> LinkShape | None:
-        """The link, None for the bare loopback."""
-        return LINKS[self.link]
-
-    @property
-    def window(self) -> int:
-        """Requests in flight that fill the link and that the server can hold: for clients that must be
-        told."""
-        server = WINDOWS.get(self.server, 10_000)
-        if self.shape is None:
-            return min(server, LOOPBACK_WINDOW)
-        return min(server, max(4, int(1.5 * self.shape.rate * self.shape.rtt / 266)))
-
-    @property
-    def patience(self) -> float:
-        """Seconds after which a request is lost, for clients that must be told: twice a full window's
-        trip."""
-        if self.shape is None:
-            return 0.25
-        return 0.1 + 2 * (self.shape.rtt + self.window * 277 / self.shape.rate)
 
 
 def cells() -> Iterator[Cell]:
@@ -123,8 +84,7 @@ def run_one(cell: Cell, client: Client, source: Path, seed: int) -> Run:
         reading = cell.direction == "read"
         shutil.copyfile(source, (card if reading else here) / "file.bin")
         port, local = free_udp_port(), here / "file.bin"
-        limits = (cell.timeout, cell.window, cell.patience)
-        job = Job(port, cell.direction, "/bench/file.bin", local, *limits, folder)
+        job = Job(cell, port, local, folder)
         server = Process("server", server_argv(cell, folder / "card", port, seed), folder)
         try:
             wait_until("server ready", lambda: bool(server.output.read_bytes()), READY_TIMEOUT)

@@ -25,30 +25,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.bench.cases import Direction
-from tests.bench.figures import BARE, US, Measured, Outcome
+from tests.bench.figures import BARE, US, Cell, Measured, Outcome
 from tests.support.mounts import abort_mount, mounted_at, wait_until
 from tests.support.vehicles import HOST, Process, peak_memory
 
 PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
 CONNECT_TIMEOUT = 120.0
 HERE = Path(__file__).parent
+REMOTE = "/bench/file.bin"
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One transfer: client port, REMOTE (a path on the vehicle), LOCAL (what to write or read here).
+    """One transfer. port: the client's. local: what to write or read here. folder: for logs, mount points."""
 
-    timeout: seconds. window: requests that the server can have in flight. patience: seconds after which one
-    is lost. folder: for logs and mount points.
-    """
-
+    cell: Cell
     port: int
-    direction: Direction
-    remote: str
     local: Path
-    timeout: float
-    window: int
-    patience: float
     folder: Path
 
 
@@ -75,7 +68,7 @@ class Client:
 def _by_worker(argv: list[str], job: Job) -> Measured:
     worker = Process("worker", argv, job.folder)
     try:
-        code = worker.popen.wait(CONNECT_TIMEOUT + job.timeout)
+        code = worker.popen.wait(CONNECT_TIMEOUT + job.cell.timeout)
     except subprocess.TimeoutExpired:
         worker.kill()
         return Measured(Outcome.FAILED, detail="not connected in time")
@@ -103,15 +96,15 @@ def _by_mount(argv: list[str], point: Path, job: Job) -> Measured:
 
 def _copied(daemon: int, point: Path, job: Job) -> Measured:
     """Run `cp`, which ends at the time-out because the mount does."""
-    there = point / job.remote.lstrip("/")
-    paths = (there, job.local) if job.direction == "read" else (job.local, there)
-    watch = threading.Timer(job.timeout, abort_mount, [point])
+    there = point / REMOTE.lstrip("/")
+    paths = (there, job.local) if job.cell.direction == "read" else (job.local, there)
+    watch = threading.Timer(job.cell.timeout, abort_mount, [point])
     watch.start()
     cpu, began = _spent(daemon), time.monotonic()
     copied = subprocess.run(["cp", *paths], stderr=subprocess.PIPE, text=True, check=False)
     seconds = time.monotonic() - began
     watch.cancel()
-    if seconds >= job.timeout:
+    if seconds >= job.cell.timeout:
         return Measured(Outcome.TIMEOUT)
     if copied.returncode:
         return Measured(Outcome.FAILED, detail=_last_line(copied.stderr))
@@ -167,10 +160,10 @@ def clients() -> dict[str, Client]:
         return [python, str(HERE / "peer.py"), library, *_task(job), *more]
 
     def tuned(job: Job, point: Path) -> list[str]:
-        return peer("pymavlink", job, "--chunk", "239", "--window", str(job.window))
+        return peer("pymavlink", job, "--chunk", "239", "--window", str(job.cell.window))
 
     def bare(job: Job, point: Path) -> list[str]:
-        limits = ["--window", str(job.window), "--patience", str(job.patience)]
+        limits = ["--window", str(job.cell.window), "--patience", str(job.cell.patience)]
         return [sys.executable, "-m", "tests.bench.bare", *_task(job), *limits]
 
     def ours(job: Job, point: Path) -> list[str]:
@@ -193,4 +186,4 @@ def clients() -> dict[str, Client]:
 
 
 def _task(job: Job) -> list[str]:
-    return [str(job.port), job.direction, job.remote, str(job.local), str(job.timeout)]
+    return [str(job.port), job.cell.direction, REMOTE, str(job.local), str(job.cell.timeout)]

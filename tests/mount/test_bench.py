@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from tests.bench.figures import BARE, US, Outcome, summarise
-from tests.bench.mount import Cell, measure
+from tests.bench.figures import BARE, US, Cell, Outcome, summarise
+from tests.bench.mount import measure
 from tests.bench.peers import Client, clients
 
 SIZE = 60_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_request, reply_of, split_run
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload, decode_request, reply_of, split_run
 
 
 def decode_reply(wire: bytes) -> Payload:
@@ -49,9 +49,9 @@ def ack(
     )
 
 
-def nak(request: Payload, *codes: int, session: int | None = None) -> Payload:
+def nak(request: Payload, *codes: int) -> Payload:
     """Return a NAK with these data bytes (the code, perhaps an errno); the offset is 0, as MAVSDK's is."""
-    return ack(request, bytes(codes), session=session, offset=0)._replace(opcode=int(Opcode.NAK))
+    return ack(request, bytes(codes), offset=0)._replace(opcode=int(Opcode.NAK))
 
 
 def eof(request: Payload) -> Payload:
@@ -65,10 +65,10 @@ def chunk(request: Payload, content: bytes) -> Payload:
     return ack(request, data) if data else eof(request)
 
 
-def packet(request: Payload, index: int, data: bytes, *, size: int = 239, complete: int = 0) -> Payload:
-    """Return packet `index` of the burst that `request` began, `size` bytes apart."""
+def packet(request: Payload, index: int, data: bytes, *, complete: int = 0) -> Payload:
+    """Return packet `index` of the burst that `request` began; full ones have 239 bytes."""
     seq = (request.seq + 1 + index) & 0xFFFF
-    offset = request.offset + index * size
+    offset = request.offset + index * MAX_DATA
     return Payload(seq, 0, Opcode.ACK, len(data), Opcode.BURST_READ_FILE, complete, offset, data)
 
 
