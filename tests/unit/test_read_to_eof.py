@@ -17,11 +17,9 @@ from tests.support.replies import chunk, nak, sent
 class Reading:
     """One read to EOF and the requests it has made."""
 
-    def __init__(self, limit: int = 10_000, block: int = 100, *, any_order: bool = False) -> None:
+    def __init__(self, limit: int = 10_000, block: int = 100) -> None:
         self.op = ReadToEof(7, block, limit)
         self.engine = Engine(random.Random(1), Flow())
-        if any_order:
-            self.engine._ledger.reorder = 8
         self.engine.start(self.op, 0.0)
         self.out: dict[int, Payload] = {}
         self.more()
@@ -84,15 +82,6 @@ def test_a_short_block_before_another_proves_nothing(late: bool) -> None:
     else:
         reading.answer(0, bytes(50))
         reading.answer(100, bytes(200))
-    assert isinstance(reading.op.error, DataUnproven)
-
-
-def test_data_behind_an_end_proves_nothing() -> None:
-    reading = Reading(any_order=True)
-    reading.refuse(100, NakCode.EOF)
-    reading.refuse(200, NakCode.EOF)
-    assert not reading.op.done
-    reading.answer(300, bytes(400))
     assert isinstance(reading.op.error, DataUnproven)
 
 

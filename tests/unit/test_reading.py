@@ -85,16 +85,6 @@ def ranges(requests: list[Payload]) -> list[tuple[int, int]]:
 # --- wants
 
 
-@pytest.mark.holds("rule 14.13")
-def test_the_last_request_is_clamped_to_the_size() -> None:
-    reader = Reader(size=500)
-    reader.transfer.want(0, 10_000, True)
-    assert ranges(reader.finish()) == [(0, 239), (239, 478), (478, 500)]
-    assert bytes(reader.sink.data) == CONTENT[:500]
-    assert reader.transfer.idle
-    assert reader.transfer.received_bytes == 500
-
-
 def test_nothing_is_asked_beyond_the_end_or_twice() -> None:
     reader = Reader()
     reader.transfer.want(SIZE, SIZE + 100, True)
@@ -119,28 +109,6 @@ def test_demand_goes_before_readahead_and_promotes_it() -> None:
     assert reader.sink.repeats == 0
 
 
-def test_readahead_can_be_dropped() -> None:
-    reader = Reader(limit=1)
-    reader.transfer.want(0, 1000, False)
-    (request,) = reader.sent()
-    reader.transfer.drop(demand=False)
-    reader.answer(request)
-    assert reader.sent() == []
-    assert reader.transfer.idle
-    assert reader.sink.have == ExtentSet([(0, 239)])
-
-
-def test_what_is_on_its_way_at_the_end_of_a_turn_is_wanted_as_before() -> None:
-    reader = Reader(limit=2)
-    wants = reader.transfer.wants
-    reader.transfer.want(0, 478, False)
-    assert len(reader.sent()) == 2
-    reader.transfer.want(0, 100, True)
-    assert reader.transfer.demanded
-    reader.transfer.give_back()
-    assert (wants.demand, wants.ahead) == (ExtentSet([(0, 239)]), ExtentSet([(239, 478)]))
-
-
 @pytest.mark.parametrize(("demand", "left"), [(True, []), (False, [(0, 239)])])
 def test_for_what_was_dropped_on_its_way_no_program_waits(demand: bool, left: list[tuple[int, int]]) -> None:
     reader = Reader(limit=2)
@@ -154,18 +122,6 @@ def test_for_what_was_dropped_on_its_way_no_program_waits(demand: bool, left: li
 
 
 # --- replies to ReadFile
-
-
-@pytest.mark.holds("fault chunk size")
-def test_a_short_reply_is_asked_for_again() -> None:
-    reader = Reader(limit=1)
-    reader.transfer.want(0, 239, True)
-    (request,) = reader.sent()
-    reader.engine.receive(ack(request, CONTENT[:100]), 0.1)
-    (rest,) = reader.sent()
-    assert ranges([rest]) == [(100, 239)]
-    reader.answer(rest)
-    assert bytes(reader.sink.data[:239]) == CONTENT[:239]
 
 
 @pytest.mark.holds("fault chunk size", "rule 14.5")

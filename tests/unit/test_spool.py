@@ -13,8 +13,8 @@ from random import Random
 import pytest
 
 from mavftpfs.cache import spool as spooling
-from mavftpfs.cache.recovery import SLOTS, SpoolDirectory, move
-from mavftpfs.cache.spool import Spool, SpoolContent, write_facts
+from mavftpfs.cache.recovery import SLOTS, SpoolDirectory
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
 pytestmark = pytest.mark.holds("promise 3")
@@ -100,40 +100,17 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
     assert content.get(0, len(data) + 4) == data + b"more"
 
 
-def test_a_directory_that_cannot_be_used_is_no_space(tmp_path: Path) -> None:
-    spool = Spool(memory_max=lambda: 0, spool_max=1000, directory=tmp_path / "none")
-    with pytest.raises(NoSpace):
-        SpoolContent(spool).put(0, b"abc")
-
-
 def test_names_in_recovery_do_not_collide_and_unknown_ones_are_kept(tmp_path: Path) -> None:
     slot = SpoolDirectory(tmp_path / "spool", Random(1))
-    for number in (1, 2, 3):
+    facts = [json.dumps({"path": f"/{name}"}) for name in ("x.json", "x", "x.json")]
+    for number, text in enumerate([*facts, "not JSON"]):
         (slot.path / f"{number}.data").write_bytes(b"%d" % number)
-    (slot.path / "1.json").write_text('{"path": "/x"}')
-    (slot.path / "2.json").write_text('{"path": "/x"}')
-    (slot.path / "3.json").write_text("not JSON")
+        (slot.path / f"{number}.json").write_text(text)
     slot.close()
     saved = SpoolDirectory(tmp_path / "spool", Random(1)).rescue(tmp_path / "r")
-    assert [path.name for path in saved] == ["x", "x.1", "3.data"]
-    assert [path.read_bytes() for path in saved] == [b"1", b"2", b"3"]
-
-
-def test_two_mounts_do_not_share_and_a_live_one_is_left_alone(tmp_path: Path) -> None:
-    first = SpoolDirectory(tmp_path, Random(1))
-    (first.path / "1.data").write_bytes(b"live")
-    second = SpoolDirectory(tmp_path, Random(2))
-    assert second.path != first.path
-    assert first.owner not in second.dead_owners
-    assert second.rescue(tmp_path / "r") == []
-    second_path = second.path
-    (second_path / "2.data").write_bytes(b"dead")
-    second.close()
-    first.close()
-    third = SpoolDirectory(tmp_path, Random(3))
-    assert third.path not in (first.path, second.path), "nothing is left in its own"
-    assert {path.read_bytes() for path in third.rescue(tmp_path / "r")} == {b"live", b"dead"}
-    third.close()
+    assert [path.read_bytes() for path in saved] == [b"0", b"1", b"2", b"3"]
+    assert [path.name for path in saved] == ["x.json", "x.1", "x.json.1", "3.data"]
+    assert len(list((tmp_path / "r").iterdir())) == 2 * len(saved), "each has its description"
 
 
 def test_who_takes_a_slot_that_another_mount_knows_for_dead_is_alive(tmp_path: Path) -> None:
@@ -181,13 +158,6 @@ def rescued(directory: SpoolDirectory, tmp_path: Path) -> dict[str, bytes]:
     assert [path.name for path in again.path.iterdir()] == ["owner"]
     again.close()
     return {path.name: path.read_bytes() for path in found}
-
-
-def test_the_name_is_written_down_before_the_first_byte(tmp_path: Path) -> None:
-    directory, _ = spilled(tmp_path)
-    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far"}
-    facts = json.loads((tmp_path / "recovered/card__log.bin.json").read_text())
-    assert facts == {"path": "/card/log.bin"}
 
 
 @pytest.mark.parametrize("close", [False, True])
@@ -352,14 +322,3 @@ def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
             content.put(9, bytes(5 * PAGE))
     assert content.get(0, 9) == b"in memory"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_known_of_a_file_does_not_replace_another_one(tmp_path: Path) -> None:
-    kept = []
-    for number, name in enumerate(("a.json", "a", "a.json")):
-        data = tmp_path / f"{number}.data"
-        data.write_text(name)
-        write_facts(data, {"path": f"/{name}"}, durable=False)
-        kept.append(move(data, {"path": f"/{name}"}, tmp_path / "recovered"))
-    assert [path.read_text() for path in kept] == ["a.json", "a", "a.json"]
-    assert len(list((tmp_path / "recovered").iterdir())) == 6
