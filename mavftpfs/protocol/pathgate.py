@@ -8,7 +8,7 @@ PX4 on NuttX checks each WriteFile against a scratch buffer in which most reques
 | of writes (first) | WriteFile | when a path waits, and the turn lasted `LEAST` or nothing is to be written |
 | of paths | requests with a path | when bytes wait, and the turn lasted `LEAST` or no path waits |
 
-Nothing of one kind goes out while the other is on its way. After a turn of paths the transfer sets the buffer
+Nothing of one kind goes out while the other is on its way, and no turn ends before it could send. After a turn of paths the transfer sets the buffer
 right before it writes (`Operation.on_paths`). Answers come while both kinds wait, so no timer ends a turn.
 """
 
@@ -68,8 +68,6 @@ class PathGate:
         if paths or not self._writes:
             transfer.on_paths()
         self._clear = not (paths if self._writes else any(r.op is transfer for r in flying))
-        if not self._clear:
-            self._began = now  # a turn lasts from the moment at which something may go out
 
     def keeps(self, op: Operation) -> bool:
         """Return whether an operation is to wait."""
