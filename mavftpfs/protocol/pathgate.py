@@ -8,8 +8,9 @@ PX4 on NuttX checks each WriteFile against a scratch buffer in which most reques
 | of writes (first) | WriteFile | when a path waits, and the turn lasted `LEAST` or nothing is to be written |
 | of paths | requests with a path | when bytes wait, and the turn lasted `LEAST` or no path waits |
 
-Nothing of one kind goes out while the other is on its way, and no turn ends before it could send. After a turn of paths the transfer sets the buffer
-right before it writes (`Operation.on_paths`). Answers come while both kinds wait, so no timer ends a turn.
+Nothing of one kind goes out while the other is on its way, and no turn ends before it could send. Before the
+first write after a turn of paths the transfer sets the buffer right (`Operation.on_paths`). Answers come while
+both kinds wait, so no timer ends a turn.
 """
 
 from __future__ import annotations
