@@ -9,8 +9,8 @@ PX4 on NuttX checks each WriteFile against a scratch buffer in which most reques
 | of paths | requests with a path | when bytes wait, and the turn lasted `LEAST` or no path waits |
 
 Nothing of one kind goes out while the other is on its way, and no turn ends before it could send. Before the
-first write after a turn of paths the transfer sets the buffer right (`Operation.on_paths`). Answers come while
-both kinds wait, so no timer ends a turn.
+first write after a turn of paths the transfer sets the buffer right (`Operation.on_paths`). Answers come
+while both kinds wait, so no timer ends a turn.
 """
 
 from __future__ import annotations
