@@ -70,7 +70,7 @@ def held(source: str) -> Iterator[tuple[str, str]]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             marks, name = node.decorator_list, node.name
         elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark":
-            marks = node.value.elts if isinstance(node.value, ast.List) else [node.value]
+            marks = [node.value]
         for mark in marks:
             if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.holds":
                 for key in mark.args:
