@@ -6,7 +6,6 @@ import pickle
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import fsspec
 import pytest
@@ -182,20 +181,6 @@ def test_a_directory_that_cannot_be_listed_is_not_an_empty_one(
     with pytest.raises(PermissionError):
         fs.find("/d")
     assert fs.find("/nothing") == []
-
-
-def test_threads_share_a_connection(source: str, fs: DroneFileSystem) -> None:
-    found: list[Any] = []
-
-    def work() -> None:
-        found.append(fsspec.filesystem("mftp", source=source).cat_file("/d/f"))
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert found == 4 * [DATA]
 
 
 def test_calls_of_many_threads_leave_no_threads(source: str) -> None:

@@ -115,22 +115,14 @@ async def test_what_the_vehicle_has_no_room_for_is_said() -> None:
         )
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("1 2 3\n", b"mission.waypoints:1: the first line"),
-        (PLAN + "x\n", b"mission.waypoints:6: an item has 12 numbers"),
-        ("\xff\n", b"mission.waypoints:1: this is no text"),
-    ],
-)
-async def test_bad_lines_are_named_and_nothing_is_sent(text: str, said: bytes) -> None:
+async def test_bad_lines_are_named_and_nothing_is_sent() -> None:
     async with rig("ardupilot5") as here:
         tree = here.mount()
         file = await tree.open(MISSION, write=True, truncate=True)
-        await file.write(0, text.encode("latin-1"))
+        await file.write(0, b"\xff\n")
         with pytest.raises(InvalidText):
             await file.flush()
-        assert said in await read_file(tree, ERRORS)
+        assert b"mission.waypoints:1: this is no text" in await read_file(tree, ERRORS)
         file = await tree.open(MISSION, write=True, append=True)
         await file.write(0, PLAN.splitlines(keepends=True)[1].encode())
         with pytest.raises(InvalidText):

@@ -190,23 +190,15 @@ async def test_one_download_serves_a_listing_and_the_opens_of_a_second(profile: 
         assert here.count(Opcode.OPEN_FILE_RO) == before + 2
 
 
-async def test_size_and_time_stay_until_it_is_read_anew() -> None:
-    async with vehicle("ardupilot5", parameters=[parameter("COUNTER", INT32, 7, drift=1)]) as (here, tree):
-        before = await tree.stat(ALL)
-        assert (await tree.stat(ERRORS)).mtime >= EPOCH
-        await trio.sleep(100)
-        assert await tree.stat(ALL) == before
-        assert here.count(Opcode.OPEN_FILE_RO) == 1
-        (await tree.open(ALL)).close()
-        assert (await tree.stat(ALL)).size == before.size + 2
-
-
 async def test_what_the_vehicle_sets_by_itself_gives_no_new_time() -> None:
     """An editor that looks at the time before it saves would warn each time."""
     clock = parameter("STAT_RUNTIME", INT32, 100, drift=1)
     async with vehicle("ardupilot5", parameters=[clock, parameter("GAIN", FLOAT, 1)]) as (here, tree):
         before = await tree.stat(ALL)
+        assert (await tree.stat(ERRORS)).mtime >= EPOCH
         await trio.sleep(100)
+        assert await tree.stat(ALL) == before
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
         assert b"STAT_RUNTIME,100" not in await read_file(tree, ALL)
         assert (await tree.stat(ALL)).mtime_ns == before.mtime_ns
         table_of(here).set(b"GAIN", 2, here.server.firmware.now)
@@ -241,21 +233,6 @@ async def test_a_damaged_download_is_read_again_and_then_an_error() -> None:
 
 
 # --- saving
-
-
-@MARKS
-@pytest.mark.parametrize("link", LINKS, ids=lambda link: f"{link.loss:.0%}")
-async def test_an_editor_sets_only_what_its_user_changed(profile: str, link: LinkSettings) -> None:
-    """Twenty values drift meanwhile: none is written back, and none is an error."""
-    async with vehicle(profile, link=link) as (here, tree):
-        editor = await Editor(tree).read()
-        await trio.sleep(30)
-        before = numbers(here)
-        await editor.edit("GAIN_002", "0.5").edit("MODE_003", "77").save()
-        assert (number(here, "GAIN_002"), number(here, "MODE_003")) == (0.5, 77)
-        assert_nothing_written_back(here, before, "GAIN_002", "MODE_003")
-        assert await errors(tree) == ""
-        assert "GAIN_002,0.5" in (await editor.read()).lines
 
 
 @MARKS
@@ -379,7 +356,7 @@ async def test_a_copy_sets_all_that_does_not_hold(profile: str) -> None:
         for name in (b"GAIN_001", b"MODE_002"):
             table_of(here).set(name, 50, here.server.firmware.now)
         await trio.sleep(5)
-        await Editor(tree, QGC).save(saved.replace("\t1\tGAIN_005", "\t1\tGAIN_005"))
+        await Editor(tree, QGC).save(saved)
         assert number(here, "GAIN_001") == pytest.approx(1 / 7)
         assert number(here, "MODE_002") == 2
         assert number(here, "STAT_RUNTIME") > 100
@@ -431,26 +408,12 @@ async def test_a_file_that_is_emptied_after_the_open_has_no_other_base() -> None
         assert writes(here) == 0
 
 
-async def test_nobody_sees_a_text_before_it_is_saved() -> None:
-    async with vehicle("px4-2026") as (_, tree):
-        whole = await read_file(tree, ALL)
-        file = await Editor(tree).open(write=True, truncate=True)
-        await file.write(0, b"MODE_001,9\n")
-        assert await read_file(tree, ALL) == whole
-        await file.flush()
-        assert b"MODE_001,9\n" in await read_file(tree, ALL)
-
-
 # --- what is refused
 
 
 BAD = [
-    ("MODE_001,x\n", "params.parm:1: 'x' is not a number"),
-    ("MODE_001,1\nMODE_001,2\n", "params.parm:2: MODE_001 has another value on line 1"),
     ("\n# c\nNO_SUCH,1\n", "params.parm:3: the vehicle has no parameter NO_SUCH"),
     ("MODE_001,2.9\n", "params.parm:1: MODE_001: 2.9 is not a whole number"),
-    ("MODE_001,3000000000\n", "params.parm:1: MODE_001: 3000000000 does not fit"),
-    ("GAIN_001,1e39\n", "params.parm:1: GAIN_001: 1e+39 is too large"),
     ("rubbish\n", "params.parm:1: 'rubbish' is not NAME,VALUE"),
     ("MODE_002,9\n\xff\n", "params.parm:2: this is no text"),
     ("1\t7\tMODE_001\t5\t6\n", "params.parm:1: MODE_001 is a parameter of component 7"),
@@ -479,10 +442,9 @@ async def test_bad_lines_are_named_and_nothing_is_sent(text: str, said: str) -> 
         assert await errors(tree) == ""
 
 
-@MARKS
-async def test_half_a_last_line_sets_nothing_and_may_be_finished(profile: str) -> None:
+async def test_half_a_last_line_sets_nothing_and_may_be_finished() -> None:
     """A child that a program forks flushes what it inherits."""
-    async with vehicle(profile) as (here, tree):
+    async with vehicle("ardupilot5") as (here, tree):
         file = await Editor(tree).open(write=True, truncate=True)
         await file.write(0, b"MODE_001,5\nMODE_002,7")
         with pytest.raises(InvalidText):
@@ -492,10 +454,6 @@ async def test_half_a_last_line_sets_nothing_and_may_be_finished(profile: str) -
         await file.write(21, b"7\n")
         await file.flush()
         assert (number(here, "MODE_001"), number(here, "MODE_002")) == (5, 77)
-        half = await Editor(tree).open(write=True, truncate=True)
-        await half.write(0, b"MODE_001,6")
-        await half.release()
-        assert number(here, "MODE_001") == 5
 
 
 STUBBORN = [
@@ -556,28 +514,6 @@ async def test_nothing_is_set_in_flight_nor_after_it(profile: str) -> None:
         await trio.sleep(120)
         assert writes(here) == 0
         assert number(here, "MODE_001") == 1
-
-
-@MARKS
-async def test_arming_in_the_middle_ends_it(profile: str) -> None:
-    async with vehicle(profile) as (here, tree):
-        here.faults.at(Opcode.WRITE_FILE, here.vehicle.arm, nth=5)
-        with pytest.raises(Armed):
-            await Editor(tree).save(gains(300))
-        took = taken(here, 300)
-        assert len(took) < 300
-        await here.disarm()
-        await trio.sleep(120)
-        assert taken(here, 300) == took
-
-
-async def test_with_when_armed_ok_it_is_set_in_flight() -> None:
-    async with vehicle("px4-2026") as (here, _):
-        tree = here.mount(write_armed=True)
-        here.connection.vehicle.write_armed = True
-        await here.arm()
-        await Editor(tree).save("MODE_001,9\n")
-        assert number(here, "MODE_001") == 9
 
 
 @MARKS
@@ -645,14 +581,6 @@ async def test_names_beside_the_texts_are_refused() -> None:
                 await tree.open(path, write=True, truncate=True)
         with pytest.raises((ReadOnly, AlreadyExists)):
             await tree.create(ALL, exclusive=True)
-
-
-async def test_a_mount_that_is_read_only_shows_them() -> None:
-    async with vehicle("ardupilot") as (here, _):
-        tree = here.mount(read_only=True)
-        assert b"MODE_001,1\n" in await read_file(tree, ALL)
-        with pytest.raises(ReadOnly):
-            await tree.open(ALL, write=True)
 
 
 # --- the command
