@@ -70,6 +70,16 @@ def test_loss_has_the_share_it_was_given(fields: dict[str, float], low: float, h
     assert low <= 1 - len(link.pop(UP, 1e6)) / 10_000 <= high
 
 
+def test_frames_are_doubled_held_up_and_damaged() -> None:
+    doubled, held, damaged = model(duplicate=1.0), model(reorder=1.0, hold=0.5), model(corrupt=1.0)
+    for link in (doubled, held, damaged):
+        link.push(UP, bytes(10), 0.0)
+    assert drain(doubled, UP, 0.0) == [(0.0, bytes(10))] * 2
+    assert drain(held, UP, 0.0) == [(0.5, bytes(10))]
+    ((_, frame),) = drain(damaged, UP, 0.0)
+    assert (len(frame), frame != bytes(10)) == (10, True)
+
+
 def test_a_cut_loses_what_is_on_the_way() -> None:
     link = model(rate=100.0, delay=1.0)
     for when in (0.0, 3.95, 4.5):
