@@ -121,16 +121,12 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
     assert [(f.source, f.target) for f in of(FtpRun, client.hear(0.5))] == [(DRONE, gcs)]
 
 
-def ask_for_storage(client: Client) -> list[StorageInformation]:
-    """Return what it answers about its card."""
-    client.tell(client.framer.encode_request_message(client.vehicle.address, STORAGE_INFORMATION_ID))
-    return [message for message in client.hear() if isinstance(message, StorageInformation)]
-
-
-def test_the_size_of_the_card_is_told_by_profile_unless_told_otherwise() -> None:
-    assert ask_for_storage(Client("px4"))
-    assert not ask_for_storage(Client("mavsdk"))
-    assert not ask_for_storage(Client("px4", tells_storage=False))
+@pytest.mark.parametrize(
+    ("client", "told"), [(Client("px4"), 1), (Client("mavsdk"), 0), (Client("px4", tells_storage=False), 0)]
+)
+def test_the_size_of_the_card_is_told_by_profile_unless_told_otherwise(client: Client, told: int) -> None:
+    client.tell(client.framer.encode_request_message(DRONE, STORAGE_INFORMATION_ID))
+    assert len(of(StorageInformation, client.hear())) == told
 
 
 def test_two_vehicles_of_one_seed_are_told_apart() -> None:
