@@ -10,7 +10,6 @@ from mavftpfs.cli.verbs import parse_date
 from mavftpfs.client import download, fetch, proof
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
-from mavftpfs.client.proof import Verify
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296
@@ -42,19 +41,9 @@ def test_what_is_here_of_a_file_of_100_bytes(
     assert wanted.here or wanted.begun == begun
 
 
-@pytest.mark.parametrize(
-    ("verify", "resumed", "size", "needed"),
-    [
-        ("auto", False, proof.PROVEN_BY_DEFAULT, True),
-        ("auto", False, proof.PROVEN_BY_DEFAULT + 1, False),
-        ("auto", True, proof.PROVEN_BY_DEFAULT + 1, True),
-        ("all", False, proof.PROVEN_BY_DEFAULT + 1, True),
-        ("none", False, 1, False),
-        ("none", True, 1, True),
-    ],
-)
-def test_what_is_proven(verify: Verify, resumed: bool, size: int, needed: bool) -> None:
-    assert proof.proof_needed(verify, resumed=resumed, size=size) is needed
+def test_only_files_up_to_some_size_are_proven_by_default() -> None:
+    sizes = (proof.PROVEN_BY_DEFAULT, proof.PROVEN_BY_DEFAULT + 1)
+    assert [proof.proof_needed("auto", resumed=False, size=size) for size in sizes] == [True, False]
 
 
 def log(below: str, mtime: int | None = None) -> Wanted:
