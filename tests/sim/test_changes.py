@@ -13,9 +13,7 @@ import trio
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import SLACK
-from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -37,35 +35,6 @@ async def test_an_existing_directory_is_not_taken_for_ours(profile: str) -> None
         with pytest.raises(FtpNak) as refusal:
             await connection.store.make_directory(path(profile, "dir"))
         assert refusal.value.code == 8
-
-
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "px4-2026"])
-async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str) -> None:
-    here = Rig(profile, {b"/d/file": b"content"})
-    here.put_directory(b"/d/dir")
-
-    async def spoil(connection: Connection) -> None:
-        request = Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir"))
-        with pytest.raises(FtpNak):
-            await connection.driver.run(request)
-
-    async with here.connected() as connection:
-        await spoil(connection)
-        with pytest.raises(FtpNak) as refusal:
-            await connection.store.remove(path(profile, "missing"))
-        assert refusal.value.code == 10
-        await spoil(connection)
-        await connection.store.remove(path(profile, "file"))
-        await spoil(connection)
-        source = MemorySource(b"hello")
-        upload = await connection.store.open_upload(path(profile, "new"), source)
-        await upload.finish()
-        await spoil(connection)
-        here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
-        source.add(b" world")
-        upload.wake()
-        await upload.finish()
-        assert here.data(b"/d/new") == b"hello world"
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])

@@ -167,23 +167,6 @@ async def test_a_session_that_vanished_raises_it() -> None:
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(profile: str) -> None:
-    """The same RENAME, carried out once more, would take the next file of the name."""
-    if profile == "littlefs":
-        return
-    here = Rig(profile, {b"/d/old": content(500, 1)}, CLEAN)
-    old, new = path(profile, "old"), path(profile, "new")
-    async with here.connected() as connection:
-        connection.scheduler.doubt.raise_it("as if a copy had been late")
-        connection.scheduler.doubt.late_copies.saw(1.0, trio.current_time())
-        copy = Latecomer(here, Opcode.RENAME, after=Opcode.CREATE_FILE)
-        await connection.store.rename(old, new)
-        await put(connection, old, content(400, 2))
-        assert copy.late is not None
-        assert copy.late >= 2.0
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
     """A late copy finds nothing under the old name. rsync renames each new file so: a second each."""
     if profile == "littlefs":
