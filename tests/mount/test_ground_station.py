@@ -46,16 +46,18 @@ class Flown(Program):
 class Station(Program):
     """A real ground station."""
 
-    def __init__(self, field: Field, port: int, *words: str) -> None:
+    def __init__(self, field: Field, port: int, *words: str, program: str = "station") -> None:
         folder = field.local("station")
         self.record = folder / "frames"
-        argv = ["tests.support.station", str(port), *words, "--record", str(self.record)]
-        super().__init__("station", argv, folder)
+        argv = [f"tests.support.{program}", str(port), *words]
+        if program == "station":
+            argv += ["--record", str(self.record)]
+        super().__init__(program, argv, folder)
         field.own(self)
         wait_until("the station listens", lambda: "ready" in self.output.read_text())
 
     def results(self) -> Any:
-        """Wait for its end; return the parameters that it got."""
+        """Wait for its end; return what it got."""
         assert self.wait(200) == 0, self.text()
         return json.loads(self.output.read_text().splitlines()[-1])
 
@@ -111,6 +113,17 @@ def test_a_station_works_beside_the_mount_and_each_frame_passes_unchanged(field:
     came = [frame for frame in recorded(flown.record, "<") if frame.source.system != OURS]
     assert [frame.data for frame in said] == [frame.data for frame in came]
     assert [frame.target.system for frame in heard].count(OURS) == 0
+
+
+def test_mavsdk_works_beside_the_mount(field: Field) -> None:
+    port = free_udp_port()
+    station = Station(field, port, program="mavsdk_station")
+    flown = Flown(field)
+    mount = field.mount(flown.source, forwarded(port), "dir_timeout=0")
+    work_on(mount, flown.root, station)
+    results = station.results()
+    assert results["parameters"] == PARAMETERS
+    assert results["attitudes"] >= 10
 
 
 def test_signed_frames_pass_unchanged(field: Field) -> None:
