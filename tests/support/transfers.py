@@ -82,10 +82,8 @@ class MemorySink:
 
 async def read_file(connection: Connection, path: bytes) -> bytes:
     """Open, read whole, close."""
-    sink = MemorySink(1 << 22)
-    reader = await connection.store.open_reader(path, sink)
+    reader, sink = await begin_to_read(connection, path, 0)
     try:
-        reader.want(0, reader.size, demand=True)
         return await sink.wait_for(0, reader.size)
     finally:
         reader.close()
