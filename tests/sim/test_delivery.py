@@ -374,18 +374,6 @@ async def test_what_was_cut_off_is_noticed_by_its_size(here: Rig, verify: str, d
     assert here.count(Opcode.CREATE_FILE) == 2
 
 
-@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
-async def test_what_was_sent_and_cut_off_is_not_there_though_nothing_is_verified(profile: str) -> None:
-    async with rig(profile, {FILE: OLD}) as here:
-        file = await here.mount(verify="none").open(FILE, write=True, truncate=True)
-        await file.write(0, b"n" * 100_000)
-        await trio.sleep(20)
-        assert here.litter(), "it is sent while the program writes"
-        await file.truncate(50_000)
-        await file.release()
-        assert here.files() == {FILE: b"n" * 50_000}
-
-
 @pytest.mark.holds("promise 9")
 async def test_no_checksum_is_asked_for_in_flight() -> None:
     """So with verify=crc nothing is delivered then."""
@@ -579,9 +567,6 @@ async def test_bytes_travel_while_the_program_still_writes(here: Rig) -> None:
     await file.release()
     assert here.data(FRESH) == bytes(50_000) + b"again 2" + bytes(49_993)
     assert here.count(Opcode.CREATE_FILE) <= 3, "a file whose sent bytes change is sent by the close"
-
-
-SLOW = LinkSettings(rate=20_000.0, delay=0.02)
 
 
 @pytest.mark.holds("promise 4")

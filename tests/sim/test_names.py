@@ -24,8 +24,9 @@ from tests.support.takingturns import taking_turns
 from tests.support.transfers import content
 
 EVERY = sorted(PROFILES)
-TELLING_CASE = [name for name in EVERY if not PROFILES[name].case_fold]
-NUTTX = {name for name in EVERY if PROFILES[name].storage is Storage.NUTTX_FAT}
+FOLDING_CASE = [
+    name for name in EVERY if PROFILES[name].case_fold or PROFILES[name].storage is Storage.NUTTX_FAT
+]
 LONG = 10.0
 D, A, B = b"/d", b"/d/a", b"/d/b"
 
@@ -69,21 +70,8 @@ async def test_what_became_a_directory_is_not_unlinked(profile: str, opened: boo
         assert here.directories() == [D, A]
 
 
-@pytest.mark.parametrize("profile", TELLING_CASE)
-async def test_directories_that_differ_by_case_are_two_where_the_card_says_so(profile: str) -> None:
-    """On NuttX those are whose names are long, as one is of small and capital letters."""
-    async with rig(profile, {A: b"ours"}) as here:
-        here.put_directory(b"/d/test")
-        here.put_directory(b"/d/more-of-it")
-        tree = await listed(here)
-        await tree.mkdir(b"/d/Test")
-        await write_file(tree, b"/d/MORE-OF-IT", b"")
-        assert set(here.directories()) == {D, b"/d/test", b"/d/Test", b"/d/more-of-it"}
-        assert set(here.files()) == {A, b"/d/MORE-OF-IT"}
-
-
-@pytest.mark.parametrize("profile", sorted((set(EVERY) - set(TELLING_CASE)) | NUTTX))
-async def test_they_are_one_elsewhere(profile: str) -> None:
+@pytest.mark.parametrize("profile", FOLDING_CASE)
+async def test_names_that_differ_by_case_are_one_where_the_card_says_so(profile: str) -> None:
     async with rig(profile, {A: b"ours"}) as here:
         here.put_directory(b"/d/test")
         tree = await listed(here)

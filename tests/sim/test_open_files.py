@@ -351,14 +351,6 @@ async def opened(tree: Tree, *, write: bool = False) -> OpenFile:
     return file
 
 
-async def reader_of_another(there: Rig, tree: Tree) -> OpenFile:
-    """Return a reader that got bytes of a file which somebody else replaced afterwards."""
-    reader = await opened(tree)
-    there.put(FILE, LATER, THEN + 200)
-    tree.forget_caches()
-    return reader
-
-
 async def require_lost(reader: OpenFile) -> None:
     for _ in range(2):
         with pytest.raises(FileChanged):

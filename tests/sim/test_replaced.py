@@ -78,29 +78,6 @@ async def read_head(handle: OpenFile) -> None:
     await trio.sleep(IDLE)
 
 
-@pytest.mark.parametrize("profile", TIMED)
-async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str) -> None:
-    """A vehicle may answer before it tells its boot time, and what is left may come in between."""
-    async with opened(profile, SLOW) as (here, tree, handle), trio.open_nursery() as nursery:
-        blocks = handle._handle._version  # type: ignore[attr-defined]
-
-        async def reboot() -> None:
-            for _ in range(10_000):
-                if sum(stop - start for start, stop in blocks.missing(0, handle.size)) <= 5_000:
-                    break
-                await trio.sleep(0.02)
-            now = trio.current_time()
-            here.vehicle.reboot(now, downtime=2.7)
-            here.vehicle._next_beat = now + 4.2
-            replace(here)
-
-        await trio.sleep(10)
-        nursery.start_soon(reboot)
-        with pytest.raises(FileChanged):
-            await read_on(handle)
-        assert await copy(tree) == NEW[: len(OLD)]
-
-
 @pytest.mark.holds("fault reboot", "fault boot time asked")
 @pytest.mark.parametrize("unasked", [True, False])
 @pytest.mark.parametrize(
@@ -244,25 +221,6 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: 
         await writer.write(0, b"whole")
         await writer.release()
         assert here.data(PATH) == b"whole"
-
-
-@pytest.mark.parametrize("profile", TIMED)
-async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(profile: str) -> None:
-    """All of it is held here, but of two sessions of the server, which were not compared yet."""
-    async with mounted(profile) as (here, tree):
-        reader = await tree.open(PATH)
-        assert bytes(await reader.read(0, STEP)) == OLD[:STEP]
-        version = reader._handle._version  # type: ignore[attr-defined]
-        version.compare_after = float("inf")  # as while readers take turns
-        await wait_and_replace(here)
-        for at in range(STEP, len(OLD) - STEP, STEP):
-            await reader.read(at, STEP)
-        await trio.sleep(IDLE)
-        assert version.whole
-        await tree.unlink(PATH)
-        with pytest.raises(FileChanged):
-            await reader.read(0, len(OLD))
-        await reader.release()
 
 
 async def test_the_end_of_a_copy_by_turns_is_compared() -> None:
