@@ -16,7 +16,6 @@ from mavftpfs.shared.errors import (
     IsADirectory,
     LocalProtocolError,
     NotFound,
-    VehicleLost,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, card, read_file, rig
@@ -244,26 +243,6 @@ async def test_a_file_that_is_gone_after_a_reboot(here: Rig) -> None:
     await here.reboot()
     with pytest.raises(FileChanged):
         await handle.read(0, 1000)
-
-
-async def test_a_reboot_with_the_link_still_down_proves_nothing(here: Rig) -> None:
-    handle = await here.mount().open(LOG)
-    await handle.read(0, 1000)
-    await here.reboot()
-    await here.lose()
-    with pytest.raises(VehicleLost):
-        await handle.read(0, 1000)
-    await here.find()
-    assert await handle.read(0, 1000) == DATA[:1000]
-
-
-async def test_after_a_reboot_recency_is_no_proof(here: Rig) -> None:
-    tree = here.mount()
-    await read_file(tree, LOG)
-    await here.reboot()
-    handle = await tree.open(LOG)
-    assert not handle.keep_cache
-    assert here.count(OPEN) == 2
 
 
 # --- doubtful bytes (promise 1)

@@ -13,7 +13,6 @@ import trio
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept import CRC_LIMIT, CRC_PAUSE, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
-from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -73,15 +72,6 @@ class Mounts:
         tree = self.mount()
         assert await read_file(tree, LOG) == self.here.data(LOG)
         await trio.sleep(ENOUGH)
-
-    async def open_partly_kept(self) -> tuple[Tree, OpenFile]:
-        """Open a file of which a mount before this one read the beginning."""
-        handle = await self.mount().open(LOG)
-        await handle.read(0, 2 * BLOCK_SIZE)
-        handle.close()
-        await trio.sleep(ENOUGH)
-        tree = self.mount()
-        return tree, await tree.open(LOG)
 
     def asked(self) -> tuple[int, int]:
         """Return how often a file was opened, and a checksum asked for, since the last mount."""
@@ -190,18 +180,6 @@ async def test_what_is_kept_of_an_older_file_is_not_read_again(mounts: Mounts) -
     assert mounts.asked() == (0, 0)
 
 
-async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(mounts: Mounts) -> None:
-    tree, handle = await mounts.open_partly_kept()
-    new = content(len(DATA), seed=8)
-    mounts.here.put(LOG, new, MTIME + 1)
-    await trio.sleep(1.0)
-    tree.rebooted()
-    with pytest.raises(FileChanged):
-        await handle.read(0, len(DATA))
-    handle.close()
-    assert await read_file(tree, LOG) == new
-
-
 async def test_without_an_mtime_a_checksum_decides(undated: Mounts) -> None:
     await undated.read_and_settle()
     assert await read_file(undated.mount(), LOG) == DATA
@@ -307,20 +285,6 @@ async def test_a_full_disk_ends_the_keeping_not_the_reading(
     assert [record.getMessage() for record in caplog.records if "cache_dir" in record.getMessage()] == [
         "nothing more is kept in cache_dir: [Errno 28] No space left on device"
     ]
-
-
-async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(mounts: Mounts) -> None:
-    await mounts.read_and_settle()
-    tree = mounts.mount(dir_timeout=5)
-    old = await tree.open(LOG)
-    await old.read(0, 100)
-    new = content(len(DATA), seed=3)
-    mounts.here.put(LOG, new, MTIME + 5)
-    await trio.sleep(6)
-    assert await read_file(tree, LOG) == new
-    with pytest.raises(FileChanged):
-        await old.read(2 * BLOCK_SIZE, 100)
-    old.close()
 
 
 async def test_a_file_that_changes_while_the_disk_is_slow(mounts: Mounts) -> None:
