@@ -19,7 +19,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FtpNak, LinkError, NotFound, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, LinkError, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import KINDS, RENAMING, Rig, card, read_file, rig
 from tests.support.transfers import content
@@ -399,6 +399,28 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> Non
             await tree.rename(FILE, OTHER)
             assert len(here.data(OTHER)) >= 2 * len(piece)
         assert here.data(OTHER) == 4 * piece
+
+
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_the_old_file_stays_while_nobody_waits(profile: str) -> None:
+    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
+    async with rig(profile, {FILE: BYTES}, link=RADIO) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        file = await begun(tree, FILE, content(60_000))
+        here.faults.cut_after(60)
+        with pytest.raises(MavftpfsError):
+            await file.release()
+        here.faults.cut_after(None)
+        await trio.sleep(5)
+        began = trio.current_time()
+        file = await tree.open(FILE, write=True, truncate=True)
+        assert trio.current_time() - began < PROMPT
+        await trio.sleep(100)
+        assert here.data(FILE) == BYTES
+        await file.write(0, NEWER)
+        await file.release()
+        assert here.data(FILE) == NEWER
 
 
 @pytest.mark.holds("fault overlap")
