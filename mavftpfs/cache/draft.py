@@ -222,7 +222,7 @@ class Draft:
         self.content.put(offset, data)
         self.on(Event.CHANGED)
         self._held.add(offset, stop)
-        self._tell_changed(min(offset, self.size), stop)
+        self._tell_changed(offset, stop)
         self.size = max(self.size, stop)
 
     def truncate(self, size: int) -> None:
