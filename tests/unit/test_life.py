@@ -91,12 +91,6 @@ async def test_the_first_signal_delivers_and_the_next_one_keeps() -> None:
     assert mount.state is State.ENDED
 
 
-async def test_one_that_was_unmounted_ends_with_0() -> None:
-    mount = Mount(mounted, signalled)
-    assert await mount.run() == 0
-    assert mount.told == ["leave"]
-
-
 async def test_a_failure_is_told_to_the_waiting_command_or_else_to_the_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -147,9 +141,3 @@ async def test_nohup_is_respected() -> None:
         assert mount.told == []
 
     assert await Mount(mounted, hung_up, signalled).run() == 0
-
-
-def test_the_table_refuses_what_it_does_not_have() -> None:
-    mount = Mount()
-    with pytest.raises(AssertionError):
-        mount.enter(State.LEAVING)
