@@ -14,16 +14,6 @@ def move(progress: Progress, clock: HandClock, seconds: int, rate: int = 10_000)
         progress.at(progress.here + rate)
 
 
-def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
-    clock = HandClock(100.0)
-    progress = Progress(clock)
-    progress.plan(1, 1_000_000)
-    progress.begin("/a", 1_000_000, 900_000)
-    assert (progress.done, progress.rate) == (900_000, None)
-    move(progress, clock, 4)
-    assert totals(progress) == "940.0 kB of 1.0 MB, 10.0 kB/s, 6.0 s left"
-
-
 def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it() -> None:
     clock = HandClock(100.0)
     progress = Progress(clock)
@@ -40,15 +30,6 @@ def test_while_the_vehicle_is_lost_no_speed_is_shown_and_none_of_before_after_it
     progress.lost = False
     move(progress, clock, 4, 5_000)
     assert totals(progress) == "80.0 kB of 1.0 MB, 5.0 kB/s, 3 min 4 s left"
-
-
-def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
-    progress = Progress(HandClock(100.0))
-    progress.plan(1, 1000)
-    progress.begin("/a", 1000)
-    progress.at(700)
-    progress.begin("/a", 1000)
-    assert progress.done == 0
 
 
 def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
