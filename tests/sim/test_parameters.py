@@ -235,18 +235,6 @@ async def test_a_damaged_download_is_read_again_and_then_an_error() -> None:
 # --- saving
 
 
-@MARKS
-async def test_a_file_unchanged_sends_nothing(profile: str) -> None:
-    async with vehicle(profile) as (here, tree):
-        for path in (ALL, QGC, CHANGED):
-            editor = await Editor(tree, path).read()
-            await trio.sleep(10)
-            asked = len(here.faults.requests)
-            await editor.save()
-            assert here.faults.requests[asked:].count(Opcode.OPEN_FILE_RO) <= 1  # of the open itself
-            assert writes(here) == 0
-
-
 VIM = {
     "nothing, then one": [{}, {"MODE_001": "5"}],
     "five each time": [{f"MODE_{5 * nth + i:03}": "77" for i in range(5)} for nth in range(3)],
@@ -338,15 +326,6 @@ async def test_what_a_program_reads_again_is_its_base() -> None:
         editor.lines = first
         await editor.save()
         assert number(here, "MODE_001") == 1
-
-
-async def test_an_editor_goes_back_and_forth_without_reading() -> None:
-    """nano keeps its text: what it saved before is no base for what it saves next."""
-    async with vehicle("ardupilot") as (here, tree):
-        editor = await Editor(tree).read()
-        for value in ("5", "1", "5"):
-            await editor.edit("MODE_001", value).save()
-            assert number(here, "MODE_001") == float(value)
 
 
 @MARKS
