@@ -304,7 +304,7 @@ class Engine:
         """Send what `op` has; return False when the window is full."""
         if op.done or not op.waits(now):
             return True
-        if self._gate.keeps(op):
+        if self._gate.keeps(op) or self._waits_for_lone(op):
             op.progress_at = now  # it is not the vehicle that is silent
             return True
         ledger = self._ledger
@@ -324,6 +324,14 @@ class Engine:
             self.stats.requests += sent
             self.flow.on_sent(sent, now)
         return left > 0
+
+    def _waits_for_lone(self, op: Operation) -> bool:
+        """Return whether an operation that goes alone is on its way, or this one is to go alone and something
+        else is."""
+        lone = next((one for one in self._ops if one.alone and not self._gate.keeps(one)), None)
+        if lone is None or op is not lone:
+            return lone is not None
+        return any(request.op not in (op, self._ledger.ghost) for request in self._ledger.flying.values())
 
     def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
         """Number requests of one opcode, or one that is repeated, and return them encoded."""

@@ -36,6 +36,7 @@ class Simple(Operation):
         session: the id to send; None sends the engine's, and asks again with the new one if it changed.
         patience: seconds until RequestTimeout, inf for the engine's deadline.
         server_time: seconds that the slowest server works at it; a repetition waits for so long.
+        alone: see Operation.
 
     Attributes:
         reply: the ACK, once done without error.
@@ -54,11 +55,13 @@ class Simple(Operation):
         session: int | None = None,
         patience: float = inf,
         server_time: float | None = None,
+        alone: bool = False,
     ) -> None:
         if len(data) > MAX_DATA:
             raise PathTooLong(f"{len(data)} bytes do not fit the {MAX_DATA} of a request")
         self.patience = patience
         self.opcode = opcode
+        self.alone = alone
         self.retransmitted = False
         manner = MANNERS[opcode]
         if server_time is not None:

@@ -177,6 +177,10 @@ class Operation:
     paced = True
     """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
+    alone = False
+    """Whether nothing else is on its way beside it: then a repetition is answered by the reply to the first
+    one, which the server still has (servers.md 2), and is not carried out again."""
+
     done = False
     error: MavftpfsError | None = None
     patience = inf

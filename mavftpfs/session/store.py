@@ -23,6 +23,7 @@ from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.protocol.writing import Pieces, WriteTransfer
+from mavftpfs.session.doubt import MOST_REST
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler, SessionUser
 from mavftpfs.session.serversession import OpenSession
@@ -332,12 +333,14 @@ class Store:
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; readers of the old path go on under the new one. completes: in flight, too."""
         data = wire_path(old) + b"\0" + wire_path(new)
+        # NuttX before October 2022, which names storages /fs/NAME, removes the file under the new name also
+        # when there is none under the old one: done twice, nothing is left (servers.md 9).
+        on_nuttx = new.startswith(b"/fs/")
         if len(data) > RENAME_ROOM:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            await self._perform(
-                old, partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new)
-            )
+            request = partial(Simple, Opcode.RENAME, data, alone=on_nuttx)
+            await self._perform(old, request, partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
             self._late_copies.on_placed(new)
@@ -351,7 +354,7 @@ class Store:
         below: also off all that lies below the first. in_flight: armed or not. at_once: no name rests before.
         """
         self._vehicle.require(self._clock(), writing=not in_flight)
-        with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
+        with trio.move_on_after(self._op_deadline + MOST_REST + VERIFY_LIMIT) as scope:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
                     await self.let_rest(path)
@@ -374,17 +377,17 @@ class Store:
         for last in (False, True):
             self._under_way += 1
             self._sent += 1
-            began, under_way = self._clock(), True  # until it is answered, and was sent once
+            began, may_come_late = self._clock(), True  # no answer came yet
             try:
-                under_way = (await self._server.ask(make, changes=True)).retransmitted
+                may_come_late = (await self._server.ask(make, changes=True)).retransmitted
                 return
             except FtpNak as nak:
-                error, under_way = nak, nak.retransmitted
+                error, may_come_late = nak, nak.retransmitted
             except RequestTimeout as timeout:
                 error = timeout
             finally:
                 self._under_way -= 1
-                if under_way:
+                if may_come_late:
                     self._late_copies.on_maybe_under_way(path, self._clock() - began, self._clock())
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(verify)

@@ -36,13 +36,17 @@ class NoErrno(OSError):
 
 
 class Storage:
-    """The filesystem of one server. Every method raises OSError."""
+    """The filesystem of one server. Every method raises OSError.
+
+    removes_first: a rename removes its target also where the source is missing (NuttX before October 2022).
+    """
 
     def __init__(
         self, tree: Tree, profile: Profile, rng: random.Random, virtual: VirtualTrees | None = None
     ) -> None:
         self._tree = tree
         self.kind = profile.storage
+        self.removes_first = False
         self._fold = profile.case_fold
         self._rng = rng
         self._fat = self.kind in (profiles.Storage.FATFS, profiles.Storage.NUTTX_FAT)
@@ -158,11 +162,12 @@ class Storage:
         self._tree.rename(source, target)
 
     def _fat_target(self, source: bytes, target: bytes) -> bytes:
-        self._tree.stat(source)
         try:
             there = self._tree.stat(target)
         except FileNotFoundError:
             return target
+        if not self.removes_first:
+            self._tree.stat(source)
         if self.kind is profiles.Storage.FATFS:
             if source == target:
                 return target

@@ -18,7 +18,7 @@ from mavftpfs.shared.errors import FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.rigs import Rig
+from tests.support.rigs import Rig, read_file, write_file
 from tests.support.takingturns import taking_turns
 from tests.support.transfers import ROOTS, MemorySource, begin_to_read, content, know, path
 
@@ -156,3 +156,24 @@ async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool) -> No
         async with trio.open_nursery() as nursery:
             for number in range(6):
                 nursery.start_soon(one, number)
+
+
+@pytest.mark.holds("promise 2", "rule 14.4")
+@pytest.mark.parametrize("removes", ["source", "target"])
+async def test_a_rename_without_an_answer_is_not_done_twice_beside_a_reader_on_nuttx(removes: str) -> None:
+    """An old NuttX removes the target of a rename whose source is gone, and so the file that was renamed. Its
+    server knows a repetition only by its last reply, which may be a reader's."""
+    files = {b"/d/a": content(500, 1), b"/d/b": content(400, 2), b"/d/big": content(3_000_000)}
+    here = Rig("px4-nuttx", files, LinkSettings(rate=400_000.0, delay=0.005))
+    here.server.firmware.storage.removes_first = True
+    async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
+        nursery.start_soon(read_file, tree, b"/d/big")
+        await trio.sleep(0.5)
+        here.faults.lose_reply_to(Opcode.RENAME)
+        if removes == "source":
+            await tree.rename(b"/d/a", b"/d/new")
+            assert here.data(b"/d/new") == content(500, 1)
+        else:
+            await write_file(tree, b"/d/b", content(300, 3))
+            assert here.data(b"/d/b") == content(300, 3)
+        nursery.cancel_scope.cancel()
