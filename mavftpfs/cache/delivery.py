@@ -165,10 +165,12 @@ class Deliverer:
         attempt, node.attempt = node.attempt, None
         if attempt is None:
             return
-        if node.draft is not None and node.draft.sending is attempt.sending:
-            node.draft.give_up()
         try:
-            await attempt.upload.end()
+            try:
+                await attempt.upload.end()
+            finally:
+                if node.draft is not None and node.draft.sending is attempt.sending:
+                    node.draft.give_up()
             if not attempt.in_place and attempt.upload.may_exist:
                 await self._names.discard(attempt.path)
         finally:
@@ -373,7 +375,7 @@ class Deliverer:
         """
         await base.require_base_there(self._context, draft)
         path = node.path
-        if draft.base is not None and draft.base_limit:
+        if draft.base is not None and draft.base_limit and not draft.sent_in_place:
             if not await self.verifier.is_same(path, draft.base):
                 draft.lose_base()
                 raise FileChanged(f"others changed {path!r} on the vehicle while it was changed here")

@@ -151,7 +151,10 @@ class Draft:
         """Whether under its own name the card may have bytes of it, or an old file that we may have emptied
         (cards that cannot rename)."""
         sending = self.sending
-        return self._sent_in_place or (self._in_place and sending is not None and sending.handed_out > 0)
+        if self._sent_in_place or sending is None or not self._in_place:
+            return self._sent_in_place
+        # A new file is ours once bytes went out: CreateFile was ACKed. An old one may be emptied before that.
+        return sending.handed_out > 0 if self.base is None else sending.begun
 
     @property
     def unacked(self) -> int:
@@ -259,12 +262,10 @@ class Draft:
     # --- what delivery does
 
     def begin(self, *, in_place: bool, progress: Callable[[int], None] | None = None) -> SendBuffer:
-        """Start to send a whole draft to an empty file. in_place: under the file's own name, so the old
-        content there does not count from now on. progress: see SendBuffer."""
+        """Start to send a whole draft to an empty file. in_place: under the file's own name. progress: see
+        SendBuffer."""
         self.on(Event.BEGUN)
         self._in_place = in_place
-        if in_place and self.base is not None:
-            self._sent_in_place, self.base_limit = True, 0
         self.sending = SendBuffer(self.local_bytes, self.size, progress)
         return self.sending
 

@@ -28,6 +28,7 @@ class SendBuffer:
         todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
             bytes ACKed before it was last closed. All other bytes are on their way.
         has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
+        begun: the file was made, or emptied, for it: CreateFile went out.
         handed_out: one past the highest byte that ever was.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
         reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
@@ -42,7 +43,7 @@ class SendBuffer:
         self.todo = ExtentSet([(0, size)])
         self.acked = ExtentSet()
         self.proven = ExtentSet()
-        self.has_checkpoint = self.overtaken = self.growing = False
+        self.begun = self.has_checkpoint = self.overtaken = self.growing = False
         self._progress = progress
         self._read = read
         self.handed_out = 0
@@ -115,7 +116,7 @@ class SendBuffer:
 
     def start_over(self) -> None:
         """The file is made anew: all of it is sent."""
-        self.has_checkpoint, self.reached = False, 0
+        self.begun, self.has_checkpoint, self.reached = True, False, 0
         self.acked, self.proven = ExtentSet(), ExtentSet()
         self.todo = ExtentSet([(0, self.size)])
 

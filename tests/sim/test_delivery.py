@@ -237,6 +237,24 @@ async def test_overwriting_in_place_that_failed_goes_on_later() -> None:
             await file.release()
 
 
+async def test_what_others_wrote_before_anything_of_ours_went_out_in_place_stays() -> None:
+    async with rig("littlefs", {FILE: OLD}) as here:
+        tree = here.mount(inplace=True)
+        await write_file(tree, OTHER, NEW)  # finds out that it cannot rename
+        file = await tree.open(FILE, write=True)
+        await file.write(0, OLD[::-1])
+        here.faults.at(Opcode.OPEN_FILE_RO, here.vehicle.arm)  # while it is asked whether the base is there
+        with pytest.raises(Armed):
+            await file.flush()
+        here.put(FILE, NEW)
+        here.vehicle.disarm()
+        await trio.sleep(15)
+        with pytest.raises(FileChanged):
+            await file.flush()
+        assert here.data(FILE) == NEW
+        file.close()
+
+
 @pytest.mark.parametrize("then", ["others", "later", "removed", "taken back"])
 @pytest.mark.parametrize("carried_out", [False, True])
 async def test_a_new_file_of_which_it_is_not_known_whether_it_was_made_in_place(
