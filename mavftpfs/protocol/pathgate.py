@@ -62,12 +62,12 @@ class PathGate:
             return
         writing, asking = not transfer.idle, any(op.opcode in LEAVES_PATH for op in ops)
         wanted, other = (writing, asking) if self._writes else (asking, writing)
-        ends = self._began + max(LEAST, LEAST_TRIPS * (rtt or 0.0))
-        if other and (not wanted or (self._clear and now >= ends)):
-            self._writes, self._began = not self._writes, now
         paths = any(r.opcode in LEAVES_PATH and r.op is not transfer for r in flying)
         if paths or not self._writes:
             transfer.on_paths()
+        ends = self._began + max(LEAST, LEAST_TRIPS * (rtt or 0.0))
+        if other and (not wanted or (self._clear and now >= ends)):
+            self._writes, self._began = not self._writes, now
         self._clear = not (paths if self._writes else any(r.op is transfer for r in flying))
 
     def keeps(self, op: Operation) -> bool:

@@ -52,6 +52,10 @@ _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_
 MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting further."""
 
 
+_MOST_LISTINGS = 3
+"""After so many listings of the root in vain a refusal means what it says. A late copy of a request with a
+path may come behind one of them."""
+
 _DISTURBED = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
@@ -149,7 +153,7 @@ class WriteTransfer(Operation):
         self._root = root
         self._disturbed = False  # the root is to be listed before the next write
         self._listing: Request | None = None
-        self._listed = False  # and nothing was ACKed since
+        self._listings = 0  # of the root, since something was ACKed
         self._in_flight = in_flight
         self._on_starved = on_starved
         self._rest: deque[tuple[int, bytes]] = deque()
@@ -256,11 +260,12 @@ class WriteTransfer(Operation):
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Tell the source what was written, or end with what a refusal means."""
         if request is self._listing:
-            self._listing, self._disturbed, self._listed = None, False, True
+            self._listing, self._disturbed = None, False
+            self._listings += 1
             return
         if reply.opcode == _NAK:
             nak = nak_of(request, reply)
-            if is_disturbed(nak) and self._root is not None and not self._listed:
+            if is_disturbed(nak) and self._root is not None and self._listings < _MOST_LISTINGS:
                 del self._unanswered[request]
                 self._rest.append((request.offset, request.data))
                 self._disturbed = self.port.traits.paths_block_writes = True
@@ -297,7 +302,7 @@ class WriteTransfer(Operation):
 
     def _tell(self, start: int, stop: int) -> None:
         if start < stop:
-            self._barren, self._listed = 0, False
+            self._barren = self._listings = 0
             self.acked_bytes += stop - start
             self._source.on_acked(start, stop - start)
 

@@ -125,12 +125,33 @@ def test_a_refused_write_is_sent_again_behind_a_listing_of_the_root() -> None:
         assert Opcode.WRITE_FILE in card.answer(6.0)
         assert {request.offset for request in card.out} == {first.offset, second.offset}
         card.answer(now + 0.2)
-    card.engine.receive(nak(card.out[0], NakCode.FILE_PROTECTED), 3.0)
-    card.engine.receive(nak(card.out[1], NakCode.FILE_PROTECTED), 3.0)
-    card.sends(3.0)
-    card.answer(3.1)
-    card.engine.receive(nak(card.out[0], NakCode.FILE_PROTECTED), 3.2)
-    assert isinstance(card.transfer.error, FtpNak), "that listing did not help"
+    for now in (3.0, 4.0, 5.0):
+        for request in card.out:
+            card.engine.receive(nak(request, NakCode.FILE_PROTECTED), now)
+        assert card.sends(now) == [Opcode.LIST_DIRECTORY]
+        card.answer(now + 0.1)
+    card.engine.receive(nak(card.out[0], NakCode.FILE_PROTECTED), 6.0)
+    assert isinstance(card.transfer.error, FtpNak), "listings do not help"
+
+
+def test_a_listing_of_the_root_that_is_answered_late_does_not_hide_a_path() -> None:
+    """Both answers come together, and the turn of paths is over at that moment."""
+    card = Card(known=False)
+    card.sends(0.0)
+    for request in card.out:
+        card.engine.receive(nak(request, NakCode.FILE_PROTECTED), 0.01)
+    assert card.sends(0.01) == [Opcode.LIST_DIRECTORY]
+    (listing,) = card.out
+    card.ask(Opcode.RENAME, 0.02)
+    due = card.engine.next_deadline()
+    assert due is not None
+    due = max(due, 2 * LEAST)
+    card.engine.on_deadline(due)
+    assert card.sends(due) == [Opcode.RENAME]
+    (path,) = card.out
+    for request in (listing, path):
+        card.engine.receive(ack(request), 4 * LEAST)
+    assert card.sends(4 * LEAST) == [Opcode.LIST_DIRECTORY]
 
 
 def test_a_lost_listing_of_the_root_goes_out_again() -> None:
@@ -162,6 +183,21 @@ def test_a_lost_write_goes_out_again_behind_a_listing_of_the_root() -> None:
             card.engine.receive(ack(card.out[0]), now)
     assert went_out[:2] == [Opcode.RENAME, Opcode.LIST_DIRECTORY]
     assert Opcode.WRITE_FILE in card.answer(6.0)
+
+
+def test_what_goes_alone_waits_for_all_and_all_for_it() -> None:
+    engine = Engine(random.Random(3), Flow(limit=4))
+    first = Simple(Opcode.READ_FILE, session=1)
+    engine.start(first, 0.0)
+    (read,) = sent(engine, 0.0)
+    engine.start(Simple(Opcode.RENAME, b"/fs/a", alone=True), 0.1)
+    engine.start(Simple(Opcode.READ_FILE, session=1), 0.1)
+    assert sent(engine, 0.1) == []
+    engine.receive(ack(read), 0.2)
+    (rename,) = sent(engine, 0.2)
+    assert rename.opcode == Opcode.RENAME
+    engine.receive(ack(rename), 0.3)
+    assert [request.opcode for request in sent(engine, 0.3)] == [Opcode.READ_FILE]
 
 
 def test_after_a_restart_nothing_waits() -> None:
