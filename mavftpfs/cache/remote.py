@@ -168,8 +168,9 @@ class VehicleStore(RemoteStore, Protocol):
     """The vehicle's files, and how the caches change them.
 
     These calls do not check types or targets; their callers do. They raise FtpNak, RequestTimeout,
-    VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change did not happen. Only
-    OutcomeUnknown says that it is not known: a request was not answered, and no listing could tell.
+    VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change had not happened when that
+    was looked at. Only OutcomeUnknown says that it is not known: a request was not answered, and no listing
+    could tell.
     """
 
     @property
@@ -203,11 +204,12 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
-        """Make a file by CreateFile and write it. Sends nothing before the source has something.
+        """Make a file by CreateFile and write it. Sends nothing before the source has something, or
+        `finish` is called.
 
-        `path` is a reserved name, or, on cards that cannot rename, a name that is known to be free. An
-        upload that was interrupted goes on by OpenFileWO where that was seen to keep what the file has, else
-        all of it is sent again.
+        `path` is a reserved name, or, on cards that cannot rename, the file's own: it is free, or has the
+        file that is to be replaced. An upload that was interrupted goes on by OpenFileWO where that was seen
+        to keep what the file has, else all of it is sent again.
         """
         ...
 

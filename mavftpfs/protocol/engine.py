@@ -63,8 +63,8 @@ class Engine:
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
         on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
             explains, and with the seconds since its request went out (0 where that is not known).
-        on_late: called with each ACK that nothing waits for any more, of a request that was repeated, or
-            whose operation was cancelled, and with the time at which that went out first.
+        on_late: called with each ACK that nothing waits for any more, of a request that was repeated, taken
+            back, or whose operation was cancelled, and with the time at which that went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).

@@ -1,16 +1,17 @@
-"""Writes and requests with a path by turns, where a server mixes them up. Layer: protocol; pure.
+"""Writes, or requests with a path: not both at once where a server mixes them up. Layer: protocol; pure.
 
 PX4 on NuttX checks each WriteFile against a scratch buffer in which most requests with a path leave that path
-(docs/servers.md 8). Once a write was refused for that, the two kinds take turns while a file is written:
+(docs/servers.md 8). Once a write was refused for that, or with NAK 8, which may hide it, the two kinds
+alternate while a file is written:
 
-| turn | goes out | ends |
+| phase | goes out | ends |
 |---|---|---|
-| of writes (first) | WriteFile | when a path waits, and the turn lasted `LEAST` or nothing is to be written |
-| of paths | requests with a path | when bytes wait, and the turn lasted `LEAST` or no path waits |
+| writes (first) | WriteFile | when a path waits, and the phase lasted `LEAST` or nothing is to be written |
+| paths | requests with a path | when bytes wait, and the phase lasted `LEAST` or no path waits |
 
-Nothing of one kind goes out while the other is on its way, and no turn ends before it could send. Before the
-first write after a turn of paths the transfer sets the buffer right (`Operation.on_paths`). Answers come
-while both kinds wait, so no timer ends a turn.
+Nothing of one kind goes out while the other is on its way, and no phase ends before it could send. Before the
+first write after paths the transfer sets the buffer right (`Operation.on_paths`). Answers come while both
+kinds wait, so no timer ends a phase.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.requests import Operation, Request
 
 LEAST, LEAST_TRIPS = 0.5, 4.0
-"""Seconds, and round trips, for which a turn lasts at least while both kinds wait."""
+"""Seconds, and round trips, for which a phase lasts at least while both kinds wait."""
 
 LEAVES_PATH = frozenset(
     {
@@ -53,7 +54,7 @@ class PathGate:
     def look(
         self, ops: Sequence[Operation], flying: Collection[Request], now: float, rtt: float | None
     ) -> None:
-        """Decide whose turn it is. ops: all, where paths block writes, else none. flying: the requests on
+        """Decide which phase it is. ops: all, where paths block writes, else none. flying: the requests on
         their way."""
         transfer = next((op for op in ops if op.bulk == Opcode.WRITE_FILE), None)
         if transfer is not self._transfer:

@@ -2,8 +2,8 @@
 
 A manner says how a request is repeated after its answer was lost. Reads, writes and listings may be executed
 twice. So each of their transmissions has its own seq, and can be told apart. A request that changes the
-server goes out again under the *same* seq first, because PX4 and ArduPilot replay their last reply
-(servers.md 2).
+server goes out again under the *same* seq first, because PX4 and ArduPilot replay their last reply, if this
+is still their last one (servers.md 2).
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ _MOST_LISTINGS = 3
 """After so many listings of the root in vain a refusal means what it says. A late copy of a request with a
 path may come behind one of them."""
 
-_DISTURBED = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
+_PATH_CODES = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
 class ChunkSource(Protocol):
@@ -151,7 +151,7 @@ class WriteTransfer(Operation):
         self.acked_bytes = 0
         self._source = source
         self._root = root
-        self._disturbed = False  # the root is to be listed before the next write
+        self._needs_listing = False  # the root is to be listed before the next write
         self._listing: Request | None = None
         self._listings = 0  # of the root, since something was ACKed
         self._in_flight = in_flight
@@ -200,7 +200,7 @@ class WriteTransfer(Operation):
             most = min(most, self._in_flight - len(self._unanswered))
         if self.paused or most <= 0:
             return []
-        if self._disturbed:
+        if self._needs_listing:
             return self._list_root()
         session = self.session
         chunk = self.chunks.next_size(now)
@@ -235,7 +235,7 @@ class WriteTransfer(Operation):
 
     def on_paths(self) -> None:
         """See Operation."""
-        self._disturbed = self._root is not None
+        self._needs_listing = self._root is not None
 
     def _new_piece(self, limit: int) -> tuple[int, bytes] | None:
         """Return at most `limit` bytes of the source; None if it has none, or fails."""
@@ -260,15 +260,15 @@ class WriteTransfer(Operation):
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Tell the source what was written, or end with what a refusal means."""
         if request is self._listing:
-            self._listing, self._disturbed = None, False
+            self._listing, self._needs_listing = None, False
             self._listings += 1
             return
         if reply.opcode == _NAK:
             nak = nak_of(request, reply)
-            if is_disturbed(nak) and self._root is not None and self._listings < _MOST_LISTINGS:
+            if is_path_refusal(nak) and self._root is not None and self._listings < _MOST_LISTINGS:
                 del self._unanswered[request]
                 self._rest.append((request.offset, request.data))
-                self._disturbed = self.port.traits.paths_block_writes = True
+                self._needs_listing = self.port.traits.paths_block_writes = True
             else:
                 self.fail(self._meaning(nak))
             return
@@ -336,7 +336,7 @@ class WriteTransfer(Operation):
         if request is self._listing:
             return False
         too_long = self.chunks.on_lost(request.size, request.sent_at, now)
-        if not too_long and not self._disturbed:
+        if not too_long and not self._needs_listing:
             return False
         del self._unanswered[request]
         offset, data = request.offset, request.data
@@ -363,6 +363,6 @@ class WriteTransfer(Operation):
         super().finish()
 
 
-def is_disturbed(error: MavftpfsError | None) -> bool:
+def is_path_refusal(error: MavftpfsError | None) -> bool:
     """Return whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
-    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _DISTURBED
+    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _PATH_CODES

@@ -28,7 +28,7 @@ class LateCopies:
     REMOVE removes it, a RENAME takes it away. So a name rests after such a request: for twice the largest
     lateness, and a second at least. If no copy was seen for ten minutes, it does not rest for them any more.
     But where we repeated such a request two were on the way, and the other one may come late on any link. So
-    after that the name rests as if a copy had come as late as the answer.
+    after that the name rests for twice the time that the answer took: 1 to 10 seconds.
 
     A file that CreateFile made rests before it is compared, too, but without that least second. A copy of
     CreateFile that comes even later empties the file, which is found when it is compared again under its
@@ -67,7 +67,8 @@ class LateCopies:
         self._note(path.lower(), now, now, now)
 
     def on_placed(self, path: bytes) -> None:
-        """The name got its file by a rename: a copy of that finds nothing to rename."""
+        """The name got its file by a rename: a copy of that finds nothing to rename. (An old
+        NuttX removes the file then: docs/servers.md 9.)"""
         self._names.pop(path.lower(), None)
 
     def rest(self, path: bytes, now: float) -> float:

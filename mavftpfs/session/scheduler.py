@@ -428,8 +428,8 @@ class Scheduler:
 
     def on_unexplained(self, reply: Payload, lateness: float) -> None:
         """An answer came that no request of ours explains. lateness: seconds since its request went out, 0 if
-        that is not known. An older open that was carried out once more may
-        have put its file in the place of ours (MAVSDK); all else is no other file's."""
+        that is not known. An older open that was carried out once more may have put its file in the place of
+        ours (MAVSDK); all else is no other file's."""
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         other = opens and session is not None and session.seq != reply.seq
@@ -442,6 +442,7 @@ class Scheduler:
         """An ACK came that nothing waits for any more: its request was repeated, or its operation cancelled.
         sent_at: when it went out first. An open of an earlier file may have put that in the place of the
         present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later one.
+        After changes of names the names rest, see LateCopies.
         """
         if sent_at >= self.server.file_since:
             return  # it is the open that is closed next, or a WriteFile to the last file

@@ -1,10 +1,10 @@
 """The vehicle's files, as the caches see them. Layer: session; implements cache.remote.VehicleStore.
 
-Did that change happen? A request whose answer was lost is sent again, may be carried out twice, and is then
-refused the second time (docs/servers.md 14.4). So after such a refusal, and after a silence, a listing tells
-whether the change happened. While there is doubt (session.doubt) the network may also have doubled a request
-that we sent once. Where copies of requests came late, names rest between two changes (LateCopies). Only
-`let_rest` waits for that.
+Did that change happen? A request whose answer was lost is sent again, and may be carried out twice. The
+second time it is refused, or hits the name's next file (docs/servers.md 14.4). So after such a refusal, and
+after a silence, a listing tells whether the change happened. While there is doubt (session.doubt) the network
+may also have doubled a request that we sent once. Where copies of requests came late, names rest between two
+changes (LateCopies). Only `let_rest` waits for that.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ class Store:
     """Reads, lists, checks and changes remote files; see cache.remote for what each call does.
 
     A change of the card that fails with FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or
-    Armed did not happen. After OutcomeUnknown that is not known. Only create_empty looks at no listing: after
-    its RequestTimeout the file may be there, and empty.
+    Armed had not happened when that was looked at. After OutcomeUnknown that is not known. Only create_empty
+    looks at no listing: after its RequestTimeout the file may be there, and empty.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:

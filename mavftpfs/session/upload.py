@@ -15,7 +15,7 @@ from math import inf
 import trio
 
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.protocol.writing import WriteTransfer, is_disturbed
+from mavftpfs.protocol.writing import WriteTransfer, is_path_refusal
 from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
 from mavftpfs.shared.errors import (
@@ -65,7 +65,8 @@ class Stop(Enum):
 
 
 class Upload(SessionUser):
-    """Implements cache.remote.Upload. Nothing is sent before the source has something.
+    """Implements cache.remote.Upload. Nothing is sent before the source has something, or
+    `finish` is called.
 
     Attributes:
         may_exist, made_twice: see cache.remote.Upload.
@@ -331,7 +332,7 @@ class Upload(SessionUser):
             if not transfer.trailing:  # else its last answers come while `_close` waits for its own
                 self._end_transfer()
         error = transfer.error
-        if is_disturbed(error) and self._vehicle.another_client_heard(self._clock()):
+        if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
             # Its requests for paths take no turns with ours: the next turns try again.
             raise SessionLost(f"beside another FTP client: {error}") from error
         if error is not None:
@@ -393,7 +394,7 @@ class Upload(SessionUser):
 
         That is a round trip less for the user that waits. Servers carry requests out in order, and what gets
         lost is sent when the file is open again. But where path operations cause refusals (NuttX) the answers
-        are waited for, because only the running upload can put that right.
+        are waited for: what is refused would have to be sent again.
         """
         if not self._keeps_content or self._engine.traits.paths_block_writes:
             return False

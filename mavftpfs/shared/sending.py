@@ -98,7 +98,7 @@ class SendBuffer:
             self._progress(count)
 
     def on_unsent(self, offset: int, count: int) -> None:
-        """These bytes were not written, and no request that carries them is under way any more."""
+        """These bytes were not ACKed. A request that carries them may still arrive: with the same bytes."""
         self.todo.add(offset, offset + count)
 
     def check_point(self) -> None:
