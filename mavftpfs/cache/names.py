@@ -38,7 +38,7 @@ from mavftpfs.shared.errors import (
     OutcomeUnknown,
     PathTooLong,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, is_on_nuttx, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -287,15 +287,15 @@ class Names:
         leave_aside: do not remove the old file. Return its reserved name, which is in `OwnNames.in_use`; None
         if it was gone.
 
-        One rename is enough where the server never leaves the name without a file. NuttX, which mounts
-        storages at /fs/NAME, removes the old file first (servers.md 9).
+        One rename is enough where the server never leaves the name without a file. NuttX removes the old file
+        first (servers.md 9).
 
         Raises:
             NotSupported: the server does not rename. Else as VehicleStore.rename. After an error the old file
             has its name again, unless the replacement is unfinished.
         """
         traits = self._context.store.traits
-        if not leave_aside and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
+        if not leave_aside and traits.rename_replaces is not False and not is_on_nuttx(target):
             try:
                 await self.rename(source, target, over=True)
                 traits.rename_replaces = True

@@ -46,6 +46,7 @@ from mavftpfs.shared.model import (
     EntryKind,
     Listing,
     Traits,
+    is_on_nuttx,
     omits_files,
     split,
     wire_path,
@@ -333,13 +334,12 @@ class Store:
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; readers of the old path go on under the new one. completes: in flight, too."""
         data = wire_path(old) + b"\0" + wire_path(new)
-        # NuttX before October 2022, which names storages /fs/NAME, removes the file under the new name also
-        # when there is none under the old one: done twice, nothing is left (servers.md 9).
-        on_nuttx = new.startswith(b"/fs/")
         if len(data) > RENAME_ROOM:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            request = partial(Simple, Opcode.RENAME, data, alone=on_nuttx)
+            # NuttX before October 2022 removes the file under the new name also when there is none under the
+            # old one: done twice, nothing is left (servers.md 9).
+            request = partial(Simple, Opcode.RENAME, data, alone=is_on_nuttx(new))
             await self._perform(old, request, partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():

@@ -27,7 +27,7 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     SessionLost,
 )
-from mavftpfs.shared.model import split, wire_path
+from mavftpfs.shared.model import is_on_nuttx, split, wire_path
 from mavftpfs.shared.sending import SendBuffer
 
 RETRY_AFTER = 5.0
@@ -333,7 +333,7 @@ class Upload(SessionUser):
                 self._end_transfer()
         error = transfer.error
         if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
-            # Its requests for paths take no turns with ours: the next turns try again.
+            # Its requests for paths do not alternate with our writes: the next turns try again.
             raise SessionLost(f"beside another FTP client: {error}") from error
         if error is not None:
             raise error
@@ -436,7 +436,5 @@ class Upload(SessionUser):
 def storage_root(path: bytes) -> bytes:
     """Return the directory, with a slash at its end, that fits PX4's whitelist for writes: `/fs/NAME/` on
     NuttX, else where the file is."""
-    parts = path.split(b"/")
-    on_nuttx = len(parts) > 3 and parts[1] == b"fs"
-    root = b"/".join(parts[:3]) if on_nuttx else split(path)[0]
+    root = b"/".join(path.split(b"/")[:3]) if is_on_nuttx(path) else split(path)[0]
     return wire_path(root).rstrip(b"/") + b"/"

@@ -113,6 +113,11 @@ def is_virtual(path: bytes) -> bool:
     return path.startswith(b"/@")
 
 
+def is_on_nuttx(path: bytes) -> bool:
+    """Return whether a path is below a storage of NuttX, which mounts them at /fs/NAME."""
+    return path.startswith(b"/fs/")
+
+
 def is_snapshot(path: bytes) -> bool:
     """Return whether it is an `@` file that must be read whole. The logs below `@MAV_LOG` are real files, and
     those of `@ROMFS` are like them: they have true sizes and do not change."""
