@@ -326,12 +326,9 @@ class Engine:
         return left > 0
 
     def _waits_for_lone(self, op: Operation) -> bool:
-        """Return whether an operation that goes alone is on its way, or this one is to go alone and something
-        else is."""
+        """Return whether another operation goes alone. What went out before that is carried out before it."""
         lone = next((one for one in self._ops if one.alone and not self._gate.keeps(one)), None)
-        if lone is None or op is not lone:
-            return lone is not None
-        return any(request.op not in (op, self._ledger.ghost) for request in self._ledger.flying.values())
+        return lone is not None and op is not lone
 
     def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
         """Number requests of one opcode, or one that is repeated, and return them encoded."""

@@ -178,8 +178,8 @@ class Operation:
     """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
     alone = False
-    """Whether nothing else is on its way beside it: then a repetition is answered by the reply to the first
-    one, which the server still has (servers.md 2), and is not carried out again."""
+    """Whether nothing else goes out until it is answered: then a repetition is answered by the reply to the
+    first one, which the server still has (servers.md 2), and is not carried out again."""
 
     done = False
     error: MavftpfsError | None = None
