@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 
 Direction = Literal["read", "write"]
@@ -44,15 +45,28 @@ TARGETS = {
 """Share of the limit to reach, by direction and loss."""
 
 
+TROUBLES = {
+    "none": LinkSettings(),
+    "reordered": LinkSettings(reorder=0.02),
+    "doubled": LinkSettings(duplicate=0.01),
+    "jittery": LinkSettings(jitter=0.05),
+}
+"""Links by what they do to frames besides losing them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One measurement's conditions. rate in bytes/s, rtt in seconds, loss 0..1 each way."""
+    """One measurement's conditions.
+
+    rate in bytes/s, rtt in seconds, loss 0..1 each way; trouble: a name of TROUBLES.
+    """
 
     profile: str
     rate: float
     rtt: float
     loss: float
     direction: Direction = "read"
+    trouble: str = "none"
 
     @property
     def limit(self) -> float:

@@ -24,9 +24,8 @@ from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
-from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench import record, tables
-from tests.bench.cases import Case, Direction, Result
+from tests.bench.cases import TROUBLES, Case, Direction, Result
 from tests.support.rigs import Rig
 from tests.support.transfers import MemorySink
 
@@ -57,8 +56,15 @@ def measure(
         trio.TooSlowError: it took PATIENCE times the ideal.
     """
     room = int(max(4096, case.rate / 2)) if queue is None else queue
-    settings = LinkSettings(
-        rate=case.rate, delay=case.rtt / 2, jitter=jitter, reorder=reorder, loss=case.loss, queue=room
+    link = TROUBLES[case.trouble]
+    settings = replace(
+        link,
+        rate=case.rate,
+        delay=case.rtt / 2,
+        jitter=jitter or link.jitter,
+        reorder=reorder or link.reorder,
+        loss=case.loss,
+        queue=room,
     )
     here = Rig(case.profile, link=settings, seed=seed, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
@@ -108,16 +114,47 @@ async def _write(here: Rig, connection: Connection, data: bytes) -> float:
 def cases(arguments: argparse.Namespace) -> list[Case]:
     """Return every combination asked for."""
     directions: tuple[Direction, ...] = ("read", "write")
-    chosen = (arguments.profiles, arguments.rates, arguments.rtts, arguments.losses, directions)
+    chosen = (
+        arguments.profiles,
+        arguments.rates,
+        arguments.rtts,
+        arguments.losses,
+        directions,
+        arguments.troubles,
+    )
     return [Case(*conditions) for conditions in product(*chosen)]
 
 
-def everything(chosen: Sequence[Case], seconds: float) -> list[Result]:
-    """Measure all cases, as many at once as there are processors: each has a clock of its own."""
+def measure_seed(run: tuple[Case, int], seconds: float) -> Result:
+    """Measure a case with one seed; see measure."""
+    case, seed = run
+    return measure(case, seconds, seed=seed)
+
+
+def everything(chosen: Sequence[Case], seeds: Sequence[int], seconds: float) -> list[Result]:
+    """Measure all cases, as many at once as there are processors (each has a clock of its own).
+
+    Returns one result for each case: the mean of its seeds.
+    """
     ours_to_end = (signal.SIGINT, signal.SIG_IGN)
+    runs = list(product(chosen, seeds))
     with get_context("spawn").Pool(initializer=signal.signal, initargs=ours_to_end) as pool:
-        found = pool.imap(partial(measure, seconds=seconds), chosen)
-        return list(track(found, "goodput", total=len(chosen), console=Console(stderr=True), transient=True))
+        found = pool.imap(partial(measure_seed, seconds=seconds), runs)
+        shown = track(found, "goodput", total=len(runs), console=Console(stderr=True), transient=True)
+        results = list(shown)
+    return [mean(results[at : at + len(seeds)]) for at in range(0, len(results), len(seeds))]
+
+
+def mean(results: Sequence[Result]) -> Result:
+    """Return the mean of one case's results."""
+    count = len(results)
+    return Result(
+        results[0].case,
+        sum(result.limit for result in results) / count,
+        sum(result.share for result in results) / count,
+        sum(result.requests for result in results) / count,
+        round(sum(result.dropped for result in results) / count),
+    )
 
 
 def main(argv: Sequence[str]) -> int:
@@ -129,11 +166,25 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--rtts", nargs="+", type=float, default=[0.01, 0.1, 0.3])
     parser.add_argument("--losses", nargs="+", type=float, default=[0.0, 0.01, 0.05, 0.1])
     parser.add_argument("--seconds", type=float, default=60.0, help="link time of each run")
+    parser.add_argument(
+        "--troubles",
+        nargs="+",
+        choices=TROUBLES,
+        default=["none"],
+        help="2 %% reordered, 1 %% doubled, 50 ms jittery",
+    )
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="a result is the mean of these")
     parser.add_argument("--json", type=Path, help="put the results into this file")
+    parser.add_argument(
+        "--against", type=Path, help="show what changed since this file of --json was written"
+    )
     arguments = parser.parse_args(argv)
-    results = everything(cases(arguments), arguments.seconds)
+    before = record.sections(arguments.against)["goodput"]["results"] if arguments.against else []
+    results = everything(cases(arguments), arguments.seeds, arguments.seconds)
     found = [asdict(result) | {"target": result.case.target} for result in results]
     print(tables.goodput_table(found))
+    if before:
+        print(tables.changes_table(before, found))
     if arguments.json is not None:
         record.put(arguments.json, "goodput", argv, 0.0, found)
     return 0

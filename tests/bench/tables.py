@@ -13,6 +13,9 @@ from tests.support.request_costs import PROFILES, expected
 BUSY = 0.5
 """Load for each CPU, before a measurement, above which rates are too low."""
 
+NOISE = 0.02
+"""How much the share of one seed differs from that of another, about."""
+
 BEGIN, END = "<!-- bench: {} -->", "<!-- bench: end -->"
 
 _SERVERS = {"px4": "PX4", "ardupilot": "ArduPilot", "mavsdk": "MAVSDK", "mavsdk-real": "MAVSDK"}
@@ -126,7 +129,9 @@ def goodput_table(results: Sequence[dict[str, Any]]) -> str:
     cells: dict[tuple[str, float], dict[tuple[str, float], list[dict[str, Any]]]] = {}
     for run in results:
         case = run["case"]
-        cells.setdefault((case["profile"], case["rate"]), {}).setdefault(
+        trouble = case.get("trouble", "none")
+        profile = case["profile"] if trouble == "none" else f"{case['profile']}, {trouble}"
+        cells.setdefault((profile, case["rate"]), {}).setdefault(
             (case["direction"], case["loss"]), []
         ).append(run)
     columns = sorted({column for found in cells.values() for column in found})
@@ -136,6 +141,33 @@ def goodput_table(results: Sequence[dict[str, Any]]) -> str:
         for (profile, rate), found in cells.items()
     ]
     return markdown(["profile", "kB/s", *head], lines)
+
+
+def changes_table(before: Sequence[dict[str, Any]], after: Sequence[dict[str, Any]]) -> str:
+    """Return the cells whose share changed by more than NOISE, and how the means changed by direction."""
+    earlier = {_cell(run): run for run in before}
+    both = [(earlier[_cell(run)], run) for run in after if _cell(run) in earlier]
+    lines = []
+    for old, new in both:
+        if abs(new["share"] - old["share"]) > NOISE:
+            pairs = [f"{old[name]:.2f} -> {new[name]:.2f}" for name in ("share", "requests")]
+            lines.append([*map(str, _cell(new)), *pairs])
+    for direction in ("read", "write"):
+        pair = [(old, new) for old, new in both if new["case"]["direction"] == direction]
+        means = [
+            " -> ".join(
+                f"{sum(run[name] for run in runs) / len(runs):.3f}" for runs in zip(*pair, strict=True)
+            )
+            for name in ("share", "requests")
+        ]
+        lines.append([f"mean of {len(pair)} cells", "", "", "", direction, "", *means])
+    return markdown(["profile", "rate", "rtt", "loss", "direction", "trouble", "share", "requests"], lines)
+
+
+def _cell(run: dict[str, Any]) -> tuple[Any, ...]:
+    """Return a run's conditions."""
+    case = {"trouble": "none", **run["case"]}
+    return tuple(case[name] for name in ("profile", "rate", "rtt", "loss", "direction", "trouble"))
 
 
 def _least_share(runs: Sequence[dict[str, Any]]) -> str:
