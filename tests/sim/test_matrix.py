@@ -31,8 +31,9 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
-from tests.support.rigs import Rig
+from tests.support.rigs import GOOD_LINK, Rig
 from tests.support.takingturns import ALIKE
 from tests.support.transfers import content
 
@@ -49,6 +50,9 @@ CHANGING = {
 }  # fmt: skip
 LEAKS = ("spec",)
 """Servers that give ids which nobody learns if the answer is lost."""
+
+DOUBLING = LinkSettings(delay=0.01, duplicate=0.01)
+"""A link that delivers one frame in a hundred twice."""
 
 Call = Callable[[Tree], Awaitable[None]]
 D = b"/d"
@@ -390,9 +394,11 @@ async def mounted(here: Rig, place: Path, seed: int) -> AsyncIterator[Tree]:
     spool.close()
 
 
-async def meet(profile: str, operation: Call, event: Event, count: int, place: Path) -> list[int]:
+async def meet(
+    profile: str, operation: Call, event: Event, count: int, place: Path, link: LinkSettings = GOOD_LINK
+) -> list[int]:
     """Have the event come at request `count` of an operation; return the opcodes of its requests."""
-    here = Rig(profile, {D + b"/" + name: data for name, data in BEFORE.items() if data is not None})
+    here = Rig(profile, {D + b"/" + name: data for name, data in BEFORE.items() if data is not None}, link)
     here.put_directory(D + b"/sub")
     async with mounted(here, place, 3) as tree:
         await tree.list(D)
@@ -502,3 +508,10 @@ async def test_at_every_request(profile: str, operation: Call, event: Event, tmp
     for count in counted(1):
         if len(await meet(profile, operation, event, count, tmp_path / str(count))) < count:
             return
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("profile", "operation", "event"), cells(DAILY))
+async def test_where_frames_come_twice(profile: str, operation: Call, event: Event, tmp_path: Path) -> None:
+    count = await sampled(profile, operation, event, tmp_path)
+    await meet(profile, operation, event, count, tmp_path / str(count), DOUBLING)
