@@ -75,10 +75,10 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
 
 def absolute_paths(options: MountOptions) -> MountOptions:
     """Return the options with local paths absolute: the background process works in `/`."""
-    client, log_file = options.client, options.log_file
+    client = options.client
     found = {name: getattr(client, name, None) for name in LOCAL_PATHS}
     client = replace(client, **{name: os.path.abspath(path) for name, path in found.items() if path})
-    return replace(options, client=client, log_file=log_file and os.path.abspath(log_file))
+    return replace(options, client=client)
 
 
 def _serve(
@@ -148,16 +148,13 @@ def _report_in_foreground(code: int, message: str) -> None:
 def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:
     level = logging.DEBUG if debug else logging.INFO
     try:
-        if options.log_file is not None:
-            daemon.log_to_file(options.log_file, level)
-        elif foreground:
+        if foreground:
             daemon.log_to_stderr(level)
         else:
             daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
     except OSError as exc:
-        raise UsageError(
-            f"cannot write the log {exc.filename}: {exc.strerror}; name another place by log_file="
-        ) from exc
+        raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
+    daemon.warn_of_gone(options.client)
 
 
 def _control_path(place: str) -> Path | None:

@@ -58,6 +58,7 @@ def run(
     """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
     target = _target(args, component)
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
+    daemon.warn_of_gone(target.options)
     if not args.debug:  # the caches' warnings are raised as errors, too, in one line
         logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
     with open_sinks(target.options, debug=args.debug, tell=say) as sinks:

@@ -8,7 +8,7 @@ both take and refuse the same names and values. Options of the kernel's side of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from mavftpfs.cache.options import DEFAULT_LOCAL
@@ -60,6 +60,8 @@ class Options:
     trace: str | None = None
     tlog: str | None = None
     forward: tuple[str, ...] = ()
+    gone: tuple[str, ...] = field(default=(), compare=False)
+    """A line for people about each word of 0.2 that was given and is gone."""
 
 
 Parser = Callable[[str], Any]
@@ -220,6 +222,38 @@ FLAGS: Flags = {
 }
 
 
+class Gone(NamedTuple):
+    """An option of version 0.2 that is gone. now: what holds instead, or what to do. refused: giving it is an
+    error."""
+
+    now: str
+    refused: bool = False
+
+
+GONE: Mapping[str, Gone] = {
+    "auto_unmount": Gone("`mavftpfs umount` clears the mountpoint of a mount that was killed"),
+    "fsname": Gone("the table of mounts shows SOURCE"),
+    "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
+}
+"""A line of /etc/fstab or a unit of 0.2 goes on to mount: what is harmless is ignored, and named in the log.
+Only what changed a promise is an error. A key may have a value, too. The next version drops the table."""
+
+
+def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
+    """Return whether an option is gone; if so, note a line about it in `values`.
+
+    Raises:
+        UsageError: what it asked for cannot be had any more.
+    """
+    gone = GONE.get(f"{name}={text}") or GONE.get(name)
+    if gone is None:
+        return False
+    if gone.refused:
+        raise UsageError(f"option {name} is gone: {gone.now}")
+    values["gone"] = (*values.get("gone", ()), f"option {name} is gone, and is ignored: {gone.now}")
+    return True
+
+
 def options_of(keywords: Mapping[str, object]) -> Options:
     """Return the options that keywords name as `-o` does: `ro=True, target_system=2, cache_size="1G"`.
 
@@ -240,7 +274,7 @@ def options_of(keywords: Mapping[str, object]) -> Options:
             values[name] = tuple(parse_value(VALUES, name, _as_text(name, one)) for one in value)
         elif name in VALUES:
             values[name] = collected(VALUES, values, name, _as_text(name, value))
-        else:
+        elif not take_gone(values, name, str(value)):
             raise UsageError(f"unknown option {name!r}")
     return Options(**values)
 

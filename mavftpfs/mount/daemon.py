@@ -17,6 +17,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
+from mavftpfs.client.options import Options
 from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, exit_code_for
 from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
@@ -182,15 +183,6 @@ class _PrivateFile(logging.handlers.RotatingFileHandler):
         return open(open_private(self.baseFilename, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8")
 
 
-def log_to_file(path: str, level: int) -> None:
-    """Log to a file of the user's choice, made 0600 if it is not there.
-
-    Raises:
-        OSError: it cannot be opened, or is a symbolic link.
-    """
-    _install(_PrivateFile(path), "%(asctime)s %(levelname)s %(name)s: %(message)s", level)
-
-
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
     """Log to syslog; if there is none, to a small file that is rotated."""
     form = f"mavftpfs[{os.getpid()}]: %(levelname)s %(name)s: %(message)s"
@@ -202,6 +194,12 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
         handler = _PrivateFile(fallback, maxBytes=_LOG_SIZE, backupCount=1)
         form = f"%(asctime)s {form}"
     _install(handler, form, level)
+
+
+def warn_of_gone(options: Options) -> None:
+    """Log a line about each option of 0.2 that was given and is gone."""
+    for line in options.gone:
+        logging.getLogger("mavftpfs").warning("%s", line)
 
 
 class _Readable(logging.Formatter):

@@ -8,9 +8,8 @@ from __future__ import annotations
 import logging
 import os
 import select
-import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager
 from typing import Any
 
 import pyfuse3
@@ -71,8 +70,7 @@ def kernel_mount(
     """
     with stderr_of() as said:
         try:
-            with watcher_told_last():
-                pyfuse3.init(operations, mountpoint, words)
+            pyfuse3.init(operations, mountpoint, words)
         except RuntimeError as exc:
             raise MountFailed(why_not_mounted(mountpoint, said() or str(exc))) from exc
     try:
@@ -85,41 +83,6 @@ def kernel_mount(
             pyfuse3.close(unmount=True)
             if is_dead(mountpoint):  # libfuse leaves it if the kernel aborted it: `umount -f` of one in use
                 unmount(mountpoint, lazy=True)
-
-
-@contextmanager
-def watcher_told_last() -> Iterator[None]:
-    """Mount in the body. With auto_unmount, make sure that the kernel notices our end before fusermount3
-    does.
-
-    It waits for the end of a socket that libfuse opens for it, and never uses again. If the kernel has not
-    given the mount up by then, fusermount3 takes the mount for a living one and leaves it. When a process is
-    killed, Linux releases the descriptors that only it has from the highest number to the lowest, and the
-    socket's number is above that of /dev/fuse. So it gets a lower one.
-    """
-    lowest, before = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), _sockets()
-    try:
-        yield
-        opened = _sockets() - before
-    except BaseException:
-        os.close(lowest)
-        raise
-    if len(opened) == 1:
-        (socket,) = opened
-        os.dup2(socket, lowest, inheritable=False)
-        os.close(socket)
-    else:
-        os.close(lowest)
-
-
-def _sockets() -> set[int]:
-    """Return this process's descriptors that are sockets."""
-    found = set()
-    for name in os.listdir("/proc/self/fd"):
-        with suppress(OSError):  # that of the directory itself is closed by now
-            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                found.add(int(name))
-    return found
 
 
 def presentation(options: MountOptions) -> Presentation:

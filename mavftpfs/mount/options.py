@@ -16,7 +16,7 @@ from typing import Any
 
 from mavftpfs.client import options as client
 from mavftpfs.client.mountpoint import SUBTYPE
-from mavftpfs.client.options import Flag, Flags, Options, Value, Values, collected, number, text_value
+from mavftpfs.client.options import Flag, Flags, Options, Value, Values, collected, number, take_gone
 from mavftpfs.shared.errors import UsageError
 
 KERNEL_WORDS = frozenset(
@@ -47,14 +47,11 @@ class MountOptions:
 
     client: Options = field(default_factory=Options)
     allow_other: bool = False
-    auto_unmount: bool = False
     uid: int | None = None
     gid: int | None = None
     umask: int | None = None
     fmask: int | None = None
     dmask: int | None = None
-    fsname: str | None = None
-    log_file: str | None = None
     all: bool = False
     kernel_words: tuple[str, ...] = ()
 
@@ -85,20 +82,17 @@ OWN_VALUES: Values = {
     "umask": Value(mask, "octal; your umask"),
     "fmask": Value(mask, "umask of files only"),
     "dmask": Value(mask, "umask of directories only"),
-    "fsname": Value(text_value, "name in the table of mounts: SOURCE"),
-    "log_file": Value(text_value, "log there, not to syslog"),
 }
 
 OWN_FLAGS: Flags = {
     "allow_other": Flag("allow_other", True, "other users may see it (permissions apply)"),
-    "auto_unmount": Flag("auto_unmount", True, "unmount when this process dies"),
     "all": Flag("all", True, "each vehicle, below the mountpoint by its system id"),
     "default_permissions": Flag("", True, ""),
 }
 """default_permissions is always on, and not shown."""
 
 VALUES: Values = {**OWN_VALUES, **client.VALUES}
-LOCAL_PATHS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
+LOCAL_PATHS = ("cache_dir", "signing_key", "trace", "tlog")
 """Options whose values are paths on this computer."""
 
 FLAGS: Flags = {**client.FLAGS, **OWN_FLAGS}
@@ -123,13 +117,10 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
 
 def fuse_words(options: MountOptions, source: str) -> set[str]:
     """Return the options that go to FUSE's init."""
-    name = options.fsname or source
-    words = {f"fsname={_escape(name)}", f"subtype={SUBTYPE}", "default_permissions", *options.kernel_words}
+    words = {f"fsname={_escape(source)}", f"subtype={SUBTYPE}", "default_permissions", *options.kernel_words}
     words.add("ro" if options.client.read_only else "rw")
     if options.allow_other:
         words.add("allow_other")
-    if options.auto_unmount:
-        words.add("auto_unmount")
     return words
 
 
@@ -151,7 +142,9 @@ def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
         if not equals:
             raise UsageError(f"option {name} needs a value ({name}=...)")
         values[name] = collected(VALUES, values, name, value)
-    elif word not in IGNORED_WORDS and not word.startswith(IGNORED_PREFIXES):
+    elif word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES):
+        return
+    elif not take_gone(values, name, value):
         raise UsageError(_refusal(name, word))
 
 

@@ -98,7 +98,6 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("mv", SOURCE, "/a"), "NEW"),
         (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
         (("ls", SOURCE, "/", "-o", "trace=/proc/none/t"), "/proc/none/t"),
-        ((SOURCE, "/mnt", "-o", "log_file=/proc/none/l"), "/proc/none/l"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
         (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
         (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),
@@ -118,11 +117,11 @@ def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_baud_and_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,log_file=a/b.log"])
+    args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,tlog=a/b.log"])
     options, spec = commands.connection_of(args)
     assert spec.baud == 921600
     monkeypatch.chdir(tmp_path)
-    assert commands.absolute_paths(options).log_file == str(tmp_path / "a" / "b.log")
+    assert commands.absolute_paths(options).client.tlog == str(tmp_path / "a" / "b.log")
 
 
 @pytest.mark.parametrize(

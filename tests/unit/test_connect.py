@@ -19,13 +19,11 @@ from mavftpfs.mount.options import MountOptions, fuse_words
 OTHER: dict[str, Any] = {
     "read_only": True,
     "allow_other": True,
-    "auto_unmount": True,
     "uid": 12345,
     "gid": 54321,
     "umask": 0o777,
     "fmask": 0o777,
     "dmask": 0o777,
-    "fsname": "drone",
     "root": b"/fs",
     "heartbeat": "none",
     "read_mode": "burst",
@@ -38,7 +36,7 @@ OTHER: dict[str, Any] = {
 }
 """Values that are no default; numbers are made below."""
 
-ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "log_file", "trace", "tlog", "forward", "all"}
+ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "trace", "tlog", "forward", "gone", "all"}
 """What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
 `test_cli.test_baud_and_relative_paths`."""
 

@@ -1,11 +1,9 @@
-"""mount.kernel: our end before fusermount3 hears of it, and reads of /dev/fuse, where what was there may be
-gone before it is read."""
+"""mount.kernel: reads of /dev/fuse, where what was there may be gone before it is read."""
 
 from __future__ import annotations
 
 import os
 import socket
-import stat
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -14,55 +12,9 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.mount.kernel import never_blocking, watcher_told_last
+from mavftpfs.mount.kernel import never_blocking
 
 pytestmark = pytest.mark.real_time
-
-
-def test_the_socket_by_which_fusermount3_hears_of_our_end_lies_below_the_device() -> None:
-    """Linux lets go of the highest descriptor first. Opened in the order of libfuse's."""
-    with watcher_told_last():
-        theirs, ours = socket.socketpair()
-        number = ours.detach()
-        theirs.close()
-        device = os.open(os.devnull, os.O_RDONLY)
-    try:
-        assert device < number
-        moved = [n for n in range(device) if stat.S_ISSOCK(mode_of(n)) and peer_is_gone(n)]
-        assert len(moved) == 1
-        assert mode_of(number) == 0
-        os.close(moved[0])
-    finally:
-        os.close(device)
-
-
-def mode_of(descriptor: int) -> int:
-    """Return what kind of file a descriptor is, 0 if it is not open."""
-    try:
-        return os.fstat(descriptor).st_mode
-    except OSError:
-        return 0
-
-
-def peer_is_gone(descriptor: int) -> bool:
-    """Return whether the other end of a socket was closed."""
-    with socket.socket(fileno=os.dup(descriptor)) as own:
-        try:
-            return own.recv(1, socket.MSG_DONTWAIT | socket.MSG_PEEK) == b""
-        except OSError:
-            return False
-
-
-def test_a_mount_that_failed_leaves_no_descriptor() -> None:
-    before = os.listdir("/proc/self/fd")
-    with pytest.raises(RuntimeError), watcher_told_last():
-        raise RuntimeError
-    with watcher_told_last():
-        pass
-    assert os.listdir("/proc/self/fd") == before
-
-
-# --- reads of /dev/fuse
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.options import DEFAULT_LOCAL, CacheOptions
-from mavftpfs.client.options import Options, options_of
+from mavftpfs.client.options import GONE, Options, options_of
 from mavftpfs.mount.options import (
     FLAGS,
     IGNORED_WORDS,
@@ -32,7 +32,7 @@ OWN, SHARED, PASSED_ON = (
 
 def test_the_table_fills_fields_and_no_others() -> None:
     named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
-    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys()
+    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone"}
     assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
 
 
@@ -64,8 +64,8 @@ def test_words_for_others_are_ignored(word: str) -> None:
         ("local=*.tmp:.x*", "local", ("*.tmp", ".x*")),
         ("local=", "local", ()),
         ("local=+*.tmp:.x*", "local", (*DEFAULT_LOCAL, "*.tmp", ".x*")),
-        ("log_file=a=b", "log_file", "a=b"),
-        (r"fsname=/dev/ttyUSB0\,57600", "fsname", "/dev/ttyUSB0,57600"),
+        ("tlog=a=b", "tlog", "a=b"),
+        (r"tlog=a\,b", "tlog", "a,b"),
         ("allow_other", "allow_other", True),
         ("ro", "read_only", True),
     ],
@@ -96,7 +96,7 @@ def test_the_last_word_wins() -> None:
         ("chunk=²", "chunk"),
         ("root=", "root"),
         ("root=/a/../b", "root"),
-        ("fsname=", "fsname"),
+        ("tlog=", "tlog"),
         ("trace", "trace"),
         ("cache_size=3x", "with K, M or G"),
         ("cache_size=1K", "within 1M and 1024G"),
@@ -226,6 +226,30 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "local",
         "chunk",
     } <= checked
+
+
+# --- words of 0.2 ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "auto_unmount",
+        r"fsname=my drone\,2",
+        "log_file=/var/log/drone",
+    ],
+)
+def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
+    options = parse_options([f"ro,{word},uid=7"])
+    assert options == parse_options(["ro,uid=7"])
+    (line,) = options.client.gone
+    assert f"option {word.partition('=')[0]} is gone, and is ignored: " in line
+
+
+def test_words_that_are_gone_are_in_no_help_and_free_for_nothing_else() -> None:
+    names = {word.partition("=")[0] for word in GONE}
+    assert not names & {name.strip("=") for name in option_help()}
+    assert not names & (KERNEL_WORDS | IGNORED_WORDS)
 
 
 def test_endpoints_are_collected() -> None:

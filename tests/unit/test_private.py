@@ -13,7 +13,7 @@ import pytest
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.client.trace import JsonTrace, TlogWriter
-from mavftpfs.mount.daemon import log_to_file
+from mavftpfs.mount.daemon import log_in_background
 from mavftpfs.mount.farewell import keep_the_rest
 from tests.support.rigs import Rig
 from tests.unit.test_daemon import restored_logging
@@ -32,7 +32,7 @@ def tlog(path: Path) -> None:
 
 
 def log(path: Path) -> None:
-    log_to_file(str(path), logging.INFO)
+    log_in_background(path, logging.INFO, socket="/nowhere")
 
 
 def exposed(directory: Path) -> list[Path]:
