@@ -74,7 +74,7 @@ def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
         range(len(groups)),
         [f"{tables.server_name(server)}\n{tables.link_name(link)}" for server, link in groups],
     )
-    axes.set_xlim(0, max([1.0, *(share_of(row) for row in rows)]) + 0.15)
+    axes.set_xlim(0, 1.15)
     axes.set_xlabel("share of the limit (loopback: of the bare loop)")
     axes.grid(visible=False, axis="y")
 
@@ -85,8 +85,10 @@ def share_of(row: Row) -> float:
 
 
 def reached(row: Row) -> float | None:
-    """Return the share of the limit, on the loopback of the bare loop. If cut off, it is an upper bound."""
-    return row.of_bare if row.of_limit is None else row.of_limit
+    """Return the share of the limit, on the loopback of the bare loop; one above 1 counts as 1. If cut off,
+    it is an upper bound."""
+    share = row.of_bare if row.of_limit is None else row.of_limit
+    return None if share is None else min(share, 1.0)
 
 
 def note_of(row: Row) -> str:

@@ -15,6 +15,8 @@ def test_the_page_shows_what_was_recorded() -> None:
     recorded = record.sections(record.RESULTS)
     assert tables.filled_in(page, recorded) == page, "scripts/bench plots --page docs/benchmarks.md"
     (picture,) = re.findall(r"\]\(\.\./(tests/bench/\S+\.svg)\)", page)
-    assert (PROJECT / picture).is_file()
+    shares = re.findall(r">(?:&lt; )?(\d\.\d\d)</text>", (PROJECT / picture).read_text())
+    assert shares
+    assert max(map(float, shares)) <= 1, "a share above 1 counts as 1"
     for section in recorded.values():
         assert f"`{' '.join(section['command'].split()[:2])}`" in page, "the command that made it"

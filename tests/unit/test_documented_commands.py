@@ -54,6 +54,24 @@ def test_it_can_be_parsed(command: str) -> None:
         parse_source(source)
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_rsync_finds_the_directory_above_its_target(page: str) -> None:
+    made = {"~"}
+    for line in BLOCK_LINE.findall((PROJECT / page).read_text()):
+        command, *words = line.partition("  #")[0].split()
+        if command == "mkdir":
+            made |= {word.rstrip("/") for word in words}
+        if command == "rsync":
+            assert words[-1].rstrip("/").rpartition("/")[0] in made
+
+
+@pytest.mark.parametrize("page", [*PAGES, "docs/library.md", "CHANGELOG.md"])
+def test_pip_installs_from_a_clone(page: str) -> None:
+    """No registry has the package."""
+    installed = re.findall(r"\bpipx? install (?:--\S+ )*('[^']*'|[^\s`]+)", (PROJECT / page).read_text())
+    assert all(word.strip("'").startswith(".") for word in installed)
+
+
 @pytest.mark.parametrize("page", ["docs/guide.md", "mavftpfs/data/mount.mavftpfs.8"])
 def test_the_line_for_fstab(page: str) -> None:
     text = (PROJECT / page).read_text().replace("\\-", "-")
