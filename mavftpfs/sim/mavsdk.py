@@ -37,13 +37,10 @@ class _ReadStream:
     position: int = 0
     failed: bool = False
 
-    def seek(self, offset: int, sticky: bool) -> bool:
-        """Go there; on old versions a failed stream stays failed."""
-        if self.failed and sticky:
-            return False
+    def seek(self, offset: int) -> None:
+        """Go to the offset and clear a failure."""
         self.failed = False
         self.position = offset
-        return True
 
     def read(self, size: int) -> bytes | None:
         """Return exactly `size` bytes, or None and fail."""
@@ -329,9 +326,9 @@ class Mavsdk(Firmware):
             self._close()
         if request.offset >= self._file_size:
             raise Refusal(NakCode.EOF)
-        sticky = self.profile.sticky_stream_failure
-        if self._reader is None or not self._reader.seek(request.offset, sticky):
+        if self._reader is None:
             raise Refusal(NakCode.FAIL)
+        self._reader.seek(request.offset)
         return self._reader
 
     def _read(self, request: Request) -> bytes:
@@ -368,7 +365,7 @@ class Mavsdk(Firmware):
         burst.packets += 1
         opcode, data, complete = ACK, self._burst_data(burst), 0
         offset = burst.offset
-        full = bool(self.profile.burst_packets) and burst.packets >= self.profile.burst_packets
+        full = burst.packets >= self.profile.burst_packets
         if data is None:
             opcode, data, offset = NAK, bytes([NakCode.FAIL]), 0
         else:

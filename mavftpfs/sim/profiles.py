@@ -1,6 +1,6 @@
 """Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
 
-The firmwares that are simulated, and a few odd variants. Sources of the numbers: servers.md, PX4
+The firmwares that are simulated. Sources of the numbers: servers.md, PX4
 `mavlink_ftp.cpp`, ArduPilot `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
 """
 
@@ -16,7 +16,6 @@ TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 class Family(Enum):
     """Whose code the server runs."""
 
-    SPEC = "spec"
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
     MAVSDK = "mavsdk"
@@ -83,8 +82,6 @@ class Profile:
     checks_sender: bool = False
     """An answer is repeated only to the client that asked, and without stray bytes (PX4 of September
     2026)."""
-    sticky_stream_failure: bool = False
-    """A read that crossed the end spoils every later read until reopened (MAVSDK before 4.1)."""
 
     # PX4
     logs: bytes = b""
@@ -120,7 +117,7 @@ class Profile:
 
     # Bursts
     burst_packets: int = 0
-    """Packets in one burst; 0 = no limit. PX4 counts bytes instead."""
+    """Packets in one burst (ArduPilot, MAVSDK). PX4 counts bytes instead."""
     burst_interval: float = 0.0
     """Time per burst packet at best."""
     short_packet_completes: bool = False
@@ -177,7 +174,6 @@ _MAVSDK = Profile(
 )
 
 _ALL = (
-    Profile(name="spec", family=Family.SPEC, list_with_time=True, sessions=4, path_limit=239),
     _PX4,
     replace(
         _PX4,
@@ -223,14 +219,6 @@ _ALL = (
         crc_rate=150e3,
     ),
     _MAVSDK,
-    replace(
-        _MAVSDK,
-        name="mavsdk-old",
-        list_with_time=False,
-        sticky_stream_failure=True,
-        burst_packets=0,
-        burst_interval=0.0001,
-    ),
 )
 
 PROFILES: dict[str, Profile] = {profile.name: profile for profile in _ALL}

@@ -31,7 +31,7 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.protocol.payload import PAYLOAD_SIZE
 from mavftpfs.sim.ardupilot import ArduPilot
-from mavftpfs.sim.firmware import Firmware, Spec
+from mavftpfs.sim.firmware import Firmware
 from mavftpfs.sim.mavsdk import Mavsdk
 from mavftpfs.sim.profiles import Family, Profile
 from mavftpfs.sim.pseudo import VirtualTrees
@@ -42,7 +42,6 @@ from mavftpfs.sim.tree import Tree
 AUTOPILOT = Address(1, 1)
 _OPCODE = itemgetter(3)
 _FIRMWARES: dict[Family, type[Firmware]] = {
-    Family.SPEC: Spec,
     Family.PX4: Px4,
     Family.ARDUPILOT: ArduPilot,
     Family.MAVSDK: Mavsdk,
@@ -125,7 +124,7 @@ CAPACITY_MIB = 30436.0
 """A 32 GB card."""
 
 _TYPE_QUADROTOR = 2
-_AUTOPILOT_TYPE = {Family.SPEC: 0, Family.ARDUPILOT: 3, Family.PX4: 12, Family.MAVSDK: 0}
+_AUTOPILOT_TYPE = {Family.ARDUPILOT: 3, Family.PX4: 12, Family.MAVSDK: 0}
 _MAVLINK2 = 0x2000
 _MODE_ENABLED = 0x01 | 0x40
 _ACCEPTED = 0

@@ -13,7 +13,6 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.places import FOLDERS, NO_RENAME, REAL, start_place
 from tests.support.trees import differing
-from tests.support.vehicles import SimVehicle
 
 LOCKSTEP = Path(__file__).parents[1] / "support" / "programs" / "lockstep.py"
 FLAWS = ("--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.005")
@@ -25,9 +24,6 @@ def run_lockstep(field: Field, kind: str, loss: str, seed: int, count: int, limi
     """Mount a vehicle with an empty card, make the calls, unmount, compare what is left."""
     flaws = ("--loss", loss) if kind == REAL else (*FLAWS, *DELAY, "--loss", loss)
     place = start_place(field, kind, (*flaws, "--seed", str(seed)))
-    if isinstance(place.vehicle, SimVehicle):
-        # It numbers its sessions: a late copy of an open opens one more.
-        place.vehicle.left_alone = kind == "spec"
     local = field.local("twin")
     mount = field.mount(place.vehicle.source, *place.options)
     where = [str(mount.path / place.folder), str(local), str(place.card)]

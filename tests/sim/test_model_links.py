@@ -42,10 +42,6 @@ STRAYING = LinkSettings(delay=0.02, loss=0.05, duplicate=0.02, reorder=0.05, hol
 FAILURES = 2
 """Calls of one sequence that may fail: too many answers in a row are lost. None is the rule."""
 
-LEAKS = ("spec",)
-"""Servers with several sessions that open another for an OpenFile or CreateFile that arrives twice; nobody
-learns its id if the answer is lost."""
-
 CALLS = 100
 """Of one sequence."""
 
@@ -79,7 +75,7 @@ async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any
             await model.do("check")
         await model.end()
         assert model.failures <= FAILURES
-    assert profile in LEAKS or here.server.open_sessions == 0
+    assert here.server.open_sessions == 0
 
 
 def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> None:

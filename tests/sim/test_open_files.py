@@ -55,7 +55,7 @@ async def test_nothing_more_is_fetched_once_nobody_reads(how: str, mode: ReadMod
     on_its_way: bytes; a burst has up to 38 kB.
     """
     link, size = LinkSettings(rate=15_000.0, delay=0.03), 400_000
-    async with rig("spec", {FILE: content(size)}, link=link, options=ConnectOptions(read_mode=mode)) as here:
+    async with rig("px4", {FILE: content(size)}, link=link, options=ConnectOptions(read_mode=mode)) as here:
         tree = here.mount()
         file = await tree.open(FILE)
         if how == "closed":  # what is read ahead is still to come

@@ -53,8 +53,7 @@ class Faults:
         requests: opcodes of ours that reached the server so far. asked: the same with their times.
         refused: opcodes of requests that were NAKed.
         spoil: in so many more WriteFiles the first byte arrives as another one.
-        orphans: files may be open that we cannot close: copies of requests come late, or the server gives
-            its sessions numbers of its own, and the ACK of an open was lost.
+        orphans: files may be open that we cannot close, because copies of requests come late.
     """
 
     def __init__(self, server: FtpServer) -> None:

@@ -16,7 +16,6 @@ REAL = "mavsdk-server"
 """The MAVSDK library's server; all others are simulated."""
 
 FOLDERS = {
-    "spec": "",
     "px4": "",
     "px4-2026": "",
     "px4-nuttx": "fs/microsd",
@@ -24,7 +23,6 @@ FOLDERS = {
     "ardupilot5": "APM",
     "littlefs": "APM",
     "mavsdk": "",
-    "mavsdk-old": "",
     REAL: "",
 }
 """The folder of each that may be written."""

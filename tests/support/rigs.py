@@ -85,7 +85,7 @@ class Rig:
         self.server = LyingServer(self.card, PROFILES[profile], rng=Random(seed))
         self.vehicle.server = self.server
         self.faults = Faults(self.server)
-        self.faults.orphans = bool(link.duplicate) or PROFILES[profile].family is Family.SPEC
+        self.faults.orphans = bool(link.duplicate)
         self.model = LinkModel(Random(seed + 1), link)
         self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []

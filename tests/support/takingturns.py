@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-ALIKE = frozenset({"spec", "px4-2026", "mavsdk-old", "ardupilot5", "littlefs"})
+ALIKE = frozenset({"px4-2026", "ardupilot5", "littlefs"})
 
 
 def taking_turns(profiles: Iterable[str], soak: Collection[str] = ()) -> list[Any]:

@@ -1,4 +1,4 @@
-"""The simulated MAVSDK server: two streams, bursts by a thread, silence, a crash (servers.md 1-10, 15)."""
+"""The simulated MAVSDK server: silence, and a crash (servers.md 6, 7, 15)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ import pytest
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
 from tests.support.sim_client import DIR, FIVE, A, Client, ack, nak
-
-FAIL = bytes([NakCode.FAIL])
-
-# -- silence and the crash -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO])
@@ -30,15 +26,3 @@ def test_listing_a_file_kills_the_server() -> None:
     c.server.reboot(c.now)
     assert not c.server.firmware.crashed
     assert nak(c.ask(Opcode.LIST_DIRECTORY, DIR)) == bytes([NakCode.EOF])
-
-
-# -- the two streams -----------------------------------------------------------------------------
-
-
-def test_on_old_versions_it_spoils_the_stream() -> None:
-    c = Client("mavsdk-old")
-    c.open(FIVE)
-    assert nak(c.ask(Opcode.READ_FILE, size=239)) == FAIL
-    assert nak(c.ask(Opcode.READ_FILE, size=1)) == FAIL
-    c.open(FIVE)
-    assert ack(c.ask(Opcode.READ_FILE, size=1)) == b"\x05"

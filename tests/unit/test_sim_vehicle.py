@@ -32,7 +32,7 @@ LIST = request(5, Opcode.LIST_DIRECTORY, data=b"/").encode()
 class Client:
     """The other end: talks to one vehicle, on hand-made time."""
 
-    def __init__(self, profile: str = "spec", **options: object) -> None:
+    def __init__(self, profile: str = "px4", **options: object) -> None:
         self.vehicle = SimVehicle(
             MemoryTree(),
             PROFILES[profile],
