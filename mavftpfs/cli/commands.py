@@ -18,7 +18,7 @@ from pathlib import Path
 from mavftpfs.cli import report
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours
-from mavftpfs.client.options import split_words, with_root
+from mavftpfs.client.options import at_source, split_words
 from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, with_vehicles
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon
@@ -68,9 +68,8 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
     options = parse_options(args.options)
     if os.path.isdir(args.source) and ":" in getattr(args, "mountpoint", ""):
         raise UsageError(f"SOURCE comes first, then the directory: {args.mountpoint} {args.source}")
-    spec = parse_source(args.source)
-    client = with_root(options.client, spec.subtree)
-    return replace(options, client=client), spec if client.baud is None else replace(spec, baud=client.baud)
+    spec, client = at_source(parse_source(args.source), options.client)
+    return replace(options, client=client), spec
 
 
 def absolute_paths(options: MountOptions) -> MountOptions:

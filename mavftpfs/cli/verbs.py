@@ -347,12 +347,10 @@ def _spooled_stdin() -> Iterator[Path]:
 
 def _put(args: Args, component: int | None, function: Callable[..., Coroutine[Any, Any, None]]) -> int:
     bar = Progress()
-    unverified = parse_options(args.options).client.verify == "none"
-    how = "not verified" if unverified else "verified"
 
     async def work(session: Session) -> None:
         def tell(remote: bytes, size: int, proof: str) -> None:
-            verified = f"verified by {proof}" if proof else how
+            verified = f"verified by {proof}" if proof else "verified"
             print(f"{_name(session.on_vehicle(remote))}: {readable_size(size)}, {verified}", flush=True)
 
         async with noting_losses(session, bar):

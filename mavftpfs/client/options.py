@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from mavftpfs.cache.options import DEFAULT_LOCAL
-from mavftpfs.link.uri import parse_endpoint
+from mavftpfs.link.uri import LinkSpec, parse_endpoint
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -24,18 +24,19 @@ _DAY = 86400.0
 class Options:
     """How to reach a vehicle and how to treat its files.
 
-    Seconds, bytes and bytes per second; None = found out, or not wanted. The session's values are explained
-    at `session.connection.ConnectOptions`, the caches' at `cache.options.CacheOptions`.
+    Seconds, bytes and bytes per second; None = found out, or not wanted. SOURCE sets root; baud overrides
+    that of SOURCE. `session.connection.ConnectOptions` explains the session's values, and
+    `cache.options.CacheOptions` those of the caches.
     """
 
     read_only: bool = False
     root: bytes = ROOT
+    baud: int | None = None
     target_system: int = 0
     target_component: int = 0
     source_system: int = 254
     source_component: int = 191
     heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
-    baud: int | None = None
     signing_key: str | None = None
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
@@ -51,7 +52,6 @@ class Options:
     dirty_max: int | None = None
     spool_max: int = 1 << 30
     rmw_max: int | None = None
-    verify: Literal["auto", "size", "crc", "none"] = "auto"
     verify_max: int = 4 << 20
     when_armed: Literal["ro", "ok"] = "ro"
     force: bool = False
@@ -170,13 +170,11 @@ class Value(NamedTuple):
 Values = Mapping[str, Value]
 
 VALUES: Values = {
-    "root": Value(remote_path, "mount this directory of the vehicle: /"),
     "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
     "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
     "source_system": Value(number(1, 255), "our system id on the link: 254"),
     "source_component": Value(number(1, 255), "and which part: 191"),
     "heartbeat": Value(Choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
-    "baud": Value(number(300, 12_000_000), "of a serial line: 57600"),
     "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
     "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
     "attr_timeout": Value(seconds(0, _DAY), "seconds that the kernel keeps attributes: 1"),
@@ -192,10 +190,7 @@ VALUES: Values = {
     "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
     "window": Value(number(1, 256, auto=True), "requests in flight at most: auto"),
     "bwlimit": Value(size(100, _SIZE_MAX), "bytes per second that we may cause on the link"),
-    "verify": Value(
-        Choice("auto", "size", "crc", "none"), "written files: auto (size, and CRC32), size, crc, none"
-    ),
-    "verify_max": Value(size(0, _SIZE_MAX), "largest file whose CRC32 is asked for by auto: 4M"),
+    "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
     "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
     "trace": Value(text_value, "every request and reply as a line of JSON there"),
@@ -223,10 +218,14 @@ FLAGS: Flags = {
 
 
 class Gone(NamedTuple):
-    """An option of version 0.2 that is gone. now: what holds instead, or what to do. refused: giving it is an
-    error."""
+    """An option of version 0.2 that is gone. now: what holds instead, or what to write.
+
+    becomes: the field of Options that its value still sets, by `parse`. refused: the option is an error.
+    """
 
     now: str
+    becomes: str = ""
+    parse: Parser = str
     refused: bool = False
 
 
@@ -234,9 +233,18 @@ GONE: Mapping[str, Gone] = {
     "auto_unmount": Gone("`mavftpfs umount` clears the mountpoint of a mount that was killed"),
     "fsname": Gone("the table of mounts shows SOURCE"),
     "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
+    "root": Gone("write SOURCE#/dir", "root", remote_path),
+    "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
+    "verify=auto": Gone("that is how written files are checked"),
+    "verify=size": Gone("write verify_max=0", "verify_max", lambda text: 0),
+    "verify=none": Gone("the size is always compared; write verify_max=0", "verify_max", lambda text: 0),
+    "verify=crc": Gone(
+        "write verify_max=1024G; a CRC32 that the vehicle does not answer is no error then, but logged",
+        refused=True,
+    ),
 }
-"""A line of /etc/fstab or a unit of 0.2 goes on to mount: what is harmless is ignored, and named in the log.
-Only what changed a promise is an error. A key may have a value, too. The next version drops the table."""
+"""A line of /etc/fstab or a unit of 0.2 goes on to mount: harmless options are ignored or translated, and the
+log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 0.3."""
 
 
 def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
@@ -250,7 +258,10 @@ def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
         return False
     if gone.refused:
         raise UsageError(f"option {name} is gone: {gone.now}")
-    values["gone"] = (*values.get("gone", ()), f"option {name} is gone, and is ignored: {gone.now}")
+    if gone.becomes:
+        values[gone.becomes] = parsed(gone.parse, name, text)
+    how = "is still understood" if gone.becomes else "is ignored"
+    values["gone"] = (*values.get("gone", ()), f"option {name} is gone, and {how}: {gone.now}")
     return True
 
 
@@ -264,17 +275,17 @@ def options_of(keywords: Mapping[str, object]) -> Options:
     """
     values: dict[str, Any] = {}
     for name, value in keywords.items():
-        if value is None:
+        if value is None or (value is False and name in GONE):
             continue
         if name in FLAGS:
             if not isinstance(value, bool):
                 raise UsageError(f"option {name} is True or False, not {value!r}")
             values[FLAGS[name].field] = FLAGS[name].becomes is value
         elif name in VALUES and VALUES[name].many and isinstance(value, list | tuple):
-            values[name] = tuple(parse_value(VALUES, name, _as_text(name, one)) for one in value)
+            values[name] = tuple(parsed(VALUES[name].parse, name, _as_text(name, one)) for one in value)
         elif name in VALUES:
             values[name] = collected(VALUES, values, name, _as_text(name, value))
-        elif not take_gone(values, name, str(value)):
+        elif not take_gone(values, name, "" if value is True else _as_text(name, value)):
             raise UsageError(f"unknown option {name!r}")
     return Options(**values)
 
@@ -290,27 +301,29 @@ def _as_text(name: str, value: object) -> str:
     return str(text)
 
 
-def with_root(options: Options, subtree: bytes) -> Options:
-    """Return the options with the `#subtree` of SOURCE as root.
+def at_source(spec: LinkSpec, options: Options) -> tuple[LinkSpec, Options]:
+    """Return SOURCE and the options, with the `#subtree` of SOURCE as root.
 
     Raises:
         UsageError: root= is given, too.
     """
-    if subtree == ROOT:
-        return options
+    if options.baud is not None:
+        spec = replace(spec, baud=options.baud)
+    if spec.subtree == ROOT:
+        return spec, options
     if options.root != ROOT:
-        raise UsageError("give the remote directory either behind '#' or as root=, not both")
-    return replace(options, root=subtree)
+        raise UsageError("give the remote directory behind '#' only, not as root=, too")
+    return spec, replace(options, root=spec.subtree)
 
 
-def parse_value(values: Values, name: str, text: str) -> Any:
-    """Return the value of an option of a table.
+def parsed(parse: Parser, name: str, text: str) -> Any:
+    """Return the value of an option.
 
     Raises:
         UsageError: a bad value; the message names the option.
     """
     try:
-        return values[name].parse(text)
+        return parse(text)
     except (ValueError, MavftpfsError) as exc:
         raise UsageError(f"option {name}={text}: {exc}") from exc
 
@@ -319,9 +332,9 @@ def collected(table: Values, values: Mapping[str, Any], name: str, text: str) ->
     """Return the value of an option, appended to its earlier values if all of them count.
 
     Raises:
-        UsageError: as parse_value.
+        UsageError: as parsed.
     """
-    value = parse_value(table, name, text)
+    value = parsed(table[name].parse, name, text)
     return tuple(dict.fromkeys((*values.get(name, ()), value))) if table[name].many else value
 
 

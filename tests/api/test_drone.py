@@ -398,7 +398,7 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
             assert drone.status()["mountpoint"] == str(mount.path)
     with pytest.raises(mavftpfs.UsageError, match="use_mount=False"):
         mavftpfs.connect(str(mount.path), use_mount=False)
-    with pytest.raises(mavftpfs.UsageError, match="name the directory below it"):
+    with pytest.raises(mavftpfs.UsageError, match="name the directory in it"):
         mavftpfs.connect(str(mount.path), root="/d")
     with mavftpfs.connect(vehicle.source, ro=True) as drone:
         for change in (CALLS["bytes"], CALLS["mkdir"], CALLS["truncate"], CALLS["remove"], CALLS["rename"]):

@@ -168,7 +168,7 @@ def clients() -> dict[str, Client]:
 
     def ours(job: Job, point: Path) -> list[str]:
         source = f"udpin:{HOST}:{job.port}"
-        return [sys.executable, "-m", "mavftpfs", source, str(point), "-f", "-o", "verify=size"]
+        return [sys.executable, "-m", "mavftpfs", source, str(point), "-f", "-o", "verify_max=0"]
 
     def fusepy(job: Job, point: Path) -> list[str]:
         (script,) = place.glob("lib/python*/site-packages/pymavlink/mavftpfs.py")

@@ -116,10 +116,18 @@ def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert "SOURCE MOUNTPOINT" in capsys.readouterr().err
 
 
-def test_baud_and_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,tlog=a/b.log"])
+def test_words_of_0_2_that_belong_to_source_are_translated() -> None:
+    args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,root=/fs/microsd/"])
     options, spec = commands.connection_of(args)
-    assert spec.baud == 921600
+    plain = argparse.Namespace(source="/dev/ttyX,921600#/fs/microsd", options=[])
+    same, there = commands.connection_of(plain)
+    assert (spec.description, options.client.root) == (there.description, same.client.root)
+    assert len(options.client.gone) == 2
+
+
+def test_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    args = argparse.Namespace(source="/dev/ttyX", options=["tlog=a/b.log"])
+    options, _ = commands.connection_of(args)
     monkeypatch.chdir(tmp_path)
     assert commands.absolute_paths(options).client.tlog == str(tmp_path / "a" / "b.log")
 

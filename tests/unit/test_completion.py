@@ -80,7 +80,7 @@ def by_fish(script: Path, folder: Path, line: str) -> str:
         (f"mavftpfs put {SOURCE} no", ["note"], []),
         (f"mavftpfs {SOURCE} mn", ["mnt"], []),
         (f"mavftpfs {SOURCE} mnt -o ro,when", ["ro,when_armed="], ["window="]),
-        ("mavftpfs ls -o verify=", ["auto", "crc", "none", "size"], ["when_armed"]),
+        ("mavftpfs ls -o read_mode=", ["window", "burst"], ["when_armed"]),
         ("mavftpfs ls -o ro,heartbeat=gc", ["ro,heartbeat=gcs"], ["onboard"]),
         ("mavftpfs mount -o tlog=no", ["tlog=note"], []),
         ("mavftpfs umount mn", ["mnt"], []),

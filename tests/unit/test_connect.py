@@ -27,7 +27,6 @@ OTHER: dict[str, Any] = {
     "root": b"/fs",
     "heartbeat": "none",
     "read_mode": "burst",
-    "verify": "size",
     "when_armed": "ok",
     "local": (),
     "force": True,
@@ -38,7 +37,7 @@ OTHER: dict[str, Any] = {
 
 ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "trace", "tlog", "forward", "gone", "all"}
 """What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
-`test_cli.test_baud_and_relative_paths`."""
+in `test_cli`."""
 
 
 def told(options: MountOptions) -> tuple[Any, ...]:

@@ -30,9 +30,13 @@ OWN, SHARED, PASSED_ON = (
 )
 
 
+OF_SOURCE = {"root", "baud"}
+"""Fields that SOURCE sets, and words of 0.2."""
+
+
 def test_the_table_fills_fields_and_no_others() -> None:
     named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
-    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone"}
+    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone", *OF_SOURCE}
     assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
 
 
@@ -53,8 +57,6 @@ def test_words_for_others_are_ignored(word: str) -> None:
     [
         ("uid=1000", "uid", 1000),
         ("umask=022", "umask", 0o022),
-        ("root=/fs/microsd/", "root", b"/fs/microsd"),
-        ("root=@SYS", "root", b"/@SYS"),
         ("heartbeat=gcs", "heartbeat", "gcs"),
         ("dir_timeout=0.5", "dir_timeout", 0.5),
         ("cache_size=2g", "cache_size", 2 << 30),
@@ -121,12 +123,12 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("keywords", "text"),
     [
-        ({"ro": True, "force": False}, "ro"),
+        ({"ro": True, "inplace": False}, "ro"),
         ({"ro": False}, "rw"),
         ({"rw": False}, "ro"),
         ({"cache_size": "1G", "target_system": 2, "baud": None}, "cache_size=1G,target_system=2"),
         ({"cache_size": 1 << 30, "op_deadline": 2.5}, "cache_size=1G,op_deadline=2.5"),
-        ({"chunk": "auto", "local": "+*.tmp", "root": b"/fs"}, "chunk=auto,local=+*.tmp,root=/fs"),
+        ({"chunk": "auto", "tlog": b"a"}, "chunk=auto,tlog=a"),
         ({"trace": Path("a/b")}, "trace=a/b"),
     ],
 )
@@ -144,7 +146,7 @@ def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> 
         ({"target_system": True}, "option target_system cannot be True"),
         ({"target_system": 2.5}, "target_system=2.5: must be a whole number"),
         ({"local": ["a"]}, "option local cannot be"),
-        ({"verify": "perhaps"}, "verify=perhaps: must be one of"),
+        ({"verify": "perhaps"}, "unknown option 'verify'"),
         ({"cache_size": 1}, "cache_size=1: must be within"),
     ],
 )
@@ -237,6 +239,7 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "auto_unmount",
         r"fsname=my drone\,2",
         "log_file=/var/log/drone",
+        "verify=auto",
     ],
 )
 def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
@@ -244,6 +247,39 @@ def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
     assert options == parse_options(["ro,uid=7"])
     (line,) = options.client.gone
     assert f"option {word.partition('=')[0]} is gone, and is ignored: " in line
+
+
+@pytest.mark.parametrize(
+    ("word", "field", "value"),
+    [
+        ("root=/fs/microsd/", "root", b"/fs/microsd"),
+        ("root=@SYS", "root", b"/@SYS"),
+        ("baud=921600", "baud", 921600),
+        ("verify=size", "verify_max", 0),
+        ("verify=none", "verify_max", 0),
+    ],
+)
+def test_some_words_of_0_2_are_translated(word: str, field: str, value: object) -> None:
+    options = parse_options([word]).client
+    assert getattr(options, field) == value
+    (line,) = options.gone
+    assert "is still understood: " in line
+    name, _, text = word.partition("=")
+    assert options_of({name: text}) == options
+
+
+@pytest.mark.parametrize(
+    ("word", "advice"),
+    [
+        ("verify=crc", "write verify_max=1024G"),
+    ],
+)
+def test_words_of_0_2_that_changed_a_promise_are_errors(word: str, advice: str) -> None:
+    name, _, value = word.partition("=")
+    with pytest.raises(UsageError, match=f"option {name} is gone: .*{advice}"):
+        parse_options([f"ro,{word}"])
+    with pytest.raises(UsageError, match=f"option {name} is gone: .*{advice}"):
+        options_of({name: value})
 
 
 def test_words_that_are_gone_are_in_no_help_and_free_for_nothing_else() -> None:
