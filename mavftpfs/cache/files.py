@@ -29,7 +29,6 @@ from functools import partial
 import trio
 
 from mavftpfs.cache.directories import COST_FACTOR, Directories, Directory, Found
-from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.pathlocks import PathLocks
@@ -47,7 +46,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 from mavftpfs.shared.sameness import Listed, Opened, Sameness, compare
 
 MAX_CLOSED = 4096
@@ -72,7 +71,7 @@ class Files:
     """All regular files that are open or cached. Paths are the vehicle's.
 
     Attributes:
-        kept: the cache on the local disk, if there is one. open_versions: those with open handles.
+        open_versions: those with open handles.
         reopening: the versions that are given a reader now, see `open_reader`.
     """
 
@@ -85,13 +84,11 @@ class Files:
         directories: Directories,
         nodes: Nodes,
         invalidate: Callable[[bytes], None],
-        kept: KeptCache | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's copies of a file are wrong.
 
         `proof_time`: seconds for which a proof that a version is the vehicle's file holds.
         """
-        self.kept = kept
         self._nodes = nodes
         self._store = store
         self.cache = cache
@@ -130,21 +127,12 @@ class Files:
 
     async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
         """Return the version to serve, and whether it was served before."""
-        entry, fresh = found.entry, self._clock() < found.directory.fresh_until
+        fresh = self._clock() < found.directory.fresh_until
         version = self._newest.get(path)
         if version is not None and self._may_serve(version, found, fresh):
             self._newest.move_to_end(path)
             return version, True
-        kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
-        if kept is not None:
-            version = self._version(path, kept.key.size, entry.mtime)
-            version.kept, version.proven_at = kept, found.directory.listed_at
-            self._set_newest(version)
-        else:
-            version = await self._start_version(path, entry)
-            if fresh and self.kept is not None:
-                self.kept.keep(version, entry)
-        return version, False
+        return await self._start_version(path, found.entry), False
 
     def _version(self, path: bytes, size: int = 0, mtime: int | None = None) -> Version:
         return Version(self.cache, path, size, mtime, on_doubt=self._on_doubt)
@@ -242,8 +230,7 @@ class Files:
             for v in self.open_versions
             if v.waited_for or (v.received_at > recent and v.progress < v.size)
         ]
-        kept = {} if self.kept is None else self.kept.status()
-        return {"reads": reads, **kept}
+        return {"reads": reads}
 
     # --- is it the same file?
 
@@ -364,23 +351,6 @@ class Files:
             version.mark_replaced(f"{version.path!r} was changed here")
         for node in self._nodes.below(path):
             node.close_base()
-
-    async def make_way(self, old: bytes, new: bytes, entry: DirEntry) -> None:
-        """What is listed as `entry` at `old` is about to be at `new`: nothing kept passes for it, nor for a
-        file below it. With `cache_dir` directories below are listed for that.
-
-        Raises:
-            As Directories.get.
-        """
-        if self.kept is None:
-            return
-        if entry.kind is EntryKind.DIRECTORY:
-            for name, below in list((await self._directories.get(old)).entries.items()):
-                await self.make_way(join(old, name), join(new, name), below)
-            return
-        for version in self._at_or_below(new):
-            version.kept = None
-        await self.kept.forget(new, entry)
 
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns
@@ -508,9 +478,6 @@ class VersionHandle(OpenFile):
             return data
         try:
             async with files.cache.reads:
-                if files.kept is not None:
-                    await files.kept.fill(version, start, stop)
-                    version.require_not_replaced()
                 if version.missing(start, stop):
                     if version.reader is None or version.ignores_data:
                         await files.reopening.run(version, partial(files.open_reader, version))

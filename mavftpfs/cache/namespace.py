@@ -202,7 +202,6 @@ class Namespace:
         for path in (old, new):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
-        await context.files.make_way(old, new, source)
         await self._move(old, new, listed)
         if source.kind is EntryKind.DIRECTORY:
             context.directories.forget(old)

@@ -20,7 +20,6 @@ from mavftpfs.cache.attributes import SECOND, Stat, shown_mtime
 from mavftpfs.cache.directories import Directories, Directory, Found
 from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.kept import CLOCK_SET, KeptCache
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.missions import Missions
 from mavftpfs.cache.nodes import Nodes
@@ -49,6 +48,9 @@ from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_vir
 
 __all__ = ["OpenFile", "Stat", "Tree"]
 
+CLOCK_SET = 1_420_070_400
+"""2015-01-01 UTC: an older mtime is that of a vehicle whose clock was not set."""
+
 MAX_CHECKSUMS = 1024
 """How many of the vehicle's checksums are remembered."""
 
@@ -70,14 +72,12 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
-        keep: Callable[[Directories, BlockCache], KeptCache] | None = None,
     ) -> None:
         """`invalidate(path)`: copies that the caller (a mount's kernel) keeps of a path's bytes and
         attributes are wrong; must not block.
 
         `nursery`: listings and snapshots under way survive the cancellation of their callers.
-        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
-        `keep` makes the cache on the local disk.
+        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names.
         """
         self._options = options
         self._clock = clock
@@ -87,10 +87,6 @@ class Tree:
             store, options, clock=clock, nursery=nursery, on_listed=self._on_listed, on_swept=self._on_swept
         )
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
-        self._kept: KeptCache | None = None
-        if keep is not None:
-            self._kept = keep(self._directories, self._blocks)
-            nursery.start_soon(self._kept.run)
         nodes = Nodes()
         self._files = Files(
             store,
@@ -99,7 +95,6 @@ class Tree:
             directories=self._directories,
             nodes=nodes,
             invalidate=self._invalidate,
-            kept=self._kept,
         )
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
@@ -406,11 +401,6 @@ class Tree:
             OSError, NoSpace, SpoolFailed: nothing could be moved.
         """
         return self._writing.recover_to(directory)
-
-    async def keep_whole_files(self) -> None:
-        """Keep files that were read whole for the next mount. For the end of this one (with `keep`)."""
-        if self._kept is not None:
-            await self._kept.keep_whole_files()
 
     def armed_changed(self, armed: bool) -> None:
         """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""

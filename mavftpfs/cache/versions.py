@@ -23,7 +23,6 @@ from enum import Enum
 
 import trio
 
-from mavftpfs.cache.kept_disk import Kept
 from mavftpfs.cache.readahead import MAX_WINDOW
 from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errors import FileChanged, RequestTimeout
@@ -170,9 +169,8 @@ class Version:
         proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the present session.
         compare_after: until then no listing is asked for only to compare it.
-        reader: where its bytes come from, if it is open. handles: how many are open. kept: its part on the
-            local disk, if it may have one. in_kernel: the kernel may have pages of it, and all of them are
-            right.
+        reader: where its bytes come from, if it is open. handles: how many are open. in_kernel: the kernel
+            may have pages of it, and all of them are right.
         ignores_data: what comes from the present reader is ignored, until a new one is opened.
         doubts: how often all bytes were dropped because they were in doubt.
     """
@@ -195,7 +193,6 @@ class Version:
         self.proven_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
         self.ours = self.in_kernel = self.ignores_data = False
-        self.kept: Kept | None = None
         self.doubts = 0
         self._why = ""  # it was replaced
         self._on_doubt = on_doubt
@@ -207,12 +204,8 @@ class Version:
         self.received_at = NEVER
 
     def block(self, index: int) -> bytearray | None:
-        """Return a block if it is here. A block that was dropped and came again is another object."""
+        """Return a block if it is here."""
         return self._blocks.get(index)
-
-    def blocks(self) -> dict[int, bytearray]:
-        """Return the blocks that are here, whole or in part, by their index."""
-        return dict(self._blocks)
 
     @property
     def waited_for(self) -> bool:
@@ -223,11 +216,6 @@ class Version:
     def progress(self) -> int:
         """How many of the file's bytes came, or were here before."""
         return min(self.size, max(self.received, self._present.total))
-
-    @property
-    def whole(self) -> bool:
-        """Whether every byte is here."""
-        return self._present.covers(0, self.size)
 
     # --- the sink
 
@@ -348,7 +336,6 @@ class Version:
     def on_restart(self, at: float) -> None:
         """Forget all proofs, because the vehicle restarted."""
         self.proven_at = self.compare_after = NEVER
-        self.kept = None
         self.on_opened(at)
 
     def close_reader(self) -> None:
@@ -359,7 +346,7 @@ class Version:
 
     def mark_replaced(self, why: str) -> None:
         """Become REPLACED: another file has the path. Reads that wait get FileChanged with this reason."""
-        self.kept, self._why = None, why
+        self._why = why
         self.close_reader()
         self.on_failed(FileChanged(why))
         self.clear()

@@ -18,12 +18,8 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.kept import KeptCache, vehicle_identity
-from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.versions import BlockCache
 from mavftpfs.client.leftovers import rescue, spool_for
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import holder_of, snapshot
@@ -57,9 +53,6 @@ MIB = 1 << 20
 KEY_SIZE = 32
 BITS_PER_BYTE = 10
 """On a serial port: eight, and a start and a stop bit."""
-
-
-MakeKept = Callable[[Directories, BlockCache], KeptCache]
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +233,6 @@ async def with_tree(
     """Give a connected vehicle's files for the length of the body; arguments as of `attached`."""
     writing = writing and not options.read_only
     caches = replace(cache_options(options, spec), read_only=not writing)
-    keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
     async with plain_nursery() as nursery:
         with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
 
@@ -256,7 +248,6 @@ async def with_tree(
                 nursery=nursery,
                 spool=spool,
                 rng=SystemRandom(),
-                keep=keep,
             )
             subscribe(connection, tree)
             try:
@@ -421,11 +412,6 @@ def read_key(path: str) -> bytes:
     return key if len(key) == KEY_SIZE else hashlib.sha256(text).digest()
 
 
-# -- cache_dir= -----------------------------------------------------------------------------------
-
-DISK_PART = 16
-"""The directory may have about so many times cache_size: 1 GB by default."""
-
 VERSION_PATIENCE = 5.0
 """Seconds for a vehicle to send AUTOPILOT_VERSION, which has its unique id."""
 _VERSION_POLL = 0.02
@@ -437,39 +423,3 @@ async def told_version(connection: Connection) -> AutopilotVersion | None:
         while connection.vehicle.version is None:  # noqa: ASYNC110 (for once)
             await trio.sleep(_VERSION_POLL)
     return connection.vehicle.version
-
-
-async def kept_in(place: str, options: CacheOptions, connection: Connection) -> MakeKept:
-    """Return what makes a tree's kept cache in a directory; waits until the vehicle told its unique id.
-
-    Raises:
-        UsageError: the directory cannot be used.
-    """
-    try:
-        directory = KeptDisk(Path(place), DISK_PART * options.cache_size)
-    except OSError as exc:
-        raise UsageError(f"cache_dir={place}: {exc.strerror}") from exc
-    await told_version(connection)
-    return partial(
-        KeptCache,
-        directory,
-        identity=partial(identity, connection),
-        crc32=connection.store.crc32,
-        crc_limit=partial(crc_limit, options, connection),
-    )
-
-
-def identity(connection: Connection) -> bytes | None:
-    """Return what tells the vehicle from others; None before the vehicle told it, and after a restart,
-    because vehicle or firmware may be another one."""
-    vehicle = connection.vehicle
-    if vehicle.version is None or vehicle.reboots:
-        return None
-    version = vehicle.version
-    return vehicle_identity(version.uid, version.uid2, version.flight_sw_version, version.git_hash)
-
-
-def crc_limit(options: CacheOptions, connection: Connection) -> int:
-    """Return the size in bytes of the largest file whose checksum may be asked for now."""
-    allowed = options.verify in ("auto", "crc") and not connection.vehicle.armed
-    return options.verify_max if allowed else 0

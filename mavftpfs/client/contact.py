@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import trio
@@ -120,8 +120,7 @@ class LinkContact:
 
     async def enter(self, stack: AsyncExitStack) -> Session:
         """See Contact."""
-        options = replace(self.options, cache_dir=None)  # it is filled at the end, when nothing may be asked
-        vehicle = await stack.enter_async_context(with_tree(self.connection, self.spec, options))
+        vehicle = await stack.enter_async_context(with_tree(self.connection, self.spec, self.options))
         return session_of(vehicle, self.options)
 
 

@@ -49,7 +49,7 @@ QUICK, SLOW = 0.25, 1.0
 """Seconds: a read that took less is followed by a larger one, one that took more by a smaller one."""
 
 EARLIEST = 946_684_800
-"""2000-01-01 UTC: an earlier time tells people nothing. (That a clock was set takes more: see cache.kept.)"""
+"""2000-01-01 UTC: an earlier time tells people nothing."""
 
 
 def known_time(mtime: int) -> int | None:

@@ -48,7 +48,6 @@ class Options:
     attr_timeout: float = 1.0
     negative_timeout: float = 2.0
     cache_size: int = 64 << 20
-    cache_dir: str | None = None
     dirty_max: int | None = None
     spool_max: int = 1 << 30
     rmw_max: int | None = None
@@ -180,7 +179,6 @@ VALUES: Values = {
     "attr_timeout": Value(seconds(0, _DAY), "seconds that the kernel keeps attributes: 1"),
     "negative_timeout": Value(seconds(0, _DAY), "seconds that it keeps absent names: 2"),
     "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
-    "cache_dir": Value(text_value, "keep what was read for the next mount there"),
     "dirty_max": Value(size(1 << 16, _SIZE_MAX, auto=True), "memory for what is not on the card yet: auto"),
     "spool_max": Value(size(0, _SIZE_MAX), "local disk for what is not on the card yet: 1G"),
     "rmw_max": Value(size(0, _SIZE_MAX, auto=True), "largest file sent again whole for a changed part: auto"),
@@ -233,6 +231,7 @@ GONE: Mapping[str, Gone] = {
     "auto_unmount": Gone("`mavftpfs umount` clears the mountpoint of a mount that was killed"),
     "fsname": Gone("the table of mounts shows SOURCE"),
     "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
+    "cache_dir": Gone("a mount reads again; `mavftpfs sync` keeps copies of logs"),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
     "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
     "verify=auto": Gone("that is how written files are checked"),

@@ -320,8 +320,7 @@ class Framer(FrameBuffer[Message]):
                     target = Address(m.target_system, m.target_component)
                     message = FtpRun(source, target, [bytes(m.payload)])
                 case 148:
-                    git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
-                    version = (m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)
+                    version = (m.capabilities, m.flight_sw_version, m.uid, bytes(m.uid2))
                     message = AutopilotVersion(source, *version)
                 case 253:
                     message = StatusText(source, str(m.text).partition("\0")[0])

@@ -47,12 +47,11 @@ _RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"
 
 @dataclass(frozen=True, slots=True)
 class AutopilotVersion:
-    """AUTOPILOT_VERSION; `git_hash` is flight_custom_version (8 bytes), `uid` 64-bit, `uid2` 18 bytes."""
+    """AUTOPILOT_VERSION; `uid` 64-bit, `uid2` 18 bytes."""
 
     source: Address
     capabilities: int
     flight_sw_version: int
-    git_hash: bytes
     uid: int
     uid2: bytes
 

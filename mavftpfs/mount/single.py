@@ -92,7 +92,6 @@ class SingleMount(Life):
         finally:
             if self.state is not State.STARTING:
                 await say_goodbye(tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED))
-        await tree.keep_whole_files()
 
     async def _answer(self, invalidator: Invalidator, notice: Callable[[], str]) -> None:
         async with trio.open_nursery() as nursery:

@@ -3,8 +3,7 @@
 A version of a file is its size, and its modification time where listings tell one. The vehicle shows a file
 in three ways: the reply to an open has a size; a listing has a size and perhaps a time; and there is the
 CRC32. `compare` compares what was seen with what is known. Whether that is the same file is decided here for
-readers, for drafts and their deliveries, and for blocks on the local disk. What follows is the callers'
-business.
+readers, and for drafts and their deliveries. What follows is the callers' business.
 """
 
 from __future__ import annotations

@@ -207,9 +207,6 @@ class FakeTree:
         self.calls.append(("recover_to", os.fsencode(directory)))
         return [directory / os.fsdecode(path.lstrip(b"/")) for path in self.left]
 
-    async def keep_whole_files(self) -> None:
-        """Nothing to keep."""
-
     async def crc32(self, path: bytes) -> int:
         await self.pause("crc32", path)
         return crc32(self.files[path])

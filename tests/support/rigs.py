@@ -113,10 +113,8 @@ class Rig:
                 yield self.connection
                 self.nursery.cancel_scope.cancel()
 
-    def mount(
-        self, *, seed: int = 1, spool: SpoolDirectory | None = None, keep: Any = None, **options: Any
-    ) -> Tree:
-        """Return a tree that is told what happens to the vehicle. keep: as Tree's. options: CacheOptions."""
+    def mount(self, *, seed: int = 1, spool: SpoolDirectory | None = None, **options: Any) -> Tree:
+        """Return a tree that is told what happens to the vehicle. options: CacheOptions."""
         tree = Tree(
             self.connection.store,
             CacheOptions(**{"root": self.root or b"/", **options}),
@@ -124,7 +122,6 @@ class Rig:
             invalidate=self.invalidated.append,
             nursery=self.nursery,
             spool=spool,
-            keep=keep,
             wall=wall,
             rng=Random(seed),
         )

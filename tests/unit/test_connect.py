@@ -35,7 +35,7 @@ OTHER: dict[str, Any] = {
 }
 """Values that are no default; numbers are made below."""
 
-ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "trace", "tlog", "forward", "gone", "all"}
+ELSEWHERE = {"baud", "connect_timeout", "trace", "tlog", "forward", "gone", "all"}
 """What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
 in `test_cli`."""
 

@@ -65,7 +65,7 @@ MESSAGES: list[tuple[Any, Message]] = [
         drone().autopilot_version_encode(
             0x20, 7, 1, 2, 3, list(b"12345678"), [0] * 8, [0] * 8, 4, 5, 99, list(range(18))
         ),
-        AutopilotVersion(DRONE, 0x20, 7, b"12345678", 99, bytes(range(18))),
+        AutopilotVersion(DRONE, 0x20, 7, 99, bytes(range(18))),
     ),
     (
         drone().storage_information_encode(5, 1, 2, 2, 1024.0, 24.0, 1000.0, 0.0, 0.0),

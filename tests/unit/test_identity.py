@@ -13,7 +13,7 @@ VEHICLE = Address(1, 1)
 
 
 def version(uid: int = 0, uid2: int = 0) -> AutopilotVersion:
-    return AutopilotVersion(VEHICLE, 0, 0, bytes(8), uid, uid2.to_bytes(18))
+    return AutopilotVersion(VEHICLE, 0, 0, uid, uid2.to_bytes(18))
 
 
 def standing(identity: Identity) -> Standing:

@@ -239,6 +239,7 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "auto_unmount",
         r"fsname=my drone\,2",
         "log_file=/var/log/drone",
+        "cache_dir=/var/tmp/drone",
         "verify=auto",
     ],
 )

@@ -37,7 +37,7 @@ def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, armed:
     ],
 )
 def test_firmware_and_board(number: int, words: str) -> None:
-    version = AutopilotVersion(Address(1, 1), 0, number, b"", 0x1234, bytes(18))
+    version = AutopilotVersion(Address(1, 1), 0, number, 0x1234, bytes(18))
     assert (version.firmware, version.board) == (words, "0000000000001234")
     assert replace(version, uid2=b"\1" * 18).board == "01" * 18
     assert replace(version, uid=0).board is None

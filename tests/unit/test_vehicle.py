@@ -30,7 +30,7 @@ def heartbeat(source: Address, *, autopilot: int = 12, armed: bool = False) -> H
 
 
 def version(source: Address) -> AutopilotVersion:
-    return AutopilotVersion(source, 0x20, 1, b"", 1, b"")
+    return AutopilotVersion(source, 0x20, 1, 1, b"")
 
 
 OURS = version(PILOT)
