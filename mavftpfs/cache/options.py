@@ -16,6 +16,9 @@ MIN_CACHE_SIZE = MIB
 DIR_TIMEOUT = 20.0
 """Seconds that a listing is fresh if the user did not set it."""
 
+ATTRIBUTES_HOLD, ABSENCE_HOLDS = 1.0, 2.0
+"""Seconds that the kernel may keep attributes, and an absent name; less if `dir_timeout` is shorter."""
+
 DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
 """What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
 find out whether the disk cuts names short."""
@@ -28,7 +31,6 @@ class CacheOptions:
     root: the vehicle's directory that is the mount's `/`. read_only: nothing is changed, all names are shown.
     dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s, and
     longer for an expensive listing.
-    attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.
     cache_size: budget for file blocks; max_entries: directory entries remembered over all listings.
     at_file_limit: largest `@` file that is read; at_cache_size: how much of such snapshots is kept.
     at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
@@ -51,8 +53,6 @@ class CacheOptions:
     root: bytes = ROOT
     read_only: bool = False
     dir_timeout: float | None = None
-    attr_timeout: float = 1.0
-    negative_timeout: float = 2.0
     cache_size: int = 64 * MIB
     max_entries: int = 100_000
     at_file_limit: int = 4 * MIB
@@ -76,6 +76,16 @@ class CacheOptions:
     def proof_time(self) -> float:
         """How long in seconds what the vehicle told of a file holds."""
         return DIR_TIMEOUT if self.dir_timeout is None else self.dir_timeout
+
+    @property
+    def attributes_hold(self) -> float:
+        """How long in seconds the kernel may keep attributes."""
+        return min(ATTRIBUTES_HOLD, self.proof_time)
+
+    @property
+    def absence_holds(self) -> float:
+        """How long in seconds the kernel may keep an absent name."""
+        return min(ABSENCE_HOLDS, self.proof_time)
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -128,7 +128,7 @@ class Tree:
         """
         remote = self._remote(path)
         if remote == self._options.root:
-            return Stat(EntryKind.DIRECTORY, 0, shown_mtime(remote, None), self._options.attr_timeout)
+            return Stat(EntryKind.DIRECTORY, 0, shown_mtime(remote, None), self._options.attributes_hold)
         if is_snapshot(remote):
             texts = self._texts_of(remote)
             return await (self._virtual.stat(remote) if texts is None else texts.stat(split(remote)[1]))
@@ -151,7 +151,7 @@ class Tree:
         directory = self._directories.known(parent)
         if directory is not None and directory.complete and name not in directory.entries:
             left = max(left, self._directories.left(directory))
-        return max(0.0, min(self._options.negative_timeout, left))
+        return max(0.0, min(self._options.absence_holds, left))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return a directory's entries without `.` and `..`.
@@ -500,7 +500,7 @@ class Tree:
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):
             return self._virtual.listed_stat(remote, found)
-        valid_for = max(0.0, min(self._options.attr_timeout, self._directories.left(found.directory)))
+        valid_for = max(0.0, min(self._options.attributes_hold, self._directories.left(found.directory)))
         size = found.size
         user_set, node = None, self._context.nodes.get(remote)
         if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
@@ -514,4 +514,4 @@ class Tree:
             entry = self._directories.entry(remote)
             listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
             mtime_ns = shown_mtime(remote, listed)
-        return Stat(EntryKind.FILE, draft.size, mtime_ns, self._options.attr_timeout)
+        return Stat(EntryKind.FILE, draft.size, mtime_ns, self._options.attributes_hold)

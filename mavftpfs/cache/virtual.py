@@ -201,7 +201,7 @@ class VirtualTrees:
             left = self._directories.left(found.directory)
         elif seen.data is not None:
             size, left = len(seen.data), seen.until - self._clock()
-        valid_for = max(0.0, min(self._options.attr_timeout, left))
+        valid_for = max(0.0, min(self._options.attributes_hold, left))
         return Stat(entry.kind, size, shown_mtime(path, entry.mtime), valid_for)
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:

@@ -45,8 +45,6 @@ class Options:
     window: int | None = None
     bwlimit: int | None = None
     dir_timeout: float | None = None
-    attr_timeout: float = 1.0
-    negative_timeout: float = 2.0
     cache_size: int = 64 << 20
     dirty_max: int | None = None
     spool_max: int = 1 << 30
@@ -176,8 +174,6 @@ VALUES: Values = {
     "heartbeat": Value(Choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
     "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
     "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
-    "attr_timeout": Value(seconds(0, _DAY), "seconds that the kernel keeps attributes: 1"),
-    "negative_timeout": Value(seconds(0, _DAY), "seconds that it keeps absent names: 2"),
     "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
     "dirty_max": Value(size(1 << 16, _SIZE_MAX, auto=True), "memory for what is not on the card yet: auto"),
     "spool_max": Value(size(0, _SIZE_MAX), "local disk for what is not on the card yet: 1G"),
@@ -232,6 +228,8 @@ GONE: Mapping[str, Gone] = {
     "fsname": Gone("the table of mounts shows SOURCE"),
     "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
     "cache_dir": Gone("a mount reads again; `mavftpfs sync` keeps copies of logs"),
+    "attr_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
+    "negative_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
     "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
     "verify=auto": Gone("that is how written files are checked"),

@@ -506,7 +506,7 @@ def test_refresh_reaches_the_kernel_of_a_mount(field: Field) -> None:
     card = field.local("card")
     (card / "f").write_bytes(DATA)
     vehicle = field.sim(card)
-    mount = field.mount(vehicle.source, "negative_timeout=600", "attr_timeout=600", "dir_timeout=600")
+    mount = field.mount(vehicle.source, "dir_timeout=600")
     with mavftpfs.connect(str(mount.path)) as drone:
         assert drone.stat("/f").size == len(DATA)
         assert not drone.exists("/others")

@@ -520,7 +520,7 @@ async def test_a_mount_that_hangs_holds_one_thread_however_often_it_is_asked(
 @pytest.mark.holds("promise 2")
 async def test_through_a_mount_a_cancelled_open_empties_nothing(sim: SimVehicle, field: Field) -> None:
     """The kernel's open goes on in its thread. What it opens is closed, and the old file stays."""
-    mount = field.mount(sim.source, "op_deadline=5", "dir_timeout=0", "attr_timeout=0")
+    mount = field.mount(sim.source, "op_deadline=5", "dir_timeout=0")
 
     def open_here() -> list[str]:
         links = [Path("/proc/self/fd", number) for number in os.listdir("/proc/self/fd")]

@@ -220,8 +220,6 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
                 assert (name, parsed) == (name, default)
                 checked.add(name)
     assert {
-        "attr_timeout",
-        "negative_timeout",
         "cache_size",
         "spool_max",
         "verify_max",
@@ -240,6 +238,8 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         r"fsname=my drone\,2",
         "log_file=/var/log/drone",
         "cache_dir=/var/tmp/drone",
+        "attr_timeout=5",
+        "negative_timeout=0",
         "verify=auto",
     ],
 )

@@ -107,6 +107,16 @@ async def test_absence_by_a_fresh_listing_costs_nothing(tree: Tree) -> None:
     assert tree.negative_valid_for(b"/unknown/none") == 0.0
 
 
+@pytest.mark.parametrize("dir_timeout", [0.0, 0.5])
+async def test_the_kernel_believes_nothing_longer_than_a_listing(here: Rig, dir_timeout: float) -> None:
+    tree = here.mount(dir_timeout=dir_timeout)
+    file = await tree.create(b"/fs/microsd/new", exclusive=True)
+    for path in (b"/", A, b"/fs/microsd/new"):
+        assert (await tree.stat(path)).valid_for <= dir_timeout
+    assert tree.negative_valid_for(b"/none") <= dir_timeout
+    file.close()
+
+
 @pytest.mark.holds("promise 6", "rule 14.30")
 async def test_a_file_is_never_listed(here: Rig, tree: Tree) -> None:
     asked = listed(here)
