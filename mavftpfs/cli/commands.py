@@ -107,7 +107,7 @@ def _serve(
 def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], list[str]]:
     """Return a function that returns the command for mounting one vehicle of several.
 
-    The hub has the endpoints already. Each vehicle's mount writes a trace and a raw log of its own.
+    The hub has the endpoints already. Each vehicle's mount writes a raw log of its own.
     """
     own: list[tuple[str, bool]] = []
     for word in split_words(args.options):
@@ -116,7 +116,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
             word = f"{option}={os.path.abspath(value)}"  # now: a process in the background works in `/`
         if option not in ("all", "forward"):
             escaped = word.replace("\\", "\\\\").replace(",", "\\,")
-            own.append((f"-o{escaped}", option in ("trace", "tlog")))
+            own.append((f"-o{escaped}", option == "tlog"))
     shown = ["-d"] if args.debug else ["-f"] if args.foreground else []
 
     def command(member: Member) -> list[str]:

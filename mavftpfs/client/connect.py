@@ -8,7 +8,7 @@ import os
 import stat
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, nullcontext
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from functools import partial
@@ -23,11 +23,11 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client.leftovers import rescue, spool_for
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import holder_of, snapshot
-from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
+from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, AutopilotVersion
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, OWN_COMPONENT, Address, AutopilotVersion
 from mavftpfs.link.peers import describe_peer
 from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
@@ -104,22 +104,14 @@ NO_SINKS = Sinks()
 
 @contextmanager
 def open_sinks(options: Options, *, debug: bool, tell: Callable[[str], None]) -> Iterator[Sinks]:
-    """Open what trace=, tlog= and -d ask for, and close it after the body; tell: see Sinks.
+    """Open what tlog= and -d ask for, and close it after the body; tell: see Sinks.
 
     Raises:
-        UsageError: a file cannot be created.
+        UsageError: the file cannot be created.
     """
-    with ExitStack() as stack:
-        traces: list[PayloadTrace] = [_print_payload] if debug else []
-        if options.trace is not None:
-            traces.append(stack.enter_context(JsonTrace(options.trace)).payload)
-        tlog = None if options.tlog is None else stack.enter_context(TlogWriter(options.tlog))
-
-        def payload(now: float, direction: str, wire: bytes) -> None:
-            for trace in traces:
-                trace(now, direction, wire)
-
-        yield Sinks(payload if traces else None, None if tlog is None else tlog.frame, tell)
+    payload = _print_payload if debug else None
+    with nullcontext() if options.tlog is None else TlogWriter(options.tlog) as tlog:
+        yield Sinks(payload, None if tlog is None else tlog.frame, tell)
 
 
 def _print_payload(now: float, direction: str, wire: bytes) -> None:
@@ -146,7 +138,7 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
     """
-    own = Address(options.source_system, options.source_component)
+    own = Address(options.source_system, OWN_COMPONENT)
     wish = Wish(own, options.forward, process_name(), beats)
     for place in options.forward:
         if leads_back(parse_source(place), spec):

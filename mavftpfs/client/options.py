@@ -35,14 +35,11 @@ class Options:
     target_system: int = 0
     target_component: int = 0
     source_system: int = 254
-    source_component: int = 191
-    heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
     signing_key: str | None = None
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
     read_mode: Literal["window", "burst"] = "window"
     chunk: int | None = None
-    window: int | None = None
     bwlimit: int | None = None
     dir_timeout: float | None = None
     cache_size: int = 64 << 20
@@ -54,7 +51,6 @@ class Options:
     force: bool = False
     inplace: bool = False
     local: tuple[str, ...] = DEFAULT_LOCAL
-    trace: str | None = None
     tlog: str | None = None
     forward: tuple[str, ...] = ()
     gone: tuple[str, ...] = field(default=(), compare=False)
@@ -169,9 +165,7 @@ Values = Mapping[str, Value]
 VALUES: Values = {
     "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
     "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
-    "source_system": Value(number(1, 255), "our system id on the link: 254"),
-    "source_component": Value(number(1, 255), "and which part: 191"),
-    "heartbeat": Value(Choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
+    "source_system": Value(number(1, 255), "system id of mavftpfs on the link: 254"),
     "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
     "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
     "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
@@ -182,12 +176,10 @@ VALUES: Values = {
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
     "read_mode": Value(Choice("window", "burst"), "window or burst"),
     "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
-    "window": Value(number(1, 256, auto=True), "requests in flight at most: auto"),
     "bwlimit": Value(size(100, _SIZE_MAX), "bytes per second that we may cause on the link"),
     "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
     "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
-    "trace": Value(text_value, "every request and reply as a line of JSON there"),
     "tlog": Value(text_value, "raw MAVLink log there"),
     "forward": Value(endpoint, "pass all frames on to there and back; several count", many=True),
 }
@@ -230,6 +222,15 @@ GONE: Mapping[str, Gone] = {
     "cache_dir": Gone("a mount reads again; `mavftpfs sync` keeps copies of logs"),
     "attr_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
     "negative_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
+    "source_component": Gone("mavftpfs is component 191"),
+    "heartbeat=onboard": Gone("that is what mavftpfs says it is"),
+    "heartbeat": Gone(
+        "mavftpfs always says that it is an onboard computer, because a ground station's heartbeat would "
+        "trigger the vehicle's failsafe when it stops; leave the option out",
+        refused=True,
+    ),
+    "window": Gone("mavftpfs finds out how many requests the link carries"),
+    "trace": Gone("-d prints every request and reply, and tlog=FILE records the link"),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
     "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
     "verify=auto": Gone("that is how written files are checked"),

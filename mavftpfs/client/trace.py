@@ -1,24 +1,18 @@
-"""Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: client.
+"""Records of what went over the link: FTP payloads as text, frames as .tlog. Layer: client.
 
-The session layer calls `payload` for each of the 251-byte payloads; without a trace nothing is computed. If a
-file cannot be written any more (disk full), that is reported once, and nothing more is written: a trace must
-never break what it watches.
+`text_line` is called for each of the 251-byte payloads only where `-d` prints them. If the disk is full, the
+log says so once, and the .tlog ends there: a record must never break what it watches.
 
-JSON lines: {"t", "time", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also
-"req_opcode" and "burst_complete"; opcodes by name, data in hex (the part that counts). "t" is in seconds of a
-clock that never jumps, "time" is UTC. The .tlog format is pymavlink's: 8 bytes big-endian microseconds since
-1970, then the frame.
+The .tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then the frame.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import struct
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
@@ -35,8 +29,9 @@ _timestamp = struct.Struct(">Q").pack
 _log = logging.getLogger(__name__)
 
 
-class _File:
-    """A file that is written to, without a buffer, until it fails. wall_clock: seconds since 1970.
+class TlogWriter:
+    """Writes frames in pymavlink's .tlog format, for every tool that reads these; without a buffer, and only
+    until the file fails. wall_clock: seconds since 1970.
 
     Raises:
         UsageError: it cannot be created.
@@ -57,52 +52,15 @@ class _File:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def _write(self, data: bytes) -> None:
+    def frame(self, frame: bytes) -> None:
+        """Record a whole frame, received or sent; made to be Framer.on_frame."""
         if self._failed:
             return
         try:
-            self._file.write(data)
+            self._file.write(_timestamp(int(self._wall_clock() * 1e6)) + frame)
         except OSError as exc:
             self._failed = True
-            _log.warning("no further trace in %s: %s", self._path, exc.strerror)
-
-
-class JsonTrace(_File):
-    """Payloads as JSON lines."""
-
-    def payload(self, now: float, direction: str, wire: bytes) -> None:
-        """Record a payload that was sent ("request") or received ("reply")."""
-        wall = datetime.fromtimestamp(self._wall_clock(), UTC).isoformat(timespec="microseconds")
-        record = {"t": round(now, 6), "time": wall, **describe(direction, wire)}
-        self._write(json.dumps(record, separators=(",", ":")).encode() + b"\n")
-
-
-class TlogWriter(_File):
-    """Frames in pymavlink's .tlog format, for every tool that reads these."""
-
-    def frame(self, frame: bytes) -> None:
-        """Record a whole frame, received or sent; made to be Framer.on_frame."""
-        self._write(_timestamp(int(self._wall_clock() * 1e6)) + frame)
-
-
-def describe(direction: str, wire: bytes) -> dict[str, str | int]:
-    """Return a payload's fields by name, as JSON takes them; what is no payload shows as its bytes."""
-    if len(wire) != PAYLOAD_SIZE:
-        return {"dir": direction, "malformed": wire.hex()}
-    payload = decode_request(wire)
-    record: dict[str, str | int] = {
-        "dir": direction,
-        "seq": payload.seq,
-        "session": payload.session,
-        "opcode": opcode_name(payload.opcode),
-        "size": payload.size,
-        "offset": payload.offset,
-    }
-    if direction == REPLY:
-        record["req_opcode"] = opcode_name(payload.req_opcode)
-        record["burst_complete"] = payload.burst_complete
-    record["data"] = _data_that_counts(direction, payload).hex()
-    return record
+            _log.warning("no further frames in %s: %s", self._path, exc.strerror)
 
 
 def text_line(direction: str, wire: bytes) -> str:

@@ -92,7 +92,7 @@ OWN_FLAGS: Flags = {
 """default_permissions is always on, and not shown."""
 
 VALUES: Values = {**OWN_VALUES, **client.VALUES}
-LOCAL_PATHS = ("signing_key", "trace", "tlog")
+LOCAL_PATHS = ("signing_key", "tlog")
 """Options whose values are paths on this computer."""
 
 FLAGS: Flags = {**client.FLAGS, **OWN_FLAGS}

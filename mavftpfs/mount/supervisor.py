@@ -23,7 +23,13 @@ from mavftpfs.client.connect import connect_options, opened, plain_nursery
 from mavftpfs.client.mountpoint import is_ours, unmount
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_ONBOARD_CONTROLLER, Address, Heartbeat
+from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
+    MAV_TYPE_ONBOARD_CONTROLLER,
+    OWN_COMPONENT,
+    Address,
+    Heartbeat,
+)
 from mavftpfs.link.sharing import own_environment
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
@@ -106,13 +112,13 @@ class Supervisor(Life):
         """Note which vehicles are heard. Some bridges answer only a client that speaks, so we send
         heartbeats."""
         options = self.request.options.client
-        own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
+        own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
         key = connect_options(options).signing_key
         framer = Framer(own, stream=False, signing_key=key, signing_clock=signing_now)
         framer.link_id = 0 if link.seat is None else link.seat.number
 
         async def beat() -> None:
-            while options.heartbeat != "none":
+            while True:
                 link.send_nowait(
                     [framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID)]
                 )

@@ -21,6 +21,7 @@ from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     MAV_TYPE_GCS,
     MAV_TYPE_ONBOARD_CONTROLLER,
+    OWN_COMPONENT,
     Address,
 )
 from mavftpfs.link.peers import describe_peer
@@ -77,7 +78,7 @@ class ConnectOptions:
     target_system: int = 0
     target_component: int = 0
     source_system: int = 254
-    source_component: int = 191
+    source_component: int = OWN_COMPONENT
     heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
     signing_key: bytes | None = None
     op_deadline: float = 30.0

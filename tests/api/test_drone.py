@@ -315,7 +315,7 @@ def test_a_vehicle_without_parameters_in_ftp(shared: mavftpfs.Drone) -> None:
         ("/dev/ttyNOWHERE", {}, FileNotFoundError, "there is no /dev/ttyNOWHERE"),
         ("tcp:127.0.0.1:9", {"connect_timeout": 1}, ConnectionRefusedError, "nothing listens"),
         ("udpin:127.0.0.1:0", {"frobnicate": 1}, mavftpfs.UsageError, "unknown option 'frobnicate'"),
-        ("udpin:127.0.0.1:0", {"window": 0}, ValueError, "window=0: must be within 1 and 256"),
+        ("udpin:127.0.0.1:0", {"chunk": 0}, ValueError, "chunk=0: must be within 16 and 239"),
         ("nonsense", {}, mavftpfs.UsageError, "nonsense"),
     ],
 )
@@ -339,7 +339,7 @@ def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
     (card / "sub" / "e").mkdir(parents=True)
     (card / "sub" / "f").write_bytes(DATA)
     other = field.sim(card, "px4")
-    with mavftpfs.connect(other.source + "#/sub", ro=True, trace=card / "trace") as drone:
+    with mavftpfs.connect(other.source + "#/sub", ro=True, tlog=card / "tlog") as drone:
         assert drone.read_bytes("f") == DATA
         assert drone.status()["vehicle"]["autopilot"] == "PX4"
         assert drone.mountpoint is None
@@ -353,7 +353,7 @@ def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
         with pytest.raises(OSError, match="only read") as caught:
             drone.write_bytes("f", b"")
         assert caught.value.errno == errno.EROFS
-    assert (card / "trace").stat().st_size
+    assert (card / "tlog").stat().st_size
 
 
 def test_closed(field: Field) -> None:

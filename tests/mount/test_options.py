@@ -78,21 +78,16 @@ def test_options_of_look_and_of_fstab(field: Field, small_tree: Path) -> None:
     assert shown.split() == ["1234", "4321", "440", "1234", "4321", "550"]
 
 
-def test_every_payload_is_printed_and_recorded_decoded(
-    field: Field, small_tree: Path, tmp_path: Path
-) -> None:
-    trace = tmp_path / "trace"
-    mount = field.mount(field.sim(small_tree).source, f"trace={trace}", argv=("-d",))
+def test_every_payload_is_printed_decoded(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source, argv=("-d",))
     mount.run("cat", mount.path / "sizes/478.bin")
     assert mount.unmount() == 0
     text = mount.alive_or_ended().text()
     lines = [line for line in text.splitlines() if "/sizes/478.bin" in line or "mounted" in line]
     assert len(lines) > 1
     assert [line for line in lines if not re.match(r"\d\d:\d\d:\d\d\.\d+ ", line)] == []
-    records = [json.loads(line) for line in trace.read_text().splitlines()]
-    opened = [record for record in records if record["opcode"] == "OPEN_FILE_RO"]
-    looked_for = b"@PARAM/param.pck"  # once, by the mount
-    assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin", looked_for}
+    opened = set(re.findall(r" -> OPEN_FILE_RO .* b'(.*)'", text))
+    assert opened == {"/sizes/478.bin", "@PARAM/param.pck"}, "the mount looks for the second one, once"
 
 
 # mount(8) runs the program named by the type from a fixed PATH, and the helper of a type from /sbin, so both

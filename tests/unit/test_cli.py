@@ -97,7 +97,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("rm", SOURCE, "-r", "mftp:///"), "root"),
         (("mv", SOURCE, "/a"), "NEW"),
         (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
-        (("ls", SOURCE, "/", "-o", "trace=/proc/none/t"), "/proc/none/t"),
+        (("ls", SOURCE, "/", "-o", "tlog=/proc/none/t"), "/proc/none/t"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
         (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
         (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),

@@ -25,7 +25,6 @@ OTHER: dict[str, Any] = {
     "fmask": 0o777,
     "dmask": 0o777,
     "root": b"/fs",
-    "heartbeat": "none",
     "read_mode": "burst",
     "when_armed": "ok",
     "local": (),
@@ -35,7 +34,7 @@ OTHER: dict[str, Any] = {
 }
 """Values that are no default; numbers are made below."""
 
-ELSEWHERE = {"baud", "connect_timeout", "trace", "tlog", "forward", "gone", "all"}
+ELSEWHERE = {"baud", "connect_timeout", "tlog", "forward", "gone", "all"}
 """What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
 in `test_cli`."""
 

@@ -57,7 +57,7 @@ def test_words_for_others_are_ignored(word: str) -> None:
     [
         ("uid=1000", "uid", 1000),
         ("umask=022", "umask", 0o022),
-        ("heartbeat=gcs", "heartbeat", "gcs"),
+        ("read_mode=burst", "read_mode", "burst"),
         ("dir_timeout=0.5", "dir_timeout", 0.5),
         ("cache_size=2g", "cache_size", 2 << 30),
         ("dirty_max=auto", "dirty_max", None),
@@ -92,14 +92,14 @@ def test_the_last_word_wins() -> None:
         ("uid", "uid"),
         ("uid=-1", "uid"),
         ("ro=1", "ro"),
-        ("heartbeat=loud", "heartbeat"),
+        ("read_mode=fast", "read_mode"),
         ("dir_timeout=inf", "dir_timeout"),
         ("source_system=0", "source_system"),
         ("chunk=²", "chunk"),
         ("root=", "root"),
         ("root=/a/../b", "root"),
         ("tlog=", "tlog"),
-        ("trace", "trace"),
+        ("tlog", "tlog"),
         ("cache_size=3x", "with K, M or G"),
         ("cache_size=1K", "within 1M and 1024G"),
         ("dirty_max=1", "within 64K and 1024G, or auto"),
@@ -129,7 +129,7 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
         ({"cache_size": "1G", "target_system": 2, "baud": None}, "cache_size=1G,target_system=2"),
         ({"cache_size": 1 << 30, "op_deadline": 2.5}, "cache_size=1G,op_deadline=2.5"),
         ({"chunk": "auto", "tlog": b"a"}, "chunk=auto,tlog=a"),
-        ({"trace": Path("a/b")}, "trace=a/b"),
+        ({"tlog": Path("a/b")}, "tlog=a/b"),
     ],
 )
 def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> None:
@@ -241,6 +241,10 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "attr_timeout=5",
         "negative_timeout=0",
         "verify=auto",
+        "source_component=3",
+        "heartbeat=onboard",
+        "window=4",
+        "trace=/tmp/trace",
     ],
 )
 def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
@@ -273,6 +277,8 @@ def test_some_words_of_0_2_are_translated(word: str, field: str, value: object) 
     ("word", "advice"),
     [
         ("verify=crc", "write verify_max=1024G"),
+        ("heartbeat=gcs", "leave the option out"),
+        ("heartbeat=none", "leave the option out"),
     ],
 )
 def test_words_of_0_2_that_changed_a_promise_are_errors(word: str, advice: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.client.trace import JsonTrace, TlogWriter
+from mavftpfs.client.trace import TlogWriter
 from mavftpfs.mount.daemon import log_in_background
 from mavftpfs.mount.farewell import keep_the_rest
 from tests.support.rigs import Rig
@@ -21,10 +21,6 @@ from tests.unit.test_daemon import restored_logging
 pytestmark = pytest.mark.holds("promise 10")
 
 __all__ = ["restored_logging"]
-
-
-def trace(path: Path) -> None:
-    JsonTrace(path).__exit__()
 
 
 def tlog(path: Path) -> None:
@@ -45,8 +41,8 @@ def exposed(directory: Path) -> list[Path]:
 
 
 @pytest.mark.usefixtures("restored_logging")
-@pytest.mark.parametrize("write", [trace, tlog, log])
-def test_traces_and_logs_are_private_and_follow_no_link(
+@pytest.mark.parametrize("write", [tlog, log])
+def test_records_and_logs_are_private_and_follow_no_link(
     write: Callable[[Path], None], tmp_path: Path
 ) -> None:
     write(tmp_path / "file")

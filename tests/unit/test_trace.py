@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import struct
 from pathlib import Path
@@ -12,7 +11,7 @@ from pymavlink import mavutil
 
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.options import Options
-from mavftpfs.client.trace import REPLY, JsonTrace, TlogWriter, text_line
+from mavftpfs.client.trace import REPLY, TlogWriter, text_line
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
@@ -23,28 +22,6 @@ READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
 DATA = Payload(8, 3, Opcode.ACK, 4, Opcode.BURST_READ_FILE, 1, 478, b"abcd").encode()
 NAK = Payload(9, 0, Opcode.NAK, 2, Opcode.OPEN_FILE_RO, 0, 0, bytes([NakCode.FAIL_ERRNO, 28])).encode()
-
-
-WALL = 1795426200.25
-"""2026-11-23 09:30 UTC in seconds since 1970."""
-
-
-def test_json_lines(tmp_path: Path) -> None:
-    with JsonTrace(tmp_path / "trace", wall_clock=lambda: WALL) as trace:
-        trace.payload(1.5, "request", READ)
-        assert (tmp_path / "trace").read_text().endswith("\n"), "it shows up while it is written"
-        trace.payload(2.25, REPLY, DATA)
-        trace.payload(4.0, REPLY, b"short")
-    lines = [json.loads(line) for line in (tmp_path / "trace").read_text().splitlines()]
-    assert {line.pop("time") for line in lines} == {"2026-11-23T09:30:00.250000+00:00"}
-    request = {"dir": "request", "seq": 7, "session": 3, "opcode": "READ_FILE", "size": 100, "offset": 478}
-    reply = {"dir": "reply", "seq": 8, "session": 3, "opcode": "ACK", "size": 4, "offset": 478}
-    burst = {"req_opcode": "BURST_READ_FILE", "burst_complete": 1, "data": b"abcd".hex()}
-    assert lines == [
-        {"t": 1.5, "data": "", **request},
-        {"t": 2.25, **reply, **burst},
-        {"t": 4.0, "dir": "reply", "malformed": b"short".hex()},
-    ]
 
 
 @pytest.mark.parametrize(
@@ -90,7 +67,7 @@ def test_a_file_that_cannot_be_made_is_the_users_error(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_said_once_and_breaks_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING), JsonTrace("/dev/full") as trace:
-        for n in range(3000):
-            trace.payload(float(n), REPLY, DATA)
-    assert caplog.messages == ["no further trace in /dev/full: No space left on device"]
+    with caplog.at_level(logging.WARNING), TlogWriter("/dev/full") as log:
+        for _ in range(3000):
+            log.frame(DATA)
+    assert caplog.messages == ["no further frames in /dev/full: No space left on device"]
