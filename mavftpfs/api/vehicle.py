@@ -23,6 +23,7 @@ from mavftpfs.api.pythonfile import Mode, python_file
 from mavftpfs.api.triofile import AsyncFile
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client import download, names, upload
+from mavftpfs.client.choice import Choice
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetcher, known_time
 from mavftpfs.client.files import File, Files, Session, walk
@@ -353,7 +354,7 @@ class Drone:
             OSError: a log did not come; the text says how many did.
         """
         where = None if place is None else remote(place)
-        wish = download.Wish(Path(local), where, newest, since)
+        wish = download.Wish(Path(local), where, Choice(newest, since))
         outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
         return [fetched.wanted.local for fetched in outcome.fetched]
 

@@ -226,7 +226,12 @@ def _sync_parser(name: str) -> Parser:
         "--from", dest="place", metavar="PATH", help="the vehicle's log directory; default: found by itself"
     )
     parser.add_argument("--newest", metavar="N", type=_count, help="only the N newest logs")
-    parser.add_argument("--since", metavar="DATE", help="only logs since then: 2026-05-01, 2026-05-01T14:30")
+    parser.add_argument(
+        "--since",
+        metavar="DATE",
+        help="only logs since then: 2026-05-01, 2026-05-01T14:30, today, yesterday, 2h, 3d",
+    )
+    _add_patterns(parser, "the log directory")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("-n", "--dry-run", action="store_true", help="only say what would be fetched")
     instead.add_argument(
@@ -262,6 +267,24 @@ def _count(text: str) -> int:
     return int(text)
 
 
+def _add_patterns(parser: Parser, source: str) -> None:
+    """Add the patterns that choose files; source: the directory below which they see paths."""
+    parser.add_argument(
+        "--include",
+        metavar="PATTERN",
+        action="append",
+        default=[],
+        help=f"only files whose name, or path below {source}, matches; * also matches /; may be repeated",
+    )
+    parser.add_argument(
+        "--exclude",
+        metavar="PATTERN",
+        action="append",
+        default=[],
+        help="no files that match; may be repeated",
+    )
+
+
 def _add_verify(parser: Parser) -> None:
     parser.add_argument(
         "--verify",
@@ -285,6 +308,7 @@ def _get_parser(name: str) -> Parser:
         help="directory (made if it ends in /, or for several), new name of one file, or - for stdout",
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    _add_patterns(parser, "PATH")
     parser.add_argument(
         "--no-resume", dest="resume", action="store_false", help="fetch all anew, also what is here"
     )

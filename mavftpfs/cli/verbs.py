@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -13,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -28,6 +29,7 @@ from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
 from mavftpfs.client import scan as scanning
+from mavftpfs.client.choice import Choice
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
@@ -128,8 +130,9 @@ def sync(args: Args) -> int:
     component, place = None, None
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
-    since = None if args.since is None else parse_date(args.since)
-    wish = download.Wish(Path(args.local), place, args.newest, since, args.dry_run)
+    since = None if args.since is None else parse_date(args.since, datetime.now())
+    choice = Choice(args.newest, since, tuple(args.include), tuple(args.exclude))
+    wish = download.Wish(Path(args.local), place, choice, args.dry_run)
     if args.watch:
         return watching.watch(args, wish, lambda work: run(args, work, component))
     if args.command is not None or args.again or args.by_sysid:
@@ -150,7 +153,7 @@ def sync(args: Args) -> int:
     if args.json:
         print(json.dumps(outcome.facts(), indent=2))
     else:
-        _print_outcome(args, outcome, since)
+        _print_outcome(args, outcome)
     _say_what_is_not_proven(outcome)
     if error is not None:
         say(f"{error}; {_here(outcome)}" if not args.check else str(error))
@@ -160,13 +163,13 @@ def sync(args: Args) -> int:
     return ExitCode.OK if outcome.complete else ExitCode.INCOMPLETE
 
 
-def _print_outcome(args: Args, outcome: download.Outcome, since: float | None) -> None:
+def _print_outcome(args: Args, outcome: download.Outcome) -> None:
     if args.check:
         _print_comparison(outcome)
     elif args.dry_run:
         _print_plan(outcome)
     else:
-        print(_sync_summary(outcome, since))
+        print(_sync_summary(outcome))
 
 
 def get(args: Args) -> int:
@@ -176,11 +179,12 @@ def get(args: Args) -> int:
             raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
         return cat(args)
     wanted, component = names.parse_paths(args.paths)
+    choice = Choice(include=tuple(args.include), exclude=tuple(args.exclude))
     outcome = download.Outcome()
 
     async def work(downloads: download.Downloads) -> None:
         into = args.to.endswith("/")
-        await downloads.get(wanted, Path(args.to), into=into, recursive=args.recursive)
+        await downloads.get(wanted, Path(args.to), into=into, recursive=args.recursive, choice=choice)
 
     _download(args, outcome, work, component)
     _say_what_is_not_proven(outcome)
@@ -257,7 +261,7 @@ def _here(outcome: download.Outcome) -> str:
     return f"{here} of {wanted} files are here; the next run goes on where this one stopped"
 
 
-def _sync_summary(outcome: download.Outcome, since: float | None) -> str:
+def _sync_summary(outcome: download.Outcome) -> str:
     new, size = len(outcome.fetched), sum(fetched.size - fetched.resumed for fetched in outcome.fetched)
     proven = sum(
         not outcome.proofs[log.remote].lacking for log in outcome.here if log.remote in outcome.proofs
@@ -268,9 +272,6 @@ def _sync_summary(outcome: download.Outcome, since: float | None) -> str:
     missing = sum(wanted.remote in outcome.failed for wanted in outcome.wanted)
     if missing:
         line += f"; {missing} not here, the next run goes on"
-    undated = sum(log.mtime is None for log in [*outcome.here, *outcome.wanted])
-    if undated and since is not None:
-        line += f"; {undated} without a time were not left out by --since"
     return line
 
 
@@ -296,17 +297,29 @@ def _print_comparison(outcome: download.Outcome) -> None:
     print(f"{', '.join(parts)}, {len(outcome.wanted)} not here, from {_name(outcome.place)}")
 
 
-def parse_date(text: str) -> float:
-    """Return seconds UTC of a date, or a date and time, which is local if it names no zone.
+_AGO = re.compile(r"(\d{1,6})(min|h|d|w)", re.ASCII)
+_UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+
+
+def parse_date(text: str, now: datetime) -> float:
+    """Return seconds UTC of a date, or a date and time, which is local if it names no zone; of `today`,
+    `yesterday`, or a time ago (`90min`, `2h`, `3d`, `1w`).
 
     Raises:
         UsageError: it is none.
     """
+    midnight = datetime(now.year, now.month, now.day)
+    ago = _AGO.fullmatch(text)
     try:
+        if text in ("today", "yesterday"):
+            return (midnight - timedelta(days=text == "yesterday")).timestamp()
+        if ago is not None:
+            return now.timestamp() - timedelta(**{_UNITS[ago[2]]: int(ago[1])}).total_seconds()
         return datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
         raise UsageError(
-            f"--since {text!r} is no date; write for example 2026-05-01, or 2026-05-01T14:30"
+            f"--since {text!r} is no date; write for example 2026-05-01, 2026-05-01T14:30, today, "
+            "yesterday, 2h or 3d"
         ) from None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from typing import Any
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.brought import NAME as MEMORY
 from mavftpfs.client.brought import Brought, Memory
+from mavftpfs.client.choice import EVERYTHING, Choice
 from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
@@ -43,22 +43,17 @@ LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/var/APM/lo
 """Where vehicles keep logs: PX4, ArduPilot, ArduPilot's simulator, PX4's simulator, ArduPilot on Linux, and
 the standard's alias, which shows one of the others again and so comes last."""
 
-NO_LOG = b"LASTLOG.TXT"
-"""ArduPilot keeps the number of its last log in this file. It is no log."""
-
 MAX_TIMEOUTS = 2
 """A run ends after so many files in a row whose requests timed out: the others would time out, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What to sync. place: the directory on the vehicle, None to find it; newest: at most so many;
-    since: not older, seconds UTC."""
+    """What to sync. place: the directory on the vehicle, None to find it."""
 
     local: Path
     place: bytes | None = None
-    newest: int | None = None
-    since: float | None = None
+    choice: Choice = EVERYTHING
     dry_run: bool = False
 
 
@@ -206,6 +201,9 @@ class Downloads:
         self.outcome.place = session.on_vehicle(place)
         for path, error in unlisted:
             self.fail(path, error)
+        warning = wish.choice.warning(logs)
+        if warning and not self.outcome.checked:
+            self.complain(warning)
         return logs
 
     def _to_be_proven(self, log: Wanted, memory: Memory) -> bool:
@@ -227,15 +225,24 @@ class Downloads:
             with local_disk(log.local):
                 memory.note(Brought(path, log.name, fetched.size, log.mtime, proven=not unproven))
 
-    async def get(self, paths: Sequence[bytes], local: Path, *, into: bool, recursive: bool) -> None:
+    async def get(
+        self,
+        paths: Sequence[bytes],
+        local: Path,
+        *,
+        into: bool,
+        recursive: bool,
+        choice: Choice = EVERYTHING,
+    ) -> None:
         """Fetch files, and with `recursive` directories; names may be patterns.
 
         One file goes into `local` if that is a directory, else it gets that name. All else goes into `local`,
         which is made. Files that match a pattern go there with their directories, from the first wildcard on.
+        The patterns of `choice` see the same paths below `local`.
 
         Raises:
-            UsageError: two files would get one local name; nothing was fetched. Else as Fetcher.fetch where
-            only one file is asked for, else as `sync`.
+            UsageError: two files would get one local name, or `choice` takes none of those that were found;
+            nothing was fetched. Else as Fetcher.fetch where only one file is asked for, else as `sync`.
         """
         alone = len(paths) == 1
         found: list[Wanted] = []
@@ -243,32 +250,34 @@ class Downloads:
             try:
                 names = await matching(self.fetcher.session.files, path)
                 alone = alone and names == [path]
-                top = split(path)[0] if names == [path] else fixed_part(path)
+                plain = names == [path]
+                top = split(path)[0] if plain else fixed_part(path)
                 for name in names:
-                    found += await self._found(name, top, local, into=into or not alone, recursive=recursive)
+                    place = Place(name, top, path if plain else top, local, into or not alone)
+                    found += await self._found(place, choice, recursive=recursive)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=alone)
         found = list(dict.fromkeys(found))
+        if choice.by_name and not found and not self.outcome.failed:
+            raise NotFound("--include and --exclude leave no file to fetch")
         _require_apart(found)
         self.outcome.wanted = _apart(found)
         await self._fetch_all(alone=alone and [one.remote for one in found] == [*paths])
 
-    async def _found(
-        self, path: bytes, top: bytes, local: Path, *, into: bool, recursive: bool
-    ) -> list[Wanted]:
-        """Make the local directories for the files of a path, and return the files; `local` stands for
-        `top`."""
-        session = self.fetcher.session
+    async def _found(self, place: Place, choice: Choice, *, recursive: bool) -> list[Wanted]:
+        """Make the local directories for the files of a path, and return the files."""
+        session, path = self.fetcher.session, place.path
         stat = await session.files.stat(path)
-        name = os.fsdecode(path.removeprefix(top).lstrip(b"/"))
         if stat.kind is EntryKind.FILE:
-            return [_wanted(path, _place(local, name, into=into), session.on_vehicle(path), stat)]
+            if not choice.takes(place.below_source(path)):
+                return []
+            return [_wanted(path, place.of_file(), session.on_vehicle(path), stat)]
         if not recursive:
             raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
-        below, unlisted = await walk(session.files, path)
+        found, unlisted = await walk(session.files, path)
         for unreadable, error in unlisted:
             self.fail(unreadable, error)
-        return _made(session, path, local / name, below)
+        return _made(session, place, found, choice)
 
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
         """Hand on the bytes of files, one behind the other.
@@ -321,12 +330,32 @@ class Downloads:
         self.complain(named(name or path, error))
 
 
-def _place(local: Path, name: str, *, into: bool) -> Path:
-    """Return where one file goes."""
-    if into:
-        with local_disk(local):
-            (local / name).parent.mkdir(parents=True, exist_ok=True)
-    return local / name if local.is_dir() else local
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a path of the vehicle goes. `local` stands for the directory `top` above it; into: as a
+    directory, which is made. source: the directory or file that was asked for; for a pattern, `top`."""
+
+    path: bytes
+    top: bytes
+    source: bytes
+    local: Path
+    into: bool
+
+    @property
+    def whole(self) -> Path:
+        """The local path, if `local` is a directory."""
+        return self.local / os.fsdecode(_below_top(self.path, self.top))
+
+    def below_source(self, path: bytes) -> bytes:
+        """Return the path of a file below the source, by which it is chosen."""
+        return _below_top(path, self.source) or split(path)[1]
+
+    def of_file(self) -> Path:
+        """Return where one file goes."""
+        if self.into:
+            with local_disk(self.local):
+                self.whole.parent.mkdir(parents=True, exist_ok=True)
+        return self.whole if self.local.is_dir() else self.local
 
 
 def _require_apart(wanted: Iterable[Wanted]) -> None:
@@ -341,17 +370,25 @@ def _require_apart(wanted: Iterable[Wanted]) -> None:
         names[one.local] = one.name
 
 
-def _made(session: Session, path: bytes, place: Path, found: Found) -> list[Wanted]:
-    """Make the directories below a directory, and return its files."""
-    files = []
-    with local_disk(place):
-        place.mkdir(parents=True, exist_ok=True)
+def _below_top(path: bytes, top: bytes) -> bytes:
+    return path.removeprefix(top).lstrip(b"/")
+
+
+def _made(session: Session, place: Place, found: Found, choice: Choice) -> list[Wanted]:
+    """Make the directories below a directory, and return its files; if these are chosen by name, make only
+    the directories that they need."""
+    files, top = [], place.whole
+    with local_disk(top):
+        if not choice.by_name:
+            top.mkdir(parents=True, exist_ok=True)
         for below, stat in found:
-            remote, local = join(path, below), place / os.fsdecode(below)
-            if stat.kind is EntryKind.FILE:
+            remote, local = join(place.path, below), top / os.fsdecode(below)
+            if stat.kind is EntryKind.DIRECTORY:
+                if not choice.by_name:
+                    local.mkdir(exist_ok=True)
+            elif choice.takes(place.below_source(remote)):
+                local.parent.mkdir(parents=True, exist_ok=True)
                 files.append(_wanted(remote, local, session.on_vehicle(remote), stat))
-            else:
-                local.mkdir(exist_ok=True)
     return files
 
 
@@ -400,9 +437,11 @@ async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes,
     logs = [
         _wanted(join(place, below), local / os.fsdecode(below), below, stat, keep_old=True)
         for below, stat in found
-        if stat.kind is EntryKind.FILE and below != MEMORY.encode()  # local logs that were copied to the card
+        if stat.kind is EntryKind.FILE
+        and below != MEMORY.encode()  # local logs that were copied to the card
+        and wish.choice.takes(below)
     ]
-    return place, _apart(select(newest_first(logs), newest=wish.newest, since=wish.since)), unlisted
+    return place, _apart(wish.choice.of_logs(logs)), unlisted
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:
@@ -438,28 +477,3 @@ def _below(root: bytes, place: bytes) -> bytes | None:
     if root == b"/":
         return place
     return place[len(root) :] if place.startswith(root + b"/") else None
-
-
-def newest_first(logs: Iterable[Wanted]) -> list[Wanted]:
-    """Order logs by time, then by their numbers. Logs without a time come last, and files that are no logs
-    behind them."""
-
-    def age(log: Wanted) -> tuple[bool, int, object]:
-        return not log.remote.endswith(NO_LOG), log.mtime or 0, natural(log.remote)
-
-    return sorted(logs, key=age, reverse=True)
-
-
-def select(logs: Sequence[Wanted], *, newest: int | None, since: float | None) -> list[Wanted]:
-    """Return the newest N, of those that are not older than `since` (seconds UTC).
-
-    A log without a time is not left out by `since`: it may be a new one.
-    """
-    young = [log for log in logs if since is None or log.mtime is None or log.mtime >= since]
-    return young if newest is None else young[:newest]
-
-
-def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
-    """Return a key by which `log10` comes after `log9`."""
-    parts = re.split(rb"(\d+)", name)
-    return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)

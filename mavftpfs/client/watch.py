@@ -18,9 +18,10 @@ from pathlib import Path
 import trio
 
 from mavftpfs.client.brought import HEAD, Brought, Memory
+from mavftpfs.client.choice import is_no_log
 from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
 from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
-from mavftpfs.client.download import NO_LOG, Wish, named, wanted_logs
+from mavftpfs.client.download import Wish, named, wanted_logs
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
 from mavftpfs.client.flights import Fetch, Log, Look, Policy, Step, Wait
@@ -248,8 +249,11 @@ class Watch:
             with local_disk(self._local):
                 self._memory = Memory(self._local)
             _, logs, unlisted = await wanted_logs(session, self._wish.logs, local)
-            logs = [log for log in logs if not log.remote.endswith(NO_LOG)]
+            logs = [log for log in logs if not is_no_log(log)]
             new = [log for log in logs if not await self._is_known(name, log, session)]
+            warning = self._wish.logs.choice.warning(new)
+            if warning:
+                self._complain(f"times of {system}", f"vehicle {system}: {warning}")
         except NotFound as exc:
             self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
             return self._policy.looked(system, (), trio.current_time())

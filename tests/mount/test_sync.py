@@ -104,6 +104,62 @@ def test_new_logs_come_newest_first_and_a_second_run_moves_nothing(field: Field,
     assert states(sync(vehicle.source, local, "--newest", 1)) == {"08_00_00.ulg": "fetched"}
 
 
+def test_since_says_first_that_a_vehicle_tells_no_times(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "ardupilot")
+    write_log(vehicle.root / "APM/LOGS/00000001.BIN", 60_000, 1, 1)
+    (vehicle.root / "APM/LOGS/LASTLOG.TXT").write_text("1")
+    warning = (
+        "mavftpfs: --since leaves out no log without a time, and the vehicle tells none for 1 of 2 logs "
+        "(60.0 kB); use --newest N to fetch fewer\n"
+    )
+    words = ("sync", vehicle.source, tmp_path / "logs", "--since", "2h")
+    out, err = run(*words, "--dry-run")
+    assert (out.splitlines()[-1][:13], err) == ("would fetch 2", warning)
+    with started(*words, "-o", "bwlimit=50000") as child:
+        assert child.stderr is not None
+        assert child.stderr.readline() == warning
+        assert not (tmp_path / "logs/00000001.BIN").exists()
+        assert child.stdout is not None
+        assert child.stdout.read().splitlines()[-1].endswith("from /APM/LOGS")
+    assert run(*words)[1] == ""
+
+
+def test_since_takes_the_time_from_a_name_that_has_one(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    for name in ("2024-05-01/10_00_00.ulg", "2024-05-01/note.txt", "2024-05-01_10-00-00.bin"):
+        write_log(vehicle.root / "log" / name, 100, 1, 1)
+        write_log(vehicle.root / "log" / name.replace("2024", "2025"), 100, 1, 1)
+    _, err = run("sync", vehicle.source, tmp_path / "logs", "--since", "2025-01-01")
+    assert local_files(tmp_path / "logs") == {
+        "2025-05-01/10_00_00.ulg",
+        "2025-05-01/note.txt",
+        "2025-05-01_10-00-00.bin",
+    }
+    assert err == ""
+
+
+def test_patterns_choose_the_files_of_sync_and_get(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    for name in ("2024-05-01/a.ulg", "2024-05-01/a.txt", "2024-05-02/b.ulg", "sess001/c.ulg", "d/e/f.txt"):
+        write_log(vehicle.root / "log" / name, 100, 1, 1)
+    run("sync", vehicle.source, tmp_path / "s", "--include", "*.ulg", "--exclude", "2024-05-01/*")
+    assert local_files(tmp_path / "s") == {"2024-05-02/b.ulg", "sess001/c.ulg"}
+    words = ("--exclude", "2024-*/*", "--exclude", "c.*")
+    run("get", "-r", vehicle.source, "/log", "--to", tmp_path / "g", *words)
+    assert [str(path.relative_to(tmp_path / "g")) for path in sorted((tmp_path / "g").rglob("*"))] == [
+        "log",
+        "log/d",
+        "log/d/e",
+        "log/d/e/f.txt",
+    ]
+    words = ("/log/*/?.*", "/log/sess001/c.ulg", "--include", "[ab].*")
+    run("get", vehicle.source, *words, "--to", tmp_path / "p")
+    assert local_files(tmp_path / "p") == {"2024-05-01/a.ulg", "2024-05-01/a.txt", "2024-05-02/b.ulg"}
+    err = run("get", vehicle.source, "/log/d/e/f.txt", "--to", tmp_path / "n", "--exclude", "f*", code=1)[1]
+    assert "leave no file" in err
+    assert not (tmp_path / "n").exists()
+
+
 def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: Path) -> None:
     vehicle = field.mavsdk(field.local("card"))
     big, local = vehicle.root / "logs" / "big.bin", tmp_path / "logs"

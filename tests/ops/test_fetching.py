@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 import trio
 
+from mavftpfs.client.choice import Choice
 from mavftpfs.client.download import Downloads, Outcome, Wish
 from mavftpfs.client.fetch import (
     Fetched,
@@ -449,7 +450,7 @@ async def sync(
     fetcher = fetcher_of(tree, root, verify)
     downloads = Downloads(fetcher, outcome, lambda fetched: told.append(fetched.wanted.name), said.append)
     try:
-        await downloads.sync(Wish(local, newest=newest, dry_run=dry_run))
+        await downloads.sync(Wish(local, choice=Choice(newest), dry_run=dry_run))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
 from mavftpfs.cli.verbs import parse_date
-from mavftpfs.client import download, fetch, proof
+from mavftpfs.client import fetch, proof
+from mavftpfs.client.choice import Choice, latest_in, newest_first
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
 from mavftpfs.shared.errors import UsageError
@@ -66,15 +68,39 @@ def log(below: str, mtime: int | None = None) -> Wanted:
     ],
 )
 def test_the_newest_come_first_by_time_then_by_number(logs: list[Wanted], ordered: list[str]) -> None:
-    assert [one.name for one in download.newest_first(logs)] == ordered
+    assert [one.name for one in newest_first(logs)] == ordered
 
 
 def test_which_logs_are_wished_for() -> None:
-    logs = download.newest_first([log("a", MAY), log("b", JUNE), log("c")])
-    assert [one.name for one in download.select(logs, newest=1, since=None)] == ["b"]
-    since = download.select(logs, newest=None, since=MAY + 1)
-    assert [one.name for one in since] == ["b", "c"]  # c may be a new one
-    assert download.select(logs, newest=9, since=None) == logs
+    logs = newest_first([log("a", MAY), log("b", JUNE), log("c")])
+    assert [one.name for one in Choice(newest=1).of_logs(logs)] == ["b"]
+    assert [one.name for one in Choice(since=MAY + 1).of_logs(logs)] == ["b", "c"]  # c may be a new one
+    assert Choice(newest=9).of_logs(logs) == logs
+
+
+@pytest.mark.parametrize(
+    ("path", "time"),
+    [
+        (b"/log/2024-05-01/12_34_56.ulg", MAY),
+        (b"/logs/2024-05-01_12-34-56.bin", MAY),
+        (b"/log/2023-01-01/2024-05-01T12-34-56.bin", MAY),
+        (b"/log/2024-05-01/note.txt", 1_714_607_999),  # the end of that day
+        (b"/log/2024-13-01/12_34_56.ulg", None),
+        (b"/log/sess001/log001.ulg", None),
+        (b"/APM/LOGS/00000012.BIN", None),
+        (b"/log/12024-05-01", None),
+    ],
+)
+def test_times_in_paths(path: bytes, time: int | None) -> None:
+    assert latest_in(path) == time
+
+
+def test_patterns_see_the_path_and_the_name() -> None:
+    some = Choice(include=("*.ulg", "sess001/*"), exclude=("2024-05-01/*", "log002.*"))
+    taken = [b"a/b.ulg", b"sess001/x/y.txt", b"sess001/log001.ulg"]
+    left = [b"a/b.ULG", b"2024-05-01/10_00_00.ulg", b"sess001/log002.ulg", b"sess002/x.txt"]
+    assert [path for path in taken + left if some.takes(path)] == taken
+    assert Choice().takes(b"anything")
 
 
 def test_a_clock_that_was_not_set_tells_nothing() -> None:
@@ -102,7 +128,16 @@ def test_paths_that_cannot_be(text: str) -> None:
 
 
 def test_dates() -> None:
-    assert parse_date("2024-05-01T12:34:56+00:00") == MAY
-    assert parse_date("2024-05-02") - parse_date("2024-05-01") == 86_400
+    now = datetime(2026, 5, 2, 14, 30)
+    assert parse_date("2024-05-01T12:34:56+00:00", now) == MAY
+    assert parse_date("today", now) == parse_date("2026-05-02", now)
+    assert parse_date("yesterday", now) == parse_date("2026-05-01", now)
+    assert parse_date("2h", now) == parse_date("2026-05-02T12:30", now)
+    assert parse_date("90min", now) == parse_date("2026-05-02T13:00", now)
+    assert parse_date("1w", now) == now.timestamp() - 7 * 86_400
+
+
+@pytest.mark.parametrize("text", ["soon", "2", "h", "-2h", "2m"])
+def test_words_that_are_no_date(text: str) -> None:
     with pytest.raises(UsageError, match="2026-05-01"):
-        parse_date("yesterday")
+        parse_date(text, datetime.now())

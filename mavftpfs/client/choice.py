@@ -1,0 +1,116 @@
+"""Which of the vehicle's files are wanted: by pattern, by time, the newest N. Layer: client; silent."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+
+from mavftpfs.client.fetch import Wanted
+from mavftpfs.shared.readable import readable_size
+
+NO_LOG = b"LASTLOG.TXT"
+"""ArduPilot keeps the number of its last log in this file. It is no log."""
+
+_DATE = re.compile(rb"(?<!\d)(20\d\d)-(\d\d)-(\d\d)(?:[/_T -](\d\d)[_:.-](\d\d)[_:.-](\d\d))?(?!\d)")
+_DAY_END = (23, 59, 59)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The files that a user wants.
+
+    newest: at most so many; since: none that is older, seconds UTC. include: patterns, one of which a file
+    has to match if there are any; exclude: patterns, none of which a file may match.
+    """
+
+    newest: int | None = None
+    since: float | None = None
+    include: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+
+    @property
+    def by_name(self) -> bool:
+        """Whether names decide."""
+        return bool(self.include or self.exclude)
+
+    def takes(self, below: bytes) -> bool:
+        """Return whether the patterns take a file; below: its path below the directory that is fetched."""
+        path = os.fsdecode(below)
+        taken = not self.include or _matches_one(path, self.include)
+        return taken and not _matches_one(path, self.exclude)
+
+    def of_logs(self, logs: Iterable[Wanted]) -> list[Wanted]:
+        """Return the logs that are young enough, the newest first.
+
+        A log is left out by `since` only if its time is known: another one may be new.
+        """
+        young = [log for log in newest_first(logs) if not self._is_older(log)]
+        return young if self.newest is None else young[: self.newest]
+
+    def _is_older(self, log: Wanted) -> bool:
+        when = time_of(log)
+        return self.since is not None and when is not None and when < self.since
+
+    def warning(self, logs: Sequence[Wanted]) -> str:
+        """Return a line about logs that are fetched although `since` may mean to leave them out, or ""."""
+        undated = [log for log in logs if time_of(log) is None and not log.here and not is_no_log(log)]
+        if self.since is None or not undated:
+            return ""
+        size = readable_size(sum(log.size - log.begun for log in undated))
+        return (
+            f"--since leaves out no log without a time, and the vehicle tells none for {len(undated)} of "
+            f"{len(logs)} logs ({size}); use --newest N to fetch fewer"
+        )
+
+
+EVERYTHING = Choice()
+
+
+def _matches_one(below: str, patterns: Sequence[str]) -> bool:
+    name = below.rpartition("/")[2]
+    return any(fnmatchcase(below, pattern) or fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def is_no_log(log: Wanted) -> bool:
+    """Return whether a file that lies among the logs is none."""
+    return log.remote.endswith(NO_LOG)
+
+
+def time_of(log: Wanted) -> int | None:
+    """Return the time of a log, seconds UTC, as listed or as its path tells it; None if neither does."""
+    return latest_in(log.remote) if log.mtime is None else log.mtime
+
+
+def latest_in(path: bytes) -> int | None:
+    """Return the time in a path, such as `2026-11-20/12_30_00.ulg` of PX4: seconds UTC, None without a date.
+
+    A date alone counts as the end of that day.
+    """
+    for found in reversed(list(_DATE.finditer(path))):
+        year, month, day, *clock = found.groups()
+        hour, minute, second = _DAY_END if clock[0] is None else map(int, clock)
+        with suppress(ValueError):
+            told = datetime(int(year), int(month), int(day), hour, minute, second, tzinfo=UTC)
+            return int(told.timestamp())
+    return None
+
+
+def newest_first(logs: Iterable[Wanted]) -> list[Wanted]:
+    """Order logs by time, then by their numbers. Logs without a time come last, and files that are no logs
+    behind them."""
+
+    def age(log: Wanted) -> tuple[bool, int, object]:
+        return not is_no_log(log), time_of(log) or 0, natural(log.remote)
+
+    return sorted(logs, key=age, reverse=True)
+
+
+def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
+    """Return a key by which `log10` comes after `log9`."""
+    parts = re.split(rb"(\d+)", name)
+    return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)
