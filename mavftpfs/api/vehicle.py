@@ -30,6 +30,7 @@ from mavftpfs.client.files import File, Files, Session, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
+from mavftpfs.client.several import IN_PYTHON
 from mavftpfs.client.source import target_of
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound, UsageError
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
@@ -102,6 +103,7 @@ class Drone:
         self._session = session
         self._nursery = nursery
         self._opened: set[Opened] = set()
+        self._is_meant = False  # the vehicle is known to be the one that the program changes
 
     def __repr__(self) -> str:
         return f"<Drone {self.source}>"
@@ -114,6 +116,23 @@ class Drone:
     def has_open_files(self) -> bool:
         """Whether a file of it is open."""
         return bool(self._opened)
+
+    @asynccontextmanager
+    async def _changing(self) -> AsyncIterator[None]:
+        """Translate the errors of a body that changes something on the vehicle. Raises: see below, too."""
+        with translated():
+            await self._require_one_vehicle()
+            yield
+
+    async def _require_one_vehicle(self) -> None:
+        """Check before the first change that no other vehicle may be meant. One that comes later is not.
+
+        Raises:
+            UsageError: several vehicles are on the link, and `target_system` does not name one.
+        """
+        if not self._is_meant:
+            await self._session.require_one_vehicle(IN_PYTHON)
+            self._is_meant = True
 
     async def _existing(self, path: PathLike) -> bytes:
         """Return a path as the client has it. If it ends in a slash, it is checked that it is no file.
@@ -211,7 +230,7 @@ class Drone:
 
     async def set_params(self, values: Mapping[str, int | float]) -> None:
         """Set parameters; each is read back. See api.params.Params.update."""
-        with translated():
+        async with self._changing():
             await params.set_values(self._session, values)
 
     # --- changing names
@@ -222,7 +241,7 @@ class Drone:
         Raises:
             FileExistsError, FileNotFoundError.
         """
-        with translated():
+        async with self._changing():
             wanted = remote(path)
             if wanted == ROOT:
                 if exist_ok:
@@ -234,7 +253,7 @@ class Drone:
 
     async def rmdir(self, path: PathLike) -> None:
         """Remove an empty directory."""
-        with translated():
+        async with self._changing():
             await names.remove_directories(self._session, [remote(path)])
 
     async def remove(self, path: PathLike, *, recursive: bool = False) -> None:
@@ -243,7 +262,7 @@ class Drone:
         Raises:
             FileNotFoundError, IsADirectoryError.
         """
-        with translated():
+        async with self._changing():
             wanted = await self._existing(path)
             names.refuse_root([wanted])
             if recursive:
@@ -255,7 +274,7 @@ class Drone:
 
     async def rename(self, old: PathLike, new: PathLike) -> None:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
-        with translated():
+        async with self._changing():
             source, target = await self._existing(old), remote(new)
             if names_directory(new) and (await self._files.stat(source)).kind is EntryKind.FILE:
                 raise NotADirectory(f"{source!r} is not a directory")
@@ -263,7 +282,7 @@ class Drone:
 
     async def copy(self, old: PathLike, new: PathLike) -> None:
         """Copy a file, by way of this computer."""
-        with translated():
+        async with self._changing():
             source = await self._existing(old)
             if names_directory(new):
                 raise IsADirectory(f"{remote(new)!r} is a directory")
@@ -273,7 +292,7 @@ class Drone:
         """Cut a file, or extend it by zeros."""
         if size < 0:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-        with translated():
+        async with self._changing():
             await self._files.truncate(await self._existing(path), size)
 
     # --- whole files
@@ -381,7 +400,7 @@ class Drone:
             FileNotFoundError, IsADirectoryError: of `local`. NotDelivered: a file is not there; see there.
         """
         told: list[str] = []
-        with translated():
+        async with self._changing():
             if stat.S_ISDIR(os.stat(local).st_mode) and not recursive:
                 raise IsADirectory(f"{os.fspath(local)} is a directory; put it with recursive=True")
             found = upload.collect(Path(local), recursive=recursive)
@@ -417,6 +436,8 @@ class Drone:
     async def open_raw(self, path: PathLike, mode: str) -> Opened:
         """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""
         with translated():
+            if mode != "r":
+                await self._require_one_vehicle()
             wanted, files = remote(path), self._files
             if mode[0] == "r":
                 await self._existing(path)
@@ -473,7 +494,11 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         with open_sinks(target.options, debug=False, tell=log.info) as sinks:
             target = replace(target, sinks=sinks)
             up = target.session(writing=True, list_root=True, use_mount=use_mount)
-            async with up as session, plain_nursery() as nursery:
+            async with (
+                up as session,
+                session.noting_others(log.warning, IN_PYTHON),
+                plain_nursery() as nursery,
+            ):
                 drone = Drone(source, session, nursery)
                 try:
                     yield drone

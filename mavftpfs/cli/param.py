@@ -73,7 +73,7 @@ def _require_one_job(args: Args, setting: Sequence[str]) -> None:
 
 def _with_session(args: Args, function: Any, *, writing: bool = False) -> int:
     async def work(target: Target) -> int:
-        async with client.at_root(target).session(writing=writing) as session:
+        async with verbs.one_vehicle(client.at_root(target), writing=writing) as session:
             return int(await function(session))
 
     return verbs.run(args, work)

@@ -11,8 +11,8 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -35,6 +35,7 @@ from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
+from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
@@ -77,10 +78,26 @@ def with_session(
     """Run a verb on the vehicle's files; `writing` if it changes them."""
 
     async def work(target: Target) -> ResultT:
-        async with target.session(writing=writing) as session:
+        async with one_vehicle(target, writing=writing) as session:
             return await function(session)
 
     return run(args, work, component)
+
+
+@asynccontextmanager
+async def one_vehicle(target: Target, *, writing: bool) -> AsyncIterator[Session]:
+    """Give the vehicle's files to a command; say whether other vehicles may have been meant.
+
+    Raises:
+        UsageError: with `writing`, if they may. Else as Target.session.
+    """
+    async with target.session(writing=writing) as session:
+        if writing:
+            await session.require_one_vehicle(ON_COMMAND_LINE)
+            yield session
+            return
+        async with session.noting_others(say, ON_COMMAND_LINE):
+            yield session
 
 
 async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:

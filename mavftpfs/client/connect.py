@@ -27,8 +27,8 @@ from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, OWN_COMPONENT, Address, AutopilotVersion
-from mavftpfs.link.peers import describe_peer
+from mavftpfs.link.messages import OWN_COMPONENT, Address, AutopilotVersion
+from mavftpfs.link.peers import names_of, vehicles_in
 from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
@@ -254,20 +254,16 @@ async def with_tree(
 def other_vehicles_heard(connection: Connection, options: Options) -> str:
     """Return a line on other vehicles that are heard, if the first one was taken because it came first; else
     ""."""
-    vehicle = connection.vehicle
-    if options.target_system or vehicle.address is None:
+    address = connection.vehicle.address
+    if options.target_system or address is None:
         return ""
-    mine = vehicle.address.system
-    others = [
-        heartbeat
-        for heartbeat in vehicle.heard.values()
-        if heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.source.system != mine
-    ]
+    found = vehicles_in(connection.vehicle.heard.values())
+    others = [one for one in found if one.source.system != address.system]
     if not others:
         return ""
-    names = ", ".join(f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in others)
-    first = f"{mine}/{vehicle.address.component}"
-    return f"this is {first}; {names} is heard, too: -o target_system={others[0].source.system}, or -o all"
+    first = f"{address.system}/{address.component}"
+    choose = f"-o target_system={others[0].source.system}, or -o all"
+    return f"this is {first}; {names_of(others)} is heard, too: {choose}"
 
 
 def process_name() -> str:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from contextlib import asynccontextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NoReturn, Protocol
 
@@ -23,8 +23,11 @@ from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
 from mavftpfs.client.mountpoint import OUR_TYPE, enclosing_mount, mounts
 from mavftpfs.client.options import Options
+from mavftpfs.client.several import Unnamed
 from mavftpfs.client.status import Facts, has_link, is_wanted, told_by, vehicle_below
+from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
+from mavftpfs.session.connection import HEARD_SOON, Connection
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
@@ -197,7 +200,8 @@ class Session:
 
     status: asks for what `status --json` tells of vehicle, link and transfers. root: where `/` of `files`
     lies on the vehicle. mountpoint: of the mount whose files these are, None for a connection of our own.
-    patience: seconds for which a lost vehicle is waited for.
+    patience: seconds for which a lost vehicle is waited for. unnamed: the vehicles on the link; None if
+    SOURCE or the options name one.
     """
 
     files: Files
@@ -205,6 +209,22 @@ class Session:
     root: bytes = ROOT
     mountpoint: str | None = None
     patience: float = 0.0
+    unnamed: Unnamed | None = None
+
+    async def require_one_vehicle(self, option: str) -> None:
+        """Check, before something is changed, that the vehicle is the only one that may be meant.
+
+        Raises:
+            UsageError: there are several on the link, and none was named.
+        """
+        if self.unnamed is not None:
+            await self.unnamed.require_one(option)
+
+    @asynccontextmanager
+    async def noting_others(self, tell: Callable[[str], None], option: str) -> AsyncIterator[None]:
+        """Tell once during the body that other vehicles may be meant, if there are any."""
+        async with nullcontext() if self.unnamed is None else self.unnamed.noted(tell, option):
+            yield
 
     async def lost(self) -> bool:
         """Return whether the vehicle is lost.
@@ -301,8 +321,23 @@ async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     it."""
     for status in await mounts_on(spec):
         if is_wanted(status, options):
-            return session_on(status, options.root, options)
+            session = session_on(status, options.root, options)
+            return session if options.target_system else replace(session, unnamed=_heard_by(status, spec))
     return None
+
+
+def _heard_by(status: Facts, spec: LinkSpec) -> Unnamed:
+    """Return the vehicles that a mount hears on its link."""
+    heard = heartbeats_in(status)
+    return Unnamed(spec.description, status["vehicle"]["system"], lambda: heard)
+
+
+def heartbeats_in(status: Facts) -> list[Heartbeat]:
+    """Return what a mount heard of the components on its link."""
+    return [
+        Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
+        for facts in status["connection"]["heard"]
+    ]
 
 
 async def mounts_on(spec: LinkSpec) -> list[Facts]:
@@ -404,7 +439,22 @@ class Target:
         deadline = trio.current_time() + self.options.connect_timeout
         up = attached(self.spec, self.options, sinks=self.sinks, list_root=list_root, writing=writing)
         async with up as vehicle, _answered_by(deadline, vehicle, self.options):
-            yield session_of(vehicle, self.options)
+            yield replace(
+                session_of(vehicle, self.options), unnamed=_unnamed(vehicle.connection, self.options)
+            )
+
+
+def _unnamed(connection: Connection, options: Options) -> Unnamed | None:
+    """Return the vehicles on the link of a connection, None if the options name one."""
+    address = connection.vehicle.address
+    if options.target_system or address is None:
+        return None
+
+    async def listened() -> None:
+        await trio.sleep_until(connection.began_at + HEARD_SOON)
+
+    heard = connection.vehicle.heard
+    return Unnamed(connection.link.description, address.system, heard.values, listened)
 
 
 def session_of(vehicle: Attached, options: Options) -> Session:

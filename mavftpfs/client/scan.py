@@ -11,7 +11,7 @@ from typing import Any
 import trio
 
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
-from mavftpfs.client.files import Target, mount_status, mounts_on
+from mavftpfs.client.files import Target, heartbeats_in, mount_status, mounts_on
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import second_vehicle, with_vehicles
 from mavftpfs.link.base import Link
@@ -179,10 +179,6 @@ def _second(facts: Mapping[str, Any]) -> list[str]:
 def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
     """Return what a mount tells of its vehicle, and of others that it hears; these are not asked."""
     own = _own_entry(status)
-    heard = [
-        Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
-        for facts in status["connection"]["heard"]
-    ]
-    others = [one for one in heard if one.source != (own["system"], own["component"])]
+    others = [one for one in heartbeats_in(status) if one.source != (own["system"], own["component"])]
     reason = f"not asked (the mount on {status['mountpoint']} has the link)"
     return [own, *(_entry(one, reason) for one in others)]

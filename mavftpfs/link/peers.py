@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Heartbeat
 from mavftpfs.shared.readable import autopilot_name
 
@@ -40,3 +42,17 @@ def describe_peer(heartbeat: Heartbeat) -> str:
         )
     words = [autopilot_name(heartbeat.autopilot), *([kind] if kind else [])]
     return f"{' '.join(words)}, {'armed' if heartbeat.armed else 'disarmed'}"
+
+
+def vehicles_in(heard: Iterable[Heartbeat]) -> list[Heartbeat]:
+    """Return a heartbeat of each vehicle, by system id: of its autopilot with the lowest component id."""
+    found: dict[int, Heartbeat] = {}
+    for one in sorted(heard, key=lambda heartbeat: heartbeat.source):
+        if one.autopilot != MAV_AUTOPILOT_INVALID:
+            found.setdefault(one.source.system, one)
+    return list(found.values())
+
+
+def names_of(senders: Iterable[Heartbeat]) -> str:
+    """Return the addresses of senders, and what they are."""
+    return ", ".join(f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in senders)

@@ -24,7 +24,7 @@ from mavftpfs.link.messages import (
     OWN_COMPONENT,
     Address,
 )
-from mavftpfs.link.peers import describe_peer
+from mavftpfs.link.peers import names_of
 from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
@@ -93,7 +93,8 @@ class Connection:
     """One vehicle, reachable. Made by `connected`, which runs its tasks.
 
     Attributes:
-        was_lost: it was lost, and not heard since. news: see `subscribe`.
+        began_at: since when the link is listened to. was_lost: it was lost, and not heard since. news: see
+            `subscribe`.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class Connection:
         on_frame: Callable[[bytes], None] | None = None,
     ) -> None:
         self.link, self.options, self.clock = link, options, clock
+        self.began_at = clock()
         self.was_lost = False
         self.news: list[Callable[[str], None]] = []
         self._first_heartbeat, self._doubted = trio.Event(), trio.Event()
@@ -238,10 +240,7 @@ class Connection:
         if not heard:
             what = "cable and baud rate" if self.link.is_serial else "address, port and firewall"
             return f": no heartbeat heard at all; check SOURCE: {what}"
-        names = ", ".join(
-            f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in heard
-        )
-        return f": heard only {names}; check target_system and target_component"
+        return f": heard only {names_of(heard)}; check target_system and target_component"
 
     # --- what the vehicle tells
 

@@ -23,8 +23,9 @@ from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import VehicleLost
 from tests.mount.conftest import Field
+from tests.support.mounts import wait_until
 from tests.support.trees import content
-from tests.support.vehicles import SimVehicle
+from tests.support.vehicles import HOST, SimVehicle, free_udp_port
 
 DATA = content("f", 70_000)
 Call = Callable[[Any, str], object]
@@ -534,3 +535,30 @@ def test_a_permission_is_one_here_and_there(field: Field) -> None:
         drone.write_bytes("/f", b"data")
     assert isinstance(caught.value, mavftpfs.NotDelivered)
     assert caught.value.on_vehicle is False
+
+
+def test_a_change_names_its_vehicle_where_several_are_heard(
+    field: Field, caplog: pytest.LogCaptureFixture
+) -> None:
+    link = f"udpout:{HOST}:{free_udp_port()}"
+    one, two = (field.sim(field.local(f"card{n}"), options=("--system", str(n)), link=link) for n in (1, 2))
+    (two.root / "f").write_bytes(DATA)
+    with mavftpfs.connect(one.source) as drone:
+        calls: dict[str, Callable[[], object]] = {
+            "mkdir": lambda: drone.mkdir("d"),
+            "open": lambda: drone.open("f", "w"),
+            "write": lambda: drone.write_text("f", "text"),
+            "put": lambda: drone.put(__file__, "/"),
+            "remove": lambda: drone.remove("f"),
+            "param": lambda: drone.params.update({"RTL_ALT": 3}),
+        }
+        for call in calls.values():
+            with pytest.raises(
+                mavftpfs.UsageError, match="choose one with target_system=1 or target_system=2"
+            ):
+                call()
+        wait_until("it is said", lambda: "also heard: " in caplog.text)
+    with mavftpfs.connect(one.source, target_system=2) as drone:
+        drone.remove("f")
+        assert drone.listdir() == []
+    assert caplog.text.count("also heard: ") == 1

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import mavftpfs
+from tests.support.mounts import command, mavftpfs, wait_until
 from tests.support.trees import differing
-from tests.support.vehicles import SimVehicle
+from tests.support.vehicles import HOST, SimVehicle, free_udp_port
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +49,74 @@ def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) 
     for folder in ("deep", "names"):
         mavftpfs("get", "-r", vehicle.source, f"/{folder}", "--to", tmp_path)
         assert differing(small_tree / folder, tmp_path / folder) == []
+
+
+@pytest.fixture(scope="module")
+def two(module_field: Field) -> tuple[SimVehicle, SimVehicle]:
+    """Two vehicles that send to one port."""
+    port = free_udp_port()
+    first, second = (
+        module_field.sim(
+            module_field.local(f"card{system}"),
+            options=("--system", str(system)),
+            link=f"udpout:{HOST}:{port}",
+        )
+        for system in (1, 2)
+    )
+    for vehicle in (first, second):
+        (vehicle.root / "log").mkdir()
+        (vehicle.root / "log/a.bin").write_bytes(bytes(120_000))
+    return first, second
+
+
+CHANGES = {
+    "rm": "rm -r SOURCE /log",
+    "rmdir": "rmdir SOURCE /log",
+    "mkdir": "mkdir SOURCE /new",
+    "mv": "mv SOURCE /log /new",
+    "put": "put SOURCE LOCAL /",
+    "param": "param SOURCE RTL_ALT=3",
+    "load": "param SOURCE --load LOCAL",
+}
+
+
+@pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
+def test_a_change_names_its_vehicle_where_several_are_heard(
+    two: tuple[SimVehicle, SimVehicle], words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "local").write_text("RTL_ALT,3\n")
+    source = two[0].source
+    places = {"SOURCE": source, "LOCAL": str(tmp_path / "local")}
+    _, said = command(*(places.get(word, word) for word in words.split()), code=1)
+    assert f"several vehicles are heard on {source}: 1/1 (PX4 quadrotor, disarmed), 2/1 (PX4" in said
+    assert "choose one with -o target_system=1 or -o target_system=2\n" in said
+    for vehicle in two:
+        assert [path.name for path in vehicle.root.rglob("*")] == ["log", "a.bin"]
+
+
+def test_a_command_says_which_of_several_vehicles_it_reads(
+    two: tuple[SimVehicle, SimVehicle], field: Field
+) -> None:
+    source = two[0].source
+    folder = field.local("local")
+    slow = ("-o", "bwlimit=60k")  # seconds, in which both send heartbeats
+    _, said = command("get", source, "/log/a.bin", "--to", folder, *slow)
+    assert said.count("was heard first on") == 1
+    assert any(
+        f"reading from vehicle {one}, which was heard first on {source}; also heard: {other}/1 (PX4" in said
+        and f"; to choose one, use -o target_system={other}\n" in said
+        for one, other in ((1, 2), (2, 1))
+    )
+    assert command("ls", source, "/log", "-o", "target_system=2") == ("a.bin\n", "")
+
+
+def test_a_mount_of_one_of_several_vehicles_is_no_choice(
+    two: tuple[SimVehicle, SimVehicle], field: Field
+) -> None:
+    source = two[0].source
+    mount = field.mount(source, "target_system=2")
+    wait_until("both are heard", lambda: len(mount.status()["connection"]["heard"]) == 2)
+    assert "several vehicles are heard" in command("mkdir", source, "/new", code=1)[1]
+    assert "reading from vehicle 2" in command("ls", source)[1]
+    command("mkdir", mount.path, "/new")
+    command("rmdir", source, "/new", "-o", "target_system=2")
