@@ -216,7 +216,7 @@ def test_ctrl_c_ends_a_call_and_nothing_else(sim: SimVehicle) -> None:
 
 
 def test_ctrl_c_while_a_file_is_written_withdraws_it(sim: SimVehicle) -> None:
-    with mavftpfs.connect(sim.source, op_deadline=5) as drone:
+    with mavftpfs.connect(sim.source, target_system=1, op_deadline=5) as drone:
 
         def write_half() -> None:
             with drone.open("/f", "w") as file:
