@@ -377,7 +377,14 @@ def _param_parser(name: str) -> Parser:
     parser.add_argument("--load", metavar="FILE", help="set what a file says and does not hold")
     parser.add_argument("--skip-unknown", action="store_true", help="with --load: leave out unknown names")
     parser.add_argument("--save", metavar="FILE", help="save all, for QGroundControl if it ends in .params")
-    parser.add_argument("--diff", metavar="FILE", help="show where a file differs; exit code 1 if it does")
+    parser.add_argument(
+        "--diff",
+        metavar="FILE",
+        nargs="?",
+        const="",
+        help="show where a file differs, or without FILE the vehicles of a mount with -o all; exit code 1 if "
+        "something differs",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("-y", "--yes", action="store_true", help="do not ask")
     return parser

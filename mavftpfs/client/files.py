@@ -378,6 +378,21 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Sessi
     return session
 
 
+async def vehicles_below(mountpoint: str) -> dict[str, str]:
+    """Return the mountpoint of each vehicle of a mount of several, by name; an empty one is not mounted now.
+
+    Raises:
+        LinkClosed: the mount does not answer. UsageError: it is of a single vehicle.
+    """
+    status = await mount_status(mountpoint, several=True)
+    if "members" not in status:
+        raise errors.UsageError(f"only one vehicle is mounted on {mountpoint}")
+    return {
+        member["name"]: os.path.join(mountpoint, member["name"]) if member["state"] == "mounted" else ""
+        for member in status["members"]
+    }
+
+
 def session_on(status: Facts, root: bytes, options: Options) -> Session:
     """Return the files below `root` of a vehicle, by the mount with this status."""
     mountpoint, mounted = status["mountpoint"], os.fsencode(status["root"])

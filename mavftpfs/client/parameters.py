@@ -92,7 +92,10 @@ async def _read(session: Session, name: bytes) -> bytes:
         part = (
             "" if session.root == ROOT else f"; the mount shows {session.root.decode(errors='replace')} only"
         )
-        raise NotFound(f"this vehicle has no parameters in MAVLink FTP{part}") from exc
+        raise NotFound(
+            f"this vehicle has no parameters in MAVLink FTP{part}; ArduPilot has them since 2020, "
+            "PX4 since September 2026: update its firmware, or use a ground station"
+        ) from exc
 
 
 async def split_by_component(
@@ -289,6 +292,23 @@ def compare(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Differe
         wanted = str(line.value) if now is None else _wanted_text(line, now)
         found.append(Difference(line.name, None if now is None else value_text(now), wanted))
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A parameter that differs between vehicles. values: a text for each vehicle, None where it has no such
+    parameter."""
+
+    name: str
+    values: tuple[str | None, ...]
+
+
+def compare_vehicles(vehicles: Sequence[Sequence[Parameter]]) -> list[Row]:
+    """Return what differs between vehicles, except in parameters that a vehicle sets by itself."""
+    texts = [{one.name: value_text(one) for one in found} for found in vehicles]
+    names = dict.fromkeys(name for known in texts for name in known if not is_own(name))
+    rows = (Row(name, tuple(known.get(name) for known in texts)) for name in names)
+    return [row for row in rows if len(set(row.values)) > 1]
 
 
 def _agrees(line: Line, now: Parameter) -> bool:

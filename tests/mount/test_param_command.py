@@ -47,6 +47,12 @@ def test_printing(source: str) -> None:
     assert "no parameter is called NOPE*" in said(source, "NOPE*", code=1)
 
 
+def test_versions_with_parameters_are_named_where_a_vehicle_has_none(field: Field, small_tree: Path) -> None:
+    for words in (("RTL*",), ("--save", "-"), ("RTL_ALT=1",)):
+        line = said(field.sim(small_tree).source, *words, code=1)
+        assert "ArduPilot has them since 2020, PX4 since September 2026: update its firmware" in line
+
+
 def test_setting(source: str) -> None:
     assert param(source, "rtl_alt=3000") == ["RTL_ALT 1500 -> 3000"]
     assert param(source, "RTL_ALT") == ["RTL_ALT,3000"]

@@ -45,10 +45,10 @@ class Fleet:
     def source(self) -> str:
         return f"udpin:{HOST}:{self.port}"
 
-    def launch(self, system: int, *options: str) -> SimVehicle:
+    def launch(self, system: int, *options: str, profile: str = "") -> SimVehicle:
         words = ("--system", str(system), "--seed", str(system), *options)
         link = f"udpout:{HOST}:{self.port}"
-        vehicle = self.field.sim(self.cards[system], PROFILES[system], words, link=link)
+        vehicle = self.field.sim(self.cards[system], profile or PROFILES[system], words, link=link)
         self.vehicles[system] = vehicle
         return vehicle
 
@@ -127,6 +127,26 @@ def same(card: Path, local: Path) -> bool:
     names = sorted(path.name for path in (card / "log").iterdir())
     wrong = filecmp.cmpfiles(card / "log", local, names, shallow=False)[1:]
     return wrong == ([], []) and sorted(os.listdir(local)) == names
+
+
+def test_the_parameters_of_several_vehicles_are_compared(fleet: Fleet) -> None:
+    for system in (1, 2):
+        fleet.launch(system, profile="ardupilot5")
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2")
+    assert command("param", mounts.path, "--diff") == ("", "")
+    command("param", mounts.path / "2", "RTL_ALT=3000", "WPNAV_SPEED=750.5", "STAT_RUNTIME=77")
+    table = command("param", mounts.path, "--diff", code=1)[0].splitlines()
+    assert table == ["                1  2", "WPNAV_SPEED  1000  750.5", "RTL_ALT      1500  3000"]
+    rows = json.loads(command("param", mounts.path, "--diff", "--json", code=1)[0])
+    assert {"name": "RTL_ALT", "1": "1500", "2": "3000"} in rows
+    fleet.launch(3)
+    mounts.await_up("3")
+    out, err = command("param", mounts.path, "--diff", code=2)
+    assert out.splitlines() == table
+    assert err.startswith("mavftpfs: vehicle 3 is left out: this vehicle has no parameters")
+    assert "only one vehicle" in command("param", mounts.path / "1", "--diff", code=1)[1]
+    assert "needs a FILE" in command("param", fleet.source, "--diff", code=1)[1]
 
 
 def test_three_vehicles_are_copied_at_once_one_dies_and_one_is_armed(fleet: Fleet) -> None:
