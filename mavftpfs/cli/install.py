@@ -109,22 +109,19 @@ def _text(path: Path) -> str:
 
 
 def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
-    """Install, show or remove, for this user; as root, or for a package, for everybody.
+    """Install, show or remove, for this user; as root, for everybody.
 
     Raises:
         UsageError: a file cannot be written or removed, or other users than root could change the program
             that all run.
     """
     program = own_program()
-    everybody = os.geteuid() == 0 or bool(args.root)
-    root = Path(args.root) if args.root else Path("/")
-    pieces = list(
-        for_everybody(parser, program, root) if everybody else for_user(parser, program, os.environ)
-    )
+    everybody = os.geteuid() == 0
+    pieces = list(for_everybody(parser, program) if everybody else for_user(parser, program, os.environ))
     if args.print:
         print("\n".join(piece.shown() for piece in pieces), end="")
         return ExitCode.OK
-    if everybody and not args.root and not args.remove:
+    if everybody and not args.remove:
         check_program(program)
     for piece in pieces:
         if piece.is_others() or (args.remove and not piece.is_there()):
@@ -134,8 +131,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
         except OSError as exc:
             raise UsageError(f"{piece.path}: {exc.strerror}") from exc
         print(f"{'removed' if args.remove else 'wrote'} {piece.path}")
-    if not args.root:
-        _tell_systemd(everybody)
+    _tell_systemd(everybody)
     if not args.remove:
         print("\n".join(_hints(everybody)))
     return ExitCode.OK
@@ -182,18 +178,18 @@ def for_user(
         yield Piece(config / "systemd/user" / unit, _unit(program, unit))
 
 
-def for_everybody(parser: argparse.ArgumentParser, program: Path, root: Path) -> Iterator[Piece]:
-    """Yield what root installs; root: where the file system begins, for packagers."""
-    data = root / "usr/local/share"
+def for_everybody(parser: argparse.ArgumentParser, program: Path) -> Iterator[Piece]:
+    """Yield what root installs."""
+    data = Path("/usr/local/share")
     yield Piece(data / "man/man1/mavftpfs.1", man_page(parser))
     yield Piece(data / "man/man8/mount.mavftpfs.8", _data("mount.mavftpfs.8"))
     yield from _completions(parser, data, data / "fish/vendor_completions.d")
     for unit in UNITS:
-        yield Piece(root / "usr/local/lib/systemd/user" / unit, _unit(program, unit))
-    yield Piece(root / "etc/udev/rules.d/70-mavftpfs.rules", _data("70-mavftpfs.rules"))
-    yield Piece(root / "sbin" / HELPER, link=program.with_name(HELPER))
+        yield Piece(Path("/usr/local/lib/systemd/user", unit), _unit(program, unit))
+    yield Piece(Path("/etc/udev/rules.d/70-mavftpfs.rules"), _data("70-mavftpfs.rules"))
+    yield Piece(Path("/sbin", HELPER), link=program.with_name(HELPER))
     caller = f'#!/bin/sh\n{MARK}\nexec {shlex.quote(str(program))} "$@"\n'  # for mount -t fuse.mavftpfs
-    yield Piece(root / "usr/local/bin/mavftpfs", caller, program=True)
+    yield Piece(Path("/usr/local/bin/mavftpfs"), caller, program=True)
 
 
 def _completions(parser: argparse.ArgumentParser, data: Path, fish: Path) -> Iterator[Piece]:

@@ -102,7 +102,7 @@ def _run(words: list[str]) -> int:
     if name in _COMMANDS:
         make_parser, run = _COMMANDS[name]
         # also `ls SOURCE -l PATH`: parse_args takes no PATH... after an option that follows SOURCE
-        return run(make_parser(name).parse_intermixed_args(words[1:]))
+        return run(make_parser(name).parse_intermixed_args(_without_gone_flags(name, words[1:])))
     parser = _top_parser()
     if not words:
         parser.print_help(sys.stderr)
@@ -116,6 +116,20 @@ def _run(words: list[str]) -> int:
     if not any(mark in args.source for mark in ":/") and not os.path.isdir(args.source):
         raise _no_command(args.source)
     return commands.mount(args)
+
+
+_GONE_FLAGS = {
+    ("get", "--no-resume"): "to fetch a file anew, delete it here first",
+}
+"""Flags that are gone, and harmless: scripts that have them go on to run. Drop the table after 0.3."""
+
+
+def _without_gone_flags(command: str, words: list[str]) -> list[str]:
+    """Return a command's words without flags that are gone; say so for each."""
+    for word in words:
+        if (command, word) in _GONE_FLAGS:
+            commands.say(f"{word} is gone, and is ignored: {_GONE_FLAGS[command, word]}")
+    return [word for word in words if (command, word) not in _GONE_FLAGS]
 
 
 def _no_command(word: str) -> UsageError:
@@ -213,7 +227,6 @@ def _ls_parser(name: str) -> Parser:
     parser = _paths_parser(name, "List directories of the vehicle.", least="*", short_help=False)
     parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times (UTC)")
     parser.add_argument("-h", dest="units", action="store_true", help="with -l: sizes as 1.2 MB")
-    parser.add_argument("-t", dest="by_time", action="store_true", help="the newest first")
     parser.add_argument("-R", dest="recursive", action="store_true", help="directories below too")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
@@ -309,9 +322,6 @@ def _get_parser(name: str) -> Parser:
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
     _add_patterns(parser, "PATH")
-    parser.add_argument(
-        "--no-resume", dest="resume", action="store_false", help="fetch all anew, also what is here"
-    )
     _add_verify(parser)
     return parser
 
@@ -425,9 +435,6 @@ def _recover_parser(name: str) -> Parser:
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="put back to there; default: list")
     parser.add_argument("names", metavar="FILE", nargs="*", help="a file or directory of the list")
     parser.add_argument("--all", action="store_true", help="all files of the list")
-    more = "also over a file that was changed since; with FILE also to another vehicle"
-    parser.add_argument("--force", action="store_true", help=more)
-    parser.add_argument("--json", action="store_true", help="list as JSON")
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
@@ -445,7 +452,6 @@ def _install_parser(name: str) -> Parser:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--print", action="store_true", help="show what would be written")
     what.add_argument("--remove", action="store_true", help="take it away again")
-    parser.add_argument("--root", metavar="DIR", help="all of it below this directory, for packagers")
     return parser
 
 

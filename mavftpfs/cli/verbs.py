@@ -263,7 +263,7 @@ def _download(
     bar = Progress()
 
     async def work(session: Session) -> None:
-        fetcher = Fetcher(session, bar, args.verify, getattr(args, "resume", True))
+        fetcher = Fetcher(session, bar, args.verify)
         async with noting_losses(session, bar):
             await function(download.Downloads(fetcher, outcome, tell, say))
 
@@ -441,11 +441,11 @@ def recover(args: Args) -> int:
     """List what did not reach a vehicle, or put it where it belonged."""
     base = recovered_directory()
     if args.source is None:
-        _list_recovered(recovering.recovered_below(base), as_json=args.json)
+        _list_recovered(recovering.recovered_below(base))
         return ExitCode.OK
     wanted = recovering.recovered_below(base) if args.all else recovering.chosen(args.names, base)
     if args.all and not wanted:
-        _list_recovered(wanted, as_json=False)
+        _list_recovered(wanted)
         return ExitCode.OK
     if not wanted:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
@@ -457,23 +457,20 @@ def recover(args: Args) -> int:
 
     async def work(session: Session) -> list[recovering.Recovered]:
         async with noting_losses(session, bar):
-            return await recovering.put_back(session, wanted, bar, tell, force=args.force)
+            return await recovering.put_back(session, wanted, bar, tell)
 
     with shown(bar):
         others = with_session(args, work, writing=True)
     for vehicle, count in Counter(copy.vehicle for copy in others).items():
         say(
-            f"{count} file(s) of {vehicle} stay here: this is another vehicle; "
-            "give theirs as SOURCE, or name a file and --force"
+            f"{count} file(s) of {vehicle} stay here: this is another vehicle; give theirs as SOURCE, or put "
+            "them on this one by: mavftpfs put SOURCE FILE PATH"
         )
     return ExitCode.INCOMPLETE if others else ExitCode.OK
 
 
-def _list_recovered(found: Sequence[recovering.Recovered], *, as_json: bool) -> None:
+def _list_recovered(found: Sequence[recovering.Recovered]) -> None:
     """Print the recovered files by directory, and what still lies where a killed mount left it."""
-    if as_json:
-        print(json.dumps([copy.described() for copy in found], indent=2))
-        return
     directory = None
     for copy in found:
         if copy.file.parent != directory:
@@ -499,7 +496,7 @@ def _list_recovered(found: Sequence[recovering.Recovered], *, as_json: bool) -> 
 def ls(args: Args) -> int:
     """List directories."""
     wanted, component = names.parse_paths(args.paths or ["/"])
-    work = partial(names.list_paths, paths=wanted, recursive=args.recursive, by_time=args.by_time)
+    work = partial(names.list_paths, paths=wanted, recursive=args.recursive)
     listings = with_session(args, work, component)
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))

@@ -256,7 +256,6 @@ class Fetcher:
     session: Session
     progress: Progress
     verify: Verify = "auto"
-    resume: bool = True
 
     async def fetch(self, wanted: Wanted) -> Fetched:
         """Fetch a file. If the vehicle is lost for a while, go on when it is heard again.
@@ -292,14 +291,14 @@ class Fetcher:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
         with local_disk(wanted.local):
-            proof = await self._prove_here(wanted) if self.resume and wanted.here else None
+            proof = await self._prove_here(wanted) if wanted.here else None
             if proof is not None:
                 return Fetched(wanted, wanted.size, wanted.size, proof, was_here=True)
             if wanted.keep_old:  # logs keep their directories
                 wanted.local.parent.mkdir(parents=True, exist_ok=True)
             part = Part(wanted.part, wanted.local)
             try:
-                begun = wanted.begun if self.resume else 0
+                begun = wanted.begun
                 if part.size != begun:
                     part.cut(0)
                     if begun:

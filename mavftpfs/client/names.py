@@ -123,19 +123,12 @@ class Look:
     colours: bool = False
 
 
-async def list_paths(
-    session: Session, paths: Sequence[bytes], *, recursive: bool = False, by_time: bool = False
-) -> list[Listing]:
-    """Return the entries of directories, and files themselves, as JSON-able facts.
-
-    by_time: the newest first, entries without a time last; else by name.
-    """
-    return [
-        listing for path in paths for listing in await _list_path(session.files, path, recursive, by_time)
-    ]
+async def list_paths(session: Session, paths: Sequence[bytes], *, recursive: bool = False) -> list[Listing]:
+    """Return the entries of directories, and files themselves, as JSON-able facts."""
+    return [listing for path in paths for listing in await _list_path(session.files, path, recursive)]
 
 
-async def _list_path(files: Files, path: bytes, recursive: bool, by_time: bool) -> list[Listing]:
+async def _list_path(files: Files, path: bytes, recursive: bool) -> list[Listing]:
     found = await files.stat(path)
     if found.kind is EntryKind.FILE:
         return [(None, [_entry(path, split(path)[1], found)])]
@@ -144,8 +137,6 @@ async def _list_path(files: Files, path: bytes, recursive: bool, by_time: bool) 
     while pending:
         here = pending.pop()
         below = sorted(await files.list(here), key=lambda entry: entry[0])
-        if by_time:
-            below.sort(key=lambda entry: known_time(entry[1].mtime) or 0, reverse=True)
         listings.append((name_text(here), [_entry(join(here, name), name, stat) for name, stat in below]))
         if recursive:
             inner = [join(here, name) for name, stat in below if stat.kind is EntryKind.DIRECTORY]

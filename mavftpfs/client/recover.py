@@ -2,8 +2,8 @@
 
 A mount that ends with undelivered files moves them below `recovered`, with a `NAME.json` beside each file
 (cache.recovery). The next mount moves there what a killed mount held. Nothing is put back by itself, because
-the file on the vehicle may have changed since. A file of another vehicle is put back only if a person names
-the file itself, and insists.
+the file on the vehicle may have changed since. Nothing is put on another vehicle, or over a file that was
+changed since: `mavftpfs put` does that.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,11 @@ _TICK = 0.05
 class Recovered:
     """The copy here of a file that did not reach the vehicle.
 
-    facts: what was written down about it, as JSON holds it. named: a person named this file itself.
+    facts: what was written down about it, as JSON holds it.
     """
 
     file: Path
     facts: Mapping[str, Any] = field(default_factory=dict)
-    named: bool = False
 
     @property
     def path(self) -> bytes | None:
@@ -60,7 +59,10 @@ class Recovered:
     @property
     def vehicle(self) -> str:
         """The vehicle it is of, for people; "" if that was not written down."""
-        return _vehicle_text(self.facts)
+        system, uid = self.facts.get("system"), self.facts.get("uid")
+        if system is None:
+            return ""
+        return f"vehicle {system} (id {uid})" if uid else f"vehicle {system}"
 
     def is_of_another(self, vehicle: Mapping[str, Any]) -> bool:
         """Return whether it is of another vehicle than this one (as in `status --json`). False if one of them
@@ -80,22 +82,6 @@ class Recovered:
         if "whole" not in self.facts:
             return "a program was still writing it, so it may be a part only"
         return "" if self.facts.get("whole") else "only the changed parts of it are here"
-
-    def described(self) -> dict[str, Any]:
-        """Return its facts for `--json`."""
-        path = None if self.path is None else name_text(self.path)
-        error, at = self.facts.get("error"), self.facts.get("at")
-        facts = {"file": str(self.file), "path": path, "size": self.size, "error": error, "at": at}
-        vehicle = {"system": self.facts.get("system"), "uid": self.facts.get("uid")}
-        return {**facts, **vehicle, "hindrance": self.hindrance or None}
-
-
-def _vehicle_text(facts: Mapping[str, Any]) -> str:
-    """Return a vehicle for people: its system id and its unique id; "" if no system id is known."""
-    system, uid = facts.get("system"), facts.get("uid")
-    if system is None:
-        return ""
-    return f"vehicle {system} (id {uid})" if uid else f"vehicle {system}"
 
 
 # -- what there is --------------------------------------------------------------------------------
@@ -153,9 +139,7 @@ def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
             continue
         if not path.is_file():
             raise UsageError(f"{name} is nothing that was kept; `mavftpfs recover` lists what is")
-        found += [
-            replace(copy, named=True) for copy in recovered_in(path.parent) if copy.file.name == path.name
-        ]
+        found += [copy for copy in recovered_in(path.parent) if copy.file.name == path.name]
     return found
 
 
@@ -167,20 +151,17 @@ async def put_back(
     wanted: Sequence[Recovered],
     progress: Progress,
     tell: Callable[[Recovered, bool], None],
-    *,
-    force: bool,
 ) -> list[Recovered]:
     """Put files where they belonged. Once it is proven that the vehicle has a file, the copy here is removed.
 
-    tell: called for each file, with whether it was there already. force: also replace a file that is not the
-    one they were to replace, and put files that a person named on another vehicle than theirs.
+    tell: called for each file, with whether it was there already.
 
     Returns those of other vehicles, which stay here.
 
     Raises:
         UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
     """
-    others = await _of_others(session, wanted, force=force)
+    others = await _of_others(session, wanted)
     wanted = [copy for copy in wanted if copy not in others]
     for copy in wanted:
         if copy.hindrance:
@@ -190,7 +171,7 @@ async def put_back(
     progress.plan(len(wanted), sum(copy.size for copy in wanted))
     for copy in wanted:
         path = _in_session(session, copy)
-        there_already = await _is_there(session, path, copy, force=force)
+        there_already = await _is_there(session, path, copy)
         if not there_already:
             await put_file(session, copy.file, path, progress)
             if await _differs(session, path, copy):
@@ -200,12 +181,8 @@ async def put_back(
     return others
 
 
-async def _of_others(session: Session, wanted: Sequence[Recovered], *, force: bool) -> list[Recovered]:
-    """Return the files that are of another vehicle. force: but not those that a person named.
-
-    Raises:
-        UsageError: a person named one of them.
-    """
+async def _of_others(session: Session, wanted: Sequence[Recovered]) -> list[Recovered]:
+    """Return the files that are of another vehicle."""
     if not any(copy.facts.get("uid") for copy in wanted):
         return []
     vehicle = (await session.status())["vehicle"]
@@ -213,14 +190,7 @@ async def _of_others(session: Session, wanted: Sequence[Recovered], *, force: bo
         while vehicle["firmware"] is None:  # it is told together with the unique id
             await trio.sleep(_TICK)
             vehicle = (await session.status())["vehicle"]
-    others = [copy for copy in wanted if copy.is_of_another(vehicle) and not (copy.named and force)]
-    for copy in others:
-        if copy.named:
-            here = _vehicle_text(vehicle)
-            raise UsageError(
-                f"{copy.file} is of {copy.vehicle}, and this is {here}; --force puts it here all the same"
-            )
-    return others
+    return [copy for copy in wanted if copy.is_of_another(vehicle)]
 
 
 def _in_session(session: Session, copy: Recovered) -> bytes:
@@ -232,7 +202,7 @@ def _in_session(session: Session, copy: Recovered) -> bytes:
     return copy.path[len(root) :]
 
 
-async def _is_there(session: Session, path: bytes, copy: Recovered, *, force: bool) -> bool:
+async def _is_there(session: Session, path: bytes, copy: Recovered) -> bool:
     """Return whether the vehicle has the file with exactly these bytes.
 
     Raises:
@@ -247,11 +217,11 @@ async def _is_there(session: Session, path: bytes, copy: Recovered, *, force: bo
     if found.size == copy.size and await _differs(session, path, copy) is False:
         return True
     before = copy.facts.get("size_on_vehicle")
-    if found.size not in (before, 0) and not force:  # an empty one holds nothing to lose
+    if found.size not in (before, 0):  # an empty one holds nothing to lose
         known = "nothing" if before is None else f"{before} bytes"
         raise UsageError(
             f"{name_text(path)} has {found.size} bytes on the vehicle, and had {known} when this was kept: "
-            "it was changed since; --force replaces it"
+            f"it was changed since; to replace it: mavftpfs put SOURCE {copy.file} {name_text(path)}"
         )
     return False
 

@@ -370,9 +370,9 @@ def test_ls_on_a_terminal_and_in_a_pipe(field: Field) -> None:
     assert "\x1b[1;34mLOGS\x1b[0m/" in screen.raw
     assert screen.lines == ["/APM:", "LOGS/", "/APM/LOGS:", "10.BIN", "2.BIN"]
     assert run("ls", "-R", vehicle.source, "/APM")[0] == "/APM:\nLOGS/\n\n/APM/LOGS:\n10.BIN\n2.BIN\n"
-    by_time = run("ls", "-lht", vehicle.source, "/APM/LOGS")[0].splitlines()
-    assert by_time[0].split()[:2] == ["1.2", "MB"]
-    assert [line.split()[-1] for line in by_time] == ["2.BIN", "10.BIN"]
+    detailed = run("ls", "-lh", vehicle.source, "/APM/LOGS")[0].splitlines()
+    assert detailed[1].split()[:2] == ["1.2", "MB"]
+    assert [line.split()[-1] for line in detailed] == ["10.BIN", "2.BIN"]
 
 
 # -- scan -----------------------------------------------------------------------------------------

@@ -313,10 +313,8 @@ def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path
     assert directory.stat().st_mode & 0o777 == 0o700
     heading, line = command("recover")[0].splitlines()
     assert heading == f"{directory}:"
-    (facts,) = json.loads(command("recover", "--json")[0])
-    assert line.startswith(f"  lost.bin for /lost.bin on vehicle 1 (id {facts['uid']}), 60.0 kB, 20")
-    assert (facts["file"], facts["path"], facts["size"]) == (f"{directory}/lost.bin", "/lost.bin", 60_000)
-    assert facts["hindrance"] is None
+    uid = json.loads((directory / "lost.bin.json").read_text())["uid"]
+    assert line.startswith(f"  lost.bin for /lost.bin on vehicle 1 (id {uid}), 60.0 kB, 20")
     assert not (card / "lost.bin").exists(), "never by itself"
     assert command("recover", vehicle.source, directory / "lost.bin")[0] == (
         "/lost.bin is on the vehicle now, verified; the copy here is removed\n"
@@ -335,49 +333,45 @@ def keep(state: Path, **files: dict[str, object]) -> Path:
     return directory
 
 
-def test_what_changed_since_is_replaced_only_by_force_and_what_is_there_is_not_sent(
-    field: Field, state: Path
-) -> None:
+def test_what_changed_since_is_not_replaced_and_what_is_there_is_not_sent(field: Field, state: Path) -> None:
     card = field.local("card")
     source = field.sim(card).source
-    keep(state, changed={"path": "/changed", "whole": True}, same={"path": "/same", "whole": True})
+    directory = keep(
+        state, changed={"path": "/changed", "whole": True}, same={"path": "/same", "whole": True}
+    )
     (card / "changed").write_bytes(b"somebody else's")
     (card / "same").write_bytes(b"kept here")
     os.utime(card / "same", (1, 1))
     _, said = command("recover", source, "--all", code=ExitCode.USAGE)
     assert "/changed has 15 bytes on the vehicle, and had nothing when this was kept" in said
     assert (card / "changed").read_bytes() == b"somebody else's"
-    assert "/same was there already" in command("recover", source, "--all", "--force")[0]
+    assert f"mavftpfs put SOURCE {directory}/changed /changed" in said
+    command("put", source, directory / "changed", "/changed")
+    assert "/same was there already" in command("recover", source, "--all")[0]
     assert ((card / "changed").read_bytes(), (card / "same").stat().st_mtime) == (b"kept here", 1)
     assert list(state.iterdir()) == []
 
 
 @pytest.mark.holds("promise 3")
-def test_a_file_is_put_on_another_vehicle_only_by_its_name_and_force(
-    field: Field, data: Path, state: Path
-) -> None:
-    """`--all` and directories mean files of the vehicle, and those of which that is not known."""
+def test_a_file_of_another_vehicle_stays_here(field: Field, data: Path, state: Path) -> None:
+    """Files whose vehicle was not written down may go to any."""
     mount = field.mount(field.sim(field.local("card"), "ardupilot5").source)
     mount.run("cp", data, mount.path / "no?such*name", code=None)
     process, mount.process = mount.alive(), None
     process.send_signal(signal.SIGTERM)
     assert process.wait() == ExitCode.UNDELIVERED
     (directory,) = state.iterdir()
-    (facts,) = json.loads(command("recover", "--json")[0])
+    kept = directory / "no?such*name"
+    facts = json.loads(Path(f"{kept}.json").read_text())
     assert (facts["system"], len(facts["uid"])) == (1, 16)
     card = field.local("card")
     other = field.sim(card, options=("--system", "2")).source
     keep(state, unknown={"path": "/unknown", "whole": True})
     stays = f"mavftpfs: 1 file(s) of vehicle 1 (id {facts['uid']}) stay here: this is another vehicle; "
-    for words in (("--all",), (directory,), ("--all", "--force")):
+    for words in (("--all",), (directory,), (kept,)):
         assert stays in command("recover", other, *words, code=ExitCode.INCOMPLETE)[1]
     assert [path.name for path in card.iterdir()] == ["unknown"]
-    _, said = command("recover", other, facts["file"], code=ExitCode.USAGE)
-    assert f"is of vehicle 1 (id {facts['uid']}), and this is vehicle 2 (id " in said
-    assert len(list(card.iterdir())) == 1
-    command("recover", other, facts["file"], "--force")
-    assert (card / "no?such*name").read_bytes() == data.read_bytes()
-    assert list(state.iterdir()) == []
+    assert kept.read_bytes() == data.read_bytes()
 
 
 @pytest.mark.holds("promise 3")
@@ -413,6 +407,6 @@ def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
     listed = command("recover")[0]
     for reason in ("a program was still writing it", "only the changed parts of it", "was not written down"):
         assert reason in listed
-    command("recover", field.sim(card).source, directory / "changed", "--force", code=ExitCode.USAGE)
+    command("recover", field.sim(card).source, directory / "changed", code=ExitCode.USAGE)
     assert list(card.iterdir()) == []
     assert len(list(directory.iterdir())) == 6

@@ -76,8 +76,8 @@ def tree() -> SpoiltTree:
     return SpoiltTree({b"/big": BIG})
 
 
-def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto", resume: bool = True) -> Fetcher:
-    return Fetcher(session_of(tree, root), Progress(), verify, resume)
+def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto") -> Fetcher:
+    return Fetcher(session_of(tree, root), Progress(), verify)
 
 
 def names_in(folder: Path) -> list[str]:
@@ -269,12 +269,9 @@ async def get_all(
     recursive: bool = True,
     into: bool = False,
     verify: Verify = "auto",
-    resume: bool = True,
 ) -> tuple[Outcome, list[str]]:
     outcome, said = Outcome(), list[str]()
-    downloads = Downloads(
-        fetcher_of(tree, verify=verify, resume=resume), outcome, lambda _: None, said.append
-    )
+    downloads = Downloads(fetcher_of(tree, verify=verify), outcome, lambda _: None, said.append)
     await downloads.get(paths, to, into=into, recursive=recursive)
     return outcome, said
 
@@ -340,7 +337,6 @@ async def test_the_same_command_goes_on_in_the_same_place(tmp_path: Path, there:
         ("its time", "crc32", False),
         ("its time", "armed", True),
         ("its time", "verify=none", True),
-        ("nothing", "no resume", True),
     ],
 )
 async def test_what_is_here_is_skipped_if_it_is_the_same(
@@ -354,7 +350,7 @@ async def test_what_is_here_is_skipped_if_it_is_the_same(
     os.utime(local, (times, times + 10 * (change == "its time")))
     tree.crc_error = Armed("in flight") if how == "armed" else None
     verify: Verify = "none" if how == "verify=none" else "auto"
-    outcome, _ = await get_all(tree, b"/d/a", to=tmp_path, verify=verify, resume=how != "no resume")
+    outcome, _ = await get_all(tree, b"/d/a", to=tmp_path, verify=verify)
     assert ([one.wanted.name for one in outcome.fetched] == ["/d/a"]) is fetched
     assert (outcome.here == []) is fetched
     if fetched:

@@ -98,6 +98,10 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("mv", SOURCE, "/a"), "NEW"),
         (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
         (("ls", SOURCE, "/", "-o", "tlog=/proc/none/t"), "/proc/none/t"),
+        (("recover", SOURCE, "--all", "--force"), "--force"),
+        (("recover", "--json"), "--json"),
+        (("ls", "-t", SOURCE), "-t"),
+        (("install", "--root", "/x"), "--root"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
         (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
         (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),
@@ -109,6 +113,24 @@ def test_usage_errors_are_one_line_and_exit_1(
     code, line = complaint(capsys, *words)
     assert code == 1
     assert named in line
+
+
+def test_harmless_flags_of_0_2_are_ignored_and_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ran: list[argparse.Namespace] = []
+
+    def run(args: argparse.Namespace) -> int:
+        ran.append(args)
+        return 0
+
+    for (name, flag), advice in cli._GONE_FLAGS.items():
+        make_parser, _ = cli._COMMANDS[name]
+        monkeypatch.setitem(cli._COMMANDS, name, (make_parser, run))
+        assert cli.main([name, SOURCE, flag, "/a"]) == 0
+        assert f"mavftpfs: {flag} is gone, and is ignored: {advice}\n" in capsys.readouterr().err
+        assert flag not in make_parser(name).format_help()
+    assert len(ran) == len(cli._GONE_FLAGS)
 
 
 def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,11 +18,11 @@ COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
 
 
 @pytest.fixture
-def pieces(tmp_path: Path) -> dict[str, install.Piece]:
-    """What root would install, by the last part of its path and the one before."""
+def pieces() -> dict[str, install.Piece]:
+    """What root would install, by its path without the first /."""
     program = Path("/opt/py thon/100%/mavftpfs")
-    found = install.for_everybody(cli.whole_parser(), program, tmp_path)
-    return {piece.path.relative_to(tmp_path).as_posix(): piece for piece in found}
+    found = install.for_everybody(cli.whole_parser(), program)
+    return {piece.path.relative_to("/").as_posix(): piece for piece in found}
 
 
 def checked(*command: str | Path) -> str:
@@ -32,21 +32,20 @@ def checked(*command: str | Path) -> str:
     return result.stdout + result.stderr
 
 
-def test_a_packager_needs_not_be_root(
+def test_what_was_installed_is_removed_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    home = tmp_path / "home"
     for name in ("HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME"):
-        monkeypatch.setenv(name, str(home))
+        monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    root = tmp_path / "package"
-    assert cli.main(["install", "--root", str(root)]) == 0
-    assert f"{root}/etc/udev/rules.d/70-mavftpfs.rules" in capsys.readouterr().out
-    assert (root / "etc/udev/rules.d/70-mavftpfs.rules").is_file()
+    monkeypatch.setattr(install, "SYSTEMD_RUNS", tmp_path / "nowhere")
+    unit = tmp_path / "systemd/user/mavftpfs@.service"
+    assert cli.main(["install"]) == 0
+    assert f"wrote {unit}" in capsys.readouterr().out
+    assert unit.is_file()
     for _ in range(2):
-        assert cli.main(["install", "--root", str(root), "--remove"]) == 0
-        assert [path for path in root.rglob("*") if not path.is_dir()] == []
-    assert not home.exists(), "the packager's own files are not touched"
+        assert cli.main(["install", "--remove"]) == 0
+        assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
 
 
 def test_a_user_needs_no_root(tmp_path: Path) -> None:
