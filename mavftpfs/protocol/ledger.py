@@ -262,7 +262,7 @@ class Ledger:
         """Give up a transmission. The request goes out again, unless its answer is not wanted any more."""
         request.flying = False
         del self.flying[request.order]
-        if request.op is self.ghost or request.manner.once:
+        if request.op is self.ghost:
             self.forget(request)
         else:
             self.again.append(request)

@@ -31,8 +31,7 @@ class Manner(NamedTuple):
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
     offset. free_sends: transmissions before the waits double. slowest: seconds that the slowest server works
     at it, beyond the round trip in the family "work". slow_from: the transmission from which on so long is
-    waited, because a slow server carries out each one (servers.md 14.38). once: never repeated, and its loss
-    is not reported.
+    waited, because a slow server carries out each one (servers.md 14.38).
     """
 
     family: str
@@ -42,7 +41,6 @@ class Manner(NamedTuple):
     free_sends: int = 1
     slow_from: int = 1 << 30
     slowest: float = 0.0
-    once: bool = False
 
 
 FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, "work": 0.3}
@@ -50,7 +48,6 @@ FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, 
 
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
-LAST_WRITE_MANNER = WRITE_MANNER._replace(once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, slow_from=4, slowest=2.5)
 _PATH = Manner("path", same_seq=True, free_sends=4)
 _SLOW = Manner("slow", same_seq=True, slow_from=2, slowest=40.0)

@@ -14,7 +14,6 @@ from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.operations import BEYOND
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
-    LAST_WRITE_MANNER,
     MANNERS,
     WRITE_MANNER,
     Operation,
@@ -125,7 +124,7 @@ class WriteTransfer(Operation):
 
     Attributes:
         acked_bytes: written so far.
-        trailing: see `repeat_nothing`. paused: send nothing new; what is on its way is still waited for.
+        paused: send nothing new; what is on its way is still waited for.
 
     Fails with SessionLost (from the FtpNak that showed it), FtpNak, RequestTimeout, or as the source. What
     was not ACKed was then given back by on_unsent, ascending.
@@ -159,7 +158,6 @@ class WriteTransfer(Operation):
         self._rest: deque[tuple[int, bytes]] = deque()
         self._unanswered: dict[Request, None] = {}
         self.paused = False
-        self.trailing = False
         self._starved = False
         self._barren = 0
         self._usual: bytes | None = None  # the data of an ACK to a full chunk
@@ -169,18 +167,6 @@ class WriteTransfer(Operation):
     def wake(self) -> None:
         """The source has more."""
         self._starved = False
-
-    def repeat_nothing(self) -> None:
-        """Stop repeating, because the file is closed right behind what is on its way. Lost bytes stay lost
-        until `finish`."""
-        self.paused = self.trailing = True
-        for request in self._unanswered:
-            request.manner = LAST_WRITE_MANNER
-
-    @property
-    def all_out(self) -> bool:
-        """Whether nothing of what is unanswered waits to go out again."""
-        return all(request.flying for request in self._unanswered)
 
     @property
     def starved(self) -> bool:

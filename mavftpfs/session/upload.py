@@ -1,10 +1,10 @@
 """One upload: its callers, what it does next, and how it uses its turns. Layer: session.
 
 A file is made by CreateFile. Where OpenFileWO was seen to keep a file's content an upload can be interrupted
-at any time: Terminate right behind the window, and later OpenFileWO and what of that was not ACKed. Where it
-was seen to empty files that would begin the file anew, so the upload keeps the session until its source has
-nothing more. Where neither was seen yet, the upload is interrupted when another user waits, and reopening its
-file tells. What was ACKed before an ACKed Terminate is written.
+at any time: Terminate when its requests are answered, and later OpenFileWO. Where it was seen to empty files
+that would begin the file anew, so the upload keeps the session until its source has nothing more. Where
+neither was seen yet, the upload is interrupted when another user waits, and reopening its file tells. What
+was ACKed before an ACKed Terminate is written.
 """
 
 from __future__ import annotations
@@ -33,16 +33,9 @@ from mavftpfs.shared.sending import SendBuffer
 RETRY_AFTER = 5.0
 """Seconds after a failure of the link before it is tried again in the background."""
 
-STARVE = 1.5
-"""Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
-
-BRIEF_STARVE = 0.05
-"""STARVE for an upload that can be interrupted, while another user waits. A program that writes fast gives
-more sooner."""
-
-TRICKLE = 10.0
-"""Seconds with its file open after which BRIEF_STARVE holds for an upload that cannot be interrupted, too.
-Else a log that is written now and then would keep the session for ever."""
+STARVE = 0.5
+"""Seconds an upload keeps the session with nothing to send. PX4 frees buffers after 2 s, and a log that a
+program writes to each second must not keep the session for ever."""
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
@@ -201,14 +194,11 @@ class Upload(SessionUser):
         """Have a turn."""
         began = self._clock()
         try:
-            try:
-                session = await self._open(turn)
-                stop = await self._write(turn, session)
-                # All that was given by now is in the file that is closed next; what comes later is not.
-                finishers = list(self._finishers)
-                await self._close(session, stop)
-            finally:
-                self._end_transfer()
+            session = await self._open(turn)
+            stop = await self._write(turn, session)
+            # All that was given by now is in the file that is closed next; what comes later is not.
+            finishers = list(self._finishers)
+            await self._close(session, stop)
             if stop is Stop.STARVED:
                 self._complete(finishers)
         except MavftpfsError as error:
@@ -304,17 +294,15 @@ class Upload(SessionUser):
     # --- writing
 
     async def _write(self, turn: Turn, session: OpenSession) -> Stop:
-        """Write until there is a reason to stop. The session is open then.
-
-        A transfer is trailing when all its requests are out and none will be repeated: Terminate may follow
-        before their answers. It still waits for these, and `_close` ends it.
+        """Write until there is a reason to stop. The session is open then, and what was sent is ACKed unless
+        no answers come.
 
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         server, stop = self._server, None
-        # If a light user waits already, a short queue is half filled: the Terminate finds a place in it, and
-        # is not behind as many writes. Else a small read at 300 ms waits a round trip more.
+        # A light user that waits already gets the session after these requests. On a slow radio a whole queue
+        # of them takes a quarter of a second.
         use, queue = turn.rival_use, self._engine.traits.queue_limit
         transfer = WriteTransfer(
             session.id,
@@ -329,8 +317,7 @@ class Upload(SessionUser):
             await self._driver.start(transfer, server.wake, self._on_batch)
             stop = await self._watch(turn, session, transfer)
         finally:
-            if not transfer.trailing:  # else its last answers come while `_close` waits for its own
-                self._end_transfer()
+            self._end_transfer()
         error = transfer.error
         if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
             # Its requests for paths do not alternate with our writes: the next turns try again.
@@ -362,12 +349,10 @@ class Upload(SessionUser):
             if stalled and stop is None:
                 stop = Stop.YIELD
             transfer.paused = stop is not None
-            if stop is not None and (
-                transfer.idle or stalled or stop is Stop.ARMED or self._let_trail(transfer)
-            ):
+            if stop is not None and (transfer.idle or stalled or stop is Stop.ARMED):
                 return stop
             self._driver.kick()
-            await server.sleep(BRIEF_STARVE if transfer.starved else _OFTEN)
+            await server.sleep(_OFTEN)
         return None
 
     def _reason_to_stop(
@@ -379,31 +364,16 @@ class Upload(SessionUser):
         if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
         now, rival_use, resumable = self._clock(), turn.rival_use, self._may_interrupt
-        if transfer.starved:
-            makes_room = resumable or now - session.opened_at >= TRICKLE
-            least = BRIEF_STARVE if rival_use is not None and makes_room else STARVE
-            return Stop.STARVED if self.awaited or starved_for >= least else None
+        if transfer.starved and (self.awaited or starved_for >= STARVE):
+            return Stop.STARVED
         if rival_use is None:
             over = self._keeps_content and now - session.opened_at >= CHECKPOINT_EVERY
         else:
             over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
 
-    def _let_trail(self, transfer: WriteTransfer) -> bool:
-        """Have the Terminate go out right behind the last requests if that is right; return whether it does.
-
-        That is a round trip less for the user that waits. Servers carry requests out in order, and what gets
-        lost is sent when the file is open again. But where path operations cause refusals (NuttX) the answers
-        are waited for: what is refused would have to be sent again.
-        """
-        if not self._keeps_content or self._engine.traits.paths_block_writes:
-            return False
-        if transfer.all_out:
-            transfer.repeat_nothing()
-        return transfer.trailing
-
     def _end_transfer(self) -> None:
-        """The session is closed, or lost: what was not ACKed goes back to the source."""
+        """End the transfer: what was not ACKed goes back to the source."""
         transfer, self._transfer = self._transfer, None
         if transfer is not None:
             self._server.transfer = None
@@ -418,19 +388,14 @@ class Upload(SessionUser):
         A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). But that
         restart raises doubt, so the file is compared; and `_reopen` compares its size.
         """
-        transfer = self._transfer  # if any, its last requests are on their way
         self._server.require_open(session)
         try:
             ours = await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
-        self._end_transfer()
-        failed = None if transfer is None else transfer.error
-        if not ours or isinstance(failed, SessionLost):
-            raise SessionLost("the vehicle had closed the session before", by_server=True) from failed
+        if not ours:
+            raise SessionLost("the vehicle had closed the session before", by_server=True)
         self._source.check_point()
-        if isinstance(failed, REFUSALS):
-            raise failed
 
 
 def storage_root(path: bytes) -> bytes:

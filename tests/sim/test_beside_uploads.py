@@ -1,7 +1,6 @@
 """Who comes beside an upload: he sees his own file soon, and the upload ends with the right bytes.
 
-An upload that makes room sends its Terminate right behind its last requests. Whether OpenFileWO empties files
-is found out on the way; where it does, others wait, and are told in time.
+Whether OpenFileWO empties files is found out on the way; where it does, others wait, and are told in time.
 """
 
 from __future__ import annotations
@@ -169,7 +168,7 @@ async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int) -> N
     assert here.data(b"/d/log") == data
 
 
-# --- the Terminate goes out right behind the last requests
+# --- over bad links, and where an upload cannot go on
 
 LINK = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
 BAD = {
@@ -185,7 +184,6 @@ SMALL = 40_000
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_full_card_is_told_though_somebody_reads_all_the_time(profile: str) -> None:
-    """What was refused behind the Terminate was sent again, and refused again, for ever."""
     here = Rig(profile, FILES, LINK)
     here.card.capacity = here.card.used + 20_400
     async with here.connected():
@@ -254,7 +252,6 @@ async def test_of_two_uploads_none_waits_for_ever() -> None:
         # Who waited for the two others longer than service counts passed for a light user: each turn was as
         # long as opening the file again (347 s where it takes 176 by now).
         (3, replace(LINK, delay=0.3, loss=0.01, duplicate=0.02), 230),
-        # The place for the Terminate was kept free through whole turns: a fifth less was written.
         (2, replace(LINK, delay=0.15, loss=0.01), 46),
     ],
 )

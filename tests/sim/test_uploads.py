@@ -269,7 +269,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: s
         await trio.sleep(3)  # it told who it is
         source = MemorySource(content(2_000))
         upload = await start(connection, profile, source)
-        await trio.sleep(0.8)
+        await trio.sleep(0.5)
         assert connection.scheduler.server.session is not None
         assert source.todo.empty
         assert source.in_flight.empty

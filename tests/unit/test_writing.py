@@ -156,21 +156,6 @@ def test_pause_drains_and_resume_goes_on() -> None:
     assert not transfer.done  # the pause was no silence
 
 
-def test_what_is_closed_behind_is_not_repeated() -> None:
-    engine = make()
-    transfer, source = writing(engine, in_flight=4)
-    requests = sent(engine, 0.0)
-    transfer.repeat_nothing()
-    for one in (requests[0], requests[3]):
-        engine.receive(ack(one), 0.1)
-    while engine.in_flight:
-        engine.on_deadline(engine.next_deadline() or 0.1)
-        assert sent(engine, 1.0) == []
-    assert list(source.in_flight) == [(239, 717)]
-    transfer.finish()
-    assert source.todo.covers(239, 717)
-
-
 @pytest.mark.holds("rule 14.26")
 @pytest.mark.parametrize("piece", [(0, b""), (0, bytes(1 << 20)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
 def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, bytes]) -> None:
