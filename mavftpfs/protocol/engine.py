@@ -62,7 +62,7 @@ class Engine:
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
         on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
-            explains, and with the seconds since its request went out (0 where that is not known).
+            explains, and with the seconds since its request went out (None where that is not known).
         on_late: called with each ACK that nothing waits for any more, of a request that was repeated, taken
             back, or whose operation was cancelled, and with the time at which that went out first.
 
@@ -77,7 +77,7 @@ class Engine:
         flow: Flow,
         *,
         op_deadline: float = OP_DEADLINE,
-        on_unexplained: Callable[[Payload, float], None] = lambda reply, lateness: None,
+        on_unexplained: Callable[[Payload, float | None], None] = lambda reply, lateness: None,
         on_late: Callable[[Payload, float], None] = lambda reply, sent_at: None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)

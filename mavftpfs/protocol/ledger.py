@@ -9,6 +9,7 @@ the window, because the server still has it in its queue.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from itertools import islice
 
@@ -31,11 +32,11 @@ _MAX_REORDER = 64
 
 
 _MOST_REMEMBERED = 1024
-"""Requests whose late answers are remembered; a window holds fewer."""
+"""Requests whose late answers are remembered, and groups of requests whose time is; a window holds fewer."""
 
 
 class DuplicateDetector:
-    """Knows which answers are still to come, and when requests that change names went out.
+    """Knows which answers are still to come, and when requests went out.
 
     A request that was sent twice may be answered twice. Any further answer means that the network delivered
     a request, or its answer, more than once. So a request may be carried out once more at any time.
@@ -45,14 +46,11 @@ class DuplicateDetector:
 
     def __init__(self) -> None:
         self._expected: dict[int, tuple[int, float]] = {}  # how many more, and when it went out first
-        self._sent: dict[int, float] = {}
+        self._sent: deque[tuple[int, int, float]] = deque(maxlen=_MOST_REMEMBERED)
 
-    def on_sent(self, request: Request) -> None:
-        """Note when a request that changes names goes out under a new seq."""
-        self._sent.pop(request.seq + 1, None)
-        self._sent[request.seq + 1] = request.sent_at
-        if len(self._sent) > _MOST_REMEMBERED:
-            del self._sent[next(iter(self._sent))]
+    def on_sent(self, first: int, last: int, now: float) -> None:
+        """Note when requests with these seqs and those between them go out."""
+        self._sent.append((first, last, now))
 
     def on_over(self, request: Request, answered: int | None) -> None:
         """Note that a request is over. answered: the seq of the answer that came, if one did."""
@@ -74,9 +72,12 @@ class DuplicateDetector:
             self._expected[seq] = left - 1, sent_at
         return sent_at if left else None
 
-    def late_by(self, seq: int, now: float) -> float:
-        """Return the seconds since the request with this answer went out first; 0 if that is not known."""
-        return now - self._sent.get(seq, now)
+    def late_by(self, seq: int, now: float) -> float | None:
+        """Return the seconds since the request with this answer went out under this seq; None: unknown."""
+        for first, last, sent_at in reversed(self._sent):
+            if (seq - 1 - first) % (LAST_SEQ + 1) <= (last - first) % (LAST_SEQ + 1):
+                return now - sent_at
+        return None
 
 
 class Ghost(Operation):
@@ -150,8 +151,7 @@ class Ledger:
             table[seq + 1] = flying[order] = request
             order += 1
         self.order = order
-        if requests[0].manner.same_seq:
-            self.duplicates.on_sent(requests[0])
+        self.duplicates.on_sent(requests[0].seq, requests[-1].seq, now)
 
     def relaunch(self, request: Request, now: float) -> None:
         """Number a request that goes out again, and note that it is on its way."""
@@ -169,8 +169,8 @@ class Ledger:
         request.sent_at = now
         request.sends += 1
         self.order += 1
-        if request.manner.same_seq and not same_seq:
-            self.duplicates.on_sent(request)
+        if not same_seq:
+            self.duplicates.on_sent(request.seq, request.seq, now)
         self._table[request.seq + 1] = self.flying[request.order] = request
         request.flying = True
 

@@ -253,7 +253,7 @@ class Connection:
         self.engine.flow.alone = False
         self.scheduler.on_another_client(payload, newcomer=newcomer)
 
-    def _on_unexplained(self, reply: Payload, lateness: float) -> None:
+    def _on_unexplained(self, reply: Payload, lateness: float | None) -> None:
         self.scheduler.on_unexplained(reply, lateness)
 
     def _on_late(self, reply: Payload, sent_at: float) -> None:

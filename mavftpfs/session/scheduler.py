@@ -426,9 +426,9 @@ class Scheduler:
             self.server.abandon()  # what we read or write would be its file
         self.server.wake()
 
-    def on_unexplained(self, reply: Payload, lateness: float) -> None:
-        """An answer came that no request of ours explains. lateness: seconds since its request went out, 0 if
-        that is not known. An older open that was carried out once more may have put its file in the place of
+    def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
+        """An answer came that no request of ours explains. lateness: seconds since its request went out, None
+        if that is not known. An older open that was carried out once more may have put its file in the place of
         ours (MAVSDK); all else is no other file's."""
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING

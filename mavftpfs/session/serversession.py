@@ -170,7 +170,7 @@ class ServerSession:
         finally:
             if opcode == Opcode.CREATE_FILE:
                 late, now = self.doubt.late_copies, self.clock()
-                late.on_made(path, now)
+                late.on_changed(path, now)
                 # Where nothing can be renamed a file is not compared once more under its final name.
                 if self.engine.traits.rename_works is False and (self.session is None or self.session.resent):
                     late.on_maybe_under_way(path, now - began, now)
