@@ -427,9 +427,12 @@ class Scheduler:
         self.server.wake()
 
     def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
-        """An answer came that no request of ours explains. lateness: seconds since its request went out, None
-        if that is not known. An older open that was carried out once more may have put its file in the place of
-        ours (MAVSDK); all else is no other file's."""
+        """Doubt what was written, because an answer came that no request of this session explains.
+
+        lateness: seconds since its request went out, None if that is not known. If it is the answer of an
+        older open, the server executed that open once more, and may have put its file in the place of the
+        present one (MAVSDK): then what was read is in doubt, too.
+        """
         session = self.server.session
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         other = opens and session is not None and session.seq != reply.seq
