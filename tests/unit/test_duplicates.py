@@ -6,6 +6,7 @@ The first put everything in doubt for ten minutes (session.doubt): a card that p
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
@@ -75,9 +76,9 @@ def test_two_answers_to_two_requests() -> None:
 
 
 def test_how_late_a_copy_was_is_told() -> None:
-    heard: list[tuple[int, float]] = []
+    heard: list[tuple[int, float | None]] = []
 
-    def hear(reply: Payload, late: float) -> None:
+    def hear(reply: Payload, late: float | None) -> None:
         heard.append((reply.req_opcode, late))
 
     engine = Engine(random.Random(1), Flow(limit=8), on_unexplained=hear)
@@ -85,6 +86,14 @@ def test_how_late_a_copy_was_is_told() -> None:
     engine.receive(ack(request), 1.1)
     engine.receive(ack(request), 4.0)
     assert heard == [(Opcode.CREATE_DIRECTORY, 3.0)]
+    heard.clear()
+    stray = replace(ack(request), seq=request.seq + 500)
+    engine.receive(stray, 4.0)
+    reading(engine)
+    read = sent(engine, 5.0)
+    engine.receive(chunk(read[1], CONTENT), 5.1)
+    engine.receive(chunk(read[1], CONTENT), 5.25)
+    assert heard == [(Opcode.CREATE_DIRECTORY, None), (Opcode.READ_FILE, 0.25)]
 
 
 def read_twice(engine: Engine) -> tuple[Payload, Payload]:
