@@ -6,7 +6,6 @@ The first put everything in doubt for ten minutes (session.doubt): a card that p
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
@@ -87,7 +86,7 @@ def test_how_late_a_copy_was_is_told() -> None:
     engine.receive(ack(request), 4.0)
     assert heard == [(Opcode.CREATE_DIRECTORY, 3.0)]
     heard.clear()
-    stray = replace(ack(request), seq=request.seq + 500)
+    stray = ack(request)._replace(seq=request.seq + 500)
     engine.receive(stray, 4.0)
     reading(engine)
     read = sent(engine, 5.0)
