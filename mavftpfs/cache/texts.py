@@ -36,7 +36,7 @@ from mavftpfs.shared.errors import (
     ReadOnly,
     RemoteProtocolError,
 )
-from mavftpfs.shared.model import EntryKind, split
+from mavftpfs.shared.model import EntryKind, join, split
 
 LAST_ERROR = b"last_error.txt"
 MAX_TEXT = 4 << 20
@@ -185,6 +185,12 @@ class Texts(ABC, Generic[B]):
         """Return whether it is the path of a text."""
         parent, name = split(path)
         return parent == self.directory and (name in self.names or name == LAST_ERROR)
+
+    @property
+    def written(self) -> set[bytes]:
+        """The paths that programs write: the texts, and their directory, because editors try to make files
+        in it before they save (`note_other_file`)."""
+        return {self.directory, *(join(self.directory, name) for name in self.names)}
 
     async def stat(self, name: bytes) -> Stat:
         """Return attributes. Raises NotFound; else as show."""

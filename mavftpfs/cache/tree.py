@@ -140,6 +140,14 @@ class Tree:
             return self._draft_stat(remote, node.draft)
         return self._listed_stat(remote, await self._directories.find(remote))
 
+    def is_only_read(self, path: bytes) -> bool:
+        """Return whether nothing can ever be written at a path, whatever the vehicle does: below `@`
+        directories all but the texts, the directories of these and local files. No traffic."""
+        remote = self._remote(path)
+        if not is_virtual(remote) or self._local.owns(remote):
+            return False
+        return not any(remote in texts.written for texts in self._texts)
+
     def negative_valid_for(self, path: bytes) -> float:
         """Return for how many seconds a caller may remember that stat(path) raised NotFound.
 

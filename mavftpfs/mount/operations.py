@@ -52,6 +52,7 @@ log = logging.getLogger("mavftpfs.fuse")
 
 DOTS = (b".", b"..")
 """The kernel takes number and kind of these entries, and counts no lookup."""
+_WRITE_BITS = 0o222
 _ANY_DIRECTORY = Stat(EntryKind.DIRECTORY, 0, 0, 0.0)
 
 BLOCK_SIZE = 4096
@@ -482,6 +483,8 @@ class Operations(pyfuse3.Operations):
         kept = None if inode.path is None else self._set_by_users.get(inode.path)
         if kept is not None:
             kept.show(entry, found)
+        if inode.path is not None and self._tree.is_only_read(inode.path):
+            entry.st_mode &= ~_WRITE_BITS
         return entry
 
     def _gone(self, path: bytes) -> None:

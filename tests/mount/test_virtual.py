@@ -37,6 +37,25 @@ def test_rsync_gets_the_true_bytes(ardupilot: Mount, tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in (tmp_path / "@SYS").iterdir()} == FILLED
 
 
+def test_modes_show_what_can_be_written(ardupilot: Mount) -> None:
+    shown = {
+        "README.txt": "-rw-r--r--",
+        "@SYS": "dr-xr-xr-x",
+        "@SYS/uarts.txt": "-r--r--r--",
+        "@ROMFS": "dr-xr-xr-x",
+        "@PARAM": "drwxr-xr-x",  # editors try to make files in it before they save
+        "@PARAM/param.pck": "-r--r--r--",
+        "@PARAM/params.parm": "-rw-r--r--",
+        "@PARAM/last_error.txt": "-r--r--r--",
+        "@MISSION/mission.waypoints": "-rw-r--r--",
+    }
+    stat = ("stat", "-c", "%n %A", *shown)
+    told = dict(line.rsplit(" ", 1) for line in ardupilot.run(*stat, cwd=ardupilot.path).stdout.splitlines())
+    assert told == shown
+    ardupilot.run("chmod", "u+w", "@SYS/uarts.txt", cwd=ardupilot.path)
+    assert not (ardupilot.path / "@SYS/uarts.txt").stat().st_mode & 0o222
+
+
 PLAN = """QGC WPL 110
 0 0 0 16 0 0 0 0 0 0 0 1
 1 0 3 22 0 0 0 0 0 0 20 1

@@ -113,6 +113,9 @@ class FakeTree:
         if error is not None:
             raise error
 
+    def is_only_read(self, path: bytes) -> bool:
+        return path.startswith(b"/@")
+
     def kind_of(self, path: bytes) -> EntryKind:
         if path in self.files:
             return EntryKind.FILE
