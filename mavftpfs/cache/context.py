@@ -16,6 +16,7 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import Armed, FileBusy
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 from mavftpfs.shared.sameness import Listed, Sameness, compare
@@ -53,7 +54,7 @@ class Context:
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""
         if self.blocked:
-            raise Armed("the vehicle is armed: nothing is written in flight (when_armed=ro)")
+            raise Armed(readonly.ARMED)
 
     def require_changeable(self) -> None:
         """Raise Armed if nothing may be changed now, VehicleLost if nothing can be."""

@@ -27,6 +27,7 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.virtual import SnapshotHandle, VirtualTrees
 from mavftpfs.parameters.text import Problem
 from mavftpfs.protocol.payload import crc32
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     FtpNak,
     InvalidText,
@@ -223,7 +224,7 @@ class Texts(ABC, Generic[B]):
         """
         if name == LAST_ERROR:
             if write:
-                raise ReadOnly(f"{name.decode()} is only read")
+                raise ReadOnly(readonly.virtual(name))
             return SnapshotHandle(self.error_text)
         if write:
             try:

@@ -33,6 +33,7 @@ from mavftpfs.cache.texts import Access, Program, Texts
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
@@ -477,12 +478,14 @@ class Tree:
             raise NotADirectory(f"{parent!r} is not a directory")
 
     def _require_writable(self, remote: bytes) -> None:
-        if self._options.read_only or is_virtual(remote):
-            raise ReadOnly(f"{remote!r} is only read")
+        if self._options.read_only:
+            raise ReadOnly(readonly.by_option(remote))
+        if is_virtual(remote):
+            raise ReadOnly(readonly.virtual(remote))
 
     def _require_texts_writable(self) -> None:
         if self._options.read_only:
-            raise ReadOnly("what is here is only read")
+            raise ReadOnly(readonly.NOTHING_BY_OPTION)
         self._context.require_disarmed()
 
     def _texts_of(self, remote: bytes) -> Texts[Any] | None:

@@ -320,7 +320,7 @@ class _Setting:
                 await client.set_values(session, changes, self.bar)
         except MavftpfsError as error:
             for line in await client.last_error(session):
-                if line != str(error):
+                if not line.endswith(str(error)):
                     say(line)
             raise
         self.done += changes

@@ -19,10 +19,11 @@ import trio
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client import control
 from mavftpfs.client.mountpoint import XATTR_CRC32
-from mavftpfs.shared import errors
+from mavftpfs.client.status import is_read_only, told_by
+from mavftpfs.shared import errors, readonly
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import NotFound
-from mavftpfs.shared.model import ROOT, EntryKind, normalise, split
+from mavftpfs.shared.model import ROOT, EntryKind, is_virtual, normalise, split
 from mavftpfs.shared.readable import name_text
 
 WITHDRAWAL_TIME = 45.0
@@ -67,7 +68,6 @@ _ABOUT_TARGET = (
 
 
 _HINTS = {
-    errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
     errors.NotDeliveredYet: " (not all of it is on the vehicle yet)",
     errors.RequestTimeout: " (the vehicle does not answer)",
     errors.FileBusy: " (another program uses the vehicle's files, or the vehicle writes this one)",
@@ -104,6 +104,40 @@ async def _call(path: bytes, function: Callable[..., ResultT], *args: object) ->
         raise _translated(exc, path) from exc
 
 
+@dataclass(frozen=True, slots=True)
+class _Changes:
+    """The kernel's calls that change something in a mount: EROFS has several reasons, which the mount knows.
+
+    mountpoint: of the mount; root: the vehicle's directory that is `/` of the paths.
+    """
+
+    mountpoint: str
+    root: bytes
+
+    async def call(self, path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
+        """Have the kernel do something about a path, in a thread."""
+        try:
+            return await _call(path, function, *args)
+        except errors.ReadOnly as exc:
+            raise await self._explained(path, exc) from exc
+
+    async def _explained(self, path: bytes, error: errors.ReadOnly) -> errors.MavftpfsError:
+        ask = partial(told_by, self.mountpoint, STATUS_PATIENCE)
+        try:
+            status = await trio.to_thread.run_sync(ask, abandon_on_cancel=True)
+        except errors.MavftpfsError:
+            return error
+        if status.get("problem") or "vehicle" not in status:
+            return error
+        if status["read_only"]:
+            return errors.ReadOnly(readonly.by_option(path, self.mountpoint))
+        if is_read_only(status["vehicle"]):
+            return errors.Armed(readonly.ARMED)
+        if is_virtual(normalise(self.root + path)):
+            return errors.ReadOnly(readonly.virtual(path))
+        return errors.ReadOnly(readonly.by_vehicle(path))
+
+
 def _write_all(fd: int, data: bytes | memoryview, offset: int) -> None:
     """Write all of `data`. A write of which only the end is refused returns how much went before."""
     left = memoryview(data)
@@ -114,12 +148,13 @@ def _write_all(fd: int, data: bytes | memoryview, offset: int) -> None:
 
 @dataclass(slots=True)
 class MountedFile:
-    """An open file of a mount; see File. withdraw: asks the mount to take it back, and blocks; None if it
-    cannot."""
+    """An open file of a mount; see File. changes: makes the calls that write. withdraw: asks the mount to
+    take the file back, and blocks; None if it cannot."""
 
     path: bytes
     fd: int
     size: int
+    changes: _Changes
     withdraw: Callable[[], bool | None]
     writable: bool
 
@@ -129,17 +164,17 @@ class MountedFile:
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """As os.pwrite, until all of it is written."""
-        await _call(self.path, _write_all, self.fd, data, offset)
+        await self.changes.call(self.path, _write_all, self.fd, data, offset)
         self.size = max(self.size, offset + len(data))
         return len(data)
 
     async def fsync(self) -> None:
         """As os.fsync."""
-        await _call(self.path, os.fsync, self.fd)
+        await self.changes.call(self.path, os.fsync, self.fd)
 
     async def truncate(self, size: int) -> None:
         """As os.ftruncate."""
-        await _call(self.path, os.ftruncate, self.fd, size)
+        await self.changes.call(self.path, os.ftruncate, self.fd, size)
         self.size = size
 
     async def release(self) -> None:
@@ -147,7 +182,7 @@ class MountedFile:
         fd, self.fd = self.fd, -1
         if fd >= 0:
             with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
-                await _call(self.path, os.close, fd)
+                await self.changes.call(self.path, os.close, fd)
 
     async def take_back(self) -> bool | None:
         """Make the mount take back what it has not delivered, before a close makes it try again."""
@@ -185,6 +220,7 @@ class MountedFiles:
         self._mountpoint = os.fsencode(mountpoint)
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
+        self._changes = _Changes(mountpoint, self._root)
 
     def _place(self, path: bytes) -> bytes:
         remote = normalise(self._root + b"/" + path)
@@ -197,7 +233,7 @@ class MountedFiles:
 
     def _place_to_change(self, path: bytes) -> bytes:
         if self._read_only:
-            raise errors.ReadOnly(f"{path!r} is only read")
+            raise errors.ReadOnly(readonly.by_option(path))
         return self._place(path)
 
     async def stat(self, path: bytes) -> Stat:
@@ -249,13 +285,14 @@ class MountedFiles:
                 os.close(fd)
 
         try:
-            size = await _call(path, open_it)
+            size = await self._changes.call(path, open_it)
         except BaseException:  # the thread may still wait for the mount
             wanted = False
             with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
                 await trio.to_thread.run_sync(drop, abandon_on_cancel=True)
             raise
-        return MountedFile(path, opened[0], size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
+        withdraw, writable = partial(self._withdraw, place), bool(flags & os.O_RDWR)
+        return MountedFile(path, opened[0], size, self._changes, withdraw, writable)
 
     def _withdraw(self, place: bytes) -> bool | None:
         request = {"command": "withdraw", "path": os.fsdecode(place[len(self._mountpoint) :])}
@@ -266,7 +303,7 @@ class MountedFiles:
 
     async def truncate(self, path: bytes, size: int) -> None:
         """As os.truncate."""
-        await _call(path, os.truncate, self._place_to_change(path), size)
+        await self._changes.call(path, os.truncate, self._place_to_change(path), size)
 
     async def crc32(self, path: bytes) -> int:
         """Ask the vehicle."""
@@ -282,20 +319,20 @@ class MountedFiles:
     async def mkdir(self, path: bytes) -> None:
         """As os.mkdir."""
         with _about_parent(path):
-            await _call(path, os.mkdir, self._place_to_change(path))
+            await self._changes.call(path, os.mkdir, self._place_to_change(path))
 
     async def rmdir(self, path: bytes) -> None:
         """As os.rmdir."""
-        await _call(path, os.rmdir, self._place_to_change(path))
+        await self._changes.call(path, os.rmdir, self._place_to_change(path))
 
     async def unlink(self, path: bytes) -> None:
         """As os.unlink."""
-        await _call(path, os.unlink, self._place_to_change(path))
+        await self._changes.call(path, os.unlink, self._place_to_change(path))
 
     async def rename(self, old: bytes, new: bytes) -> None:
         """As os.rename."""
         try:
-            await _call(old, os.rename, self._place_to_change(old), self._place(new))
+            await self._changes.call(old, os.rename, self._place_to_change(old), self._place(new))
         except _ABOUT_TARGET as exc:
             raise type(exc)(_sentence(type(exc), new)) from exc
         except errors.InvalidMove as exc:

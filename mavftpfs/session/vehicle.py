@@ -32,6 +32,7 @@ from mavftpfs.link.messages import (
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import Armed, VehicleLost
 from mavftpfs.shared.readable import autopilot_name
 
@@ -270,7 +271,7 @@ class Vehicle:
         """Raise VehicleLost while requests that need the link should fail at once; writing: or Armed while
         nothing may be written (promise 9)."""
         if writing and not self.may_write:
-            raise Armed("the vehicle is armed: nothing is written in flight")
+            raise Armed(readonly.ARMED)
         if self.identity.standing is Standing.STRANGER:
             raise VehicleLost(_REPLACED)
         if self.lost(now):

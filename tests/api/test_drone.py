@@ -351,7 +351,7 @@ def test_options_are_a_mount_s(vehicle: SimVehicle, field: Field) -> None:
         assert drone.exists("/others")
         drone.mkdir("/", parents=True, exist_ok=True)
         drone.mkdir("/e", exist_ok=True)
-        with pytest.raises(OSError, match="only read") as caught:
+        with pytest.raises(OSError, match="because the option ro was given") as caught:
             drone.write_bytes("f", b"")
         assert caught.value.errno == errno.EROFS
     assert (card / "tlog").stat().st_size
@@ -403,7 +403,7 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
         mavftpfs.connect(str(mount.path), root="/d")
     with mavftpfs.connect(vehicle.source, ro=True) as drone:
         for change in (CALLS["bytes"], CALLS["mkdir"], CALLS["truncate"], CALLS["remove"], CALLS["rename"]):
-            with pytest.raises(OSError, match="is only read") as caught:
+            with pytest.raises(OSError, match="because the option ro was given") as caught:
                 change(drone, "")
             assert caught.value.errno == errno.EROFS
         assert drone.read_bytes("/f") == DATA

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
 from tests.support.mounts import command, mavftpfs, wait_until
+from tests.support.replies import nak
 from tests.support.trees import differing
 from tests.support.vehicles import HOST, SimVehicle, free_udp_port
 
@@ -120,3 +124,59 @@ def test_a_mount_of_one_of_several_vehicles_is_no_choice(
     assert "reading from vehicle 2" in command("ls", source)[1]
     command("mkdir", mount.path, "/new")
     command("rmdir", source, "/new", "-o", "target_system=2")
+
+
+# -- why nothing is changed -----------------------------------------------------------------------
+
+READ_ONLY = 30
+"""The errno."""
+
+
+def refusing(request: Payload) -> list[Payload] | None:
+    """Refuse what changes the card, as a vehicle does whose card is write-protected."""
+    if request.opcode in (Opcode.CREATE_FILE, Opcode.REMOVE_FILE, Opcode.CREATE_DIRECTORY, Opcode.RENAME):
+        return [nak(request, NakCode.FAIL_ERRNO, READ_ONLY)]
+    return None
+
+
+REASONS = {
+    "ro": ("/d/f", r"because the (option ro was given|mount on \S+ has the option ro)\n"),
+    "armed": ("/d/f", r"the vehicle is armed: nothing is written in flight \(when_armed=ro\)\n"),
+    "card": ("/d/f", r"the vehicle reports that its card is read-only\n|it is read-only \(opcode \d+, NAK 2"),
+    "virtual": ("/@SYS/uarts.txt", r"what the vehicle shows below @ can only be read\n"),
+}
+
+
+@pytest.mark.parametrize("mounted", [False, True], ids=["link", "mount"])
+@pytest.mark.parametrize("reason", REASONS)
+def test_a_refused_change_has_one_reason(reason: str, mounted: bool, field: Field, tmp_path: Path) -> None:
+    if reason == "card":
+        tree = MemoryTree()
+        tree.add(b"/d/f", b"old")
+        lying = field.lying(tree)
+        lying.server.answer = refusing
+        source = lying.source
+    else:
+        root = field.local("card")
+        (root / "d").mkdir()
+        (root / "d/f").write_text("old")
+        source = field.sim(root, "ardupilot5", ("--armed",) if reason == "armed" else ()).source
+    option = ("ro",) * (reason == "ro")
+    place = field.mount(source, *option).path if mounted else source
+    more = [f"-o{word}" for word in option if not mounted]
+    local = tmp_path / "local"
+    local.write_text("new")
+    path, expected = REASONS[reason]
+    for words in (
+        ["put", place, local, path],
+        ["rm", place, path],
+        ["mkdir", place, f"{path}2"],
+        ["mv", place, path, f"{path}2"],
+    ):
+        _, said = command(*words, *more, code=4 if words[0] == "put" else EXITS.get((reason, mounted), 1))
+        assert len(re.findall(expected, said)) == 1, said
+        assert len(re.findall("is armed|option ro|read-only|below @", said)) == 1, said
+
+
+EXITS = {("card", False): 2}
+"""Codes of changes that are refused by the vehicle itself."""

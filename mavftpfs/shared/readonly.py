@@ -1,0 +1,27 @@
+"""Why a change is refused as read-only (EROFS), in words. Layer: shared; pure."""
+
+from __future__ import annotations
+
+from mavftpfs.shared.readable import name_text
+
+ARMED = "the vehicle is armed: nothing is written in flight (when_armed=ro)"
+
+NOTHING_BY_OPTION = "nothing is changed, because the option ro was given"
+
+
+def by_option(path: bytes, mountpoint: str | None = None) -> str:
+    """Return the words for the option ro: of a mount, or of the command itself."""
+    whose = (
+        "the option ro was given" if mountpoint is None else f"the mount on {mountpoint} has the option ro"
+    )
+    return f"'{name_text(path)}' is not changed, because {whose}"
+
+
+def virtual(path: bytes) -> str:
+    """Return the words for a path below an `@` directory."""
+    return f"'{name_text(path)}' is not changed: what the vehicle shows below @ can only be read"
+
+
+def by_vehicle(path: bytes) -> str:
+    """Return the words for a refusal of the vehicle."""
+    return f"'{name_text(path)}' is not changed: the vehicle reports that its card is read-only"
