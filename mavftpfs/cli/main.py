@@ -119,6 +119,8 @@ def _run(words: list[str]) -> int:
 
 
 _GONE_FLAGS = {
+    ("sync", "--by-sysid"): "directories are named by unique ids",
+    ("sync", "--again"): "to fetch a log again, delete LOCAL/.mavftpfs-logs",
     ("get", "--no-resume"): "to fetch a file anew, delete it here first",
 }
 """Flags that are gone, and harmless: scripts that have them go on to run. Drop the table after 0.3."""
@@ -252,7 +254,6 @@ def _sync_parser(name: str) -> Parser:
         action="store_true",
         help="only compare what is here by CRC32 with the vehicle; exit code 1 if something differs",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
     instead.add_argument(
         "--watch",
         action="store_true",
@@ -263,12 +264,6 @@ def _sync_parser(name: str) -> Parser:
         dest="command",
         metavar="COMMAND",
         help="with --watch: run it for each log that came, with the file as its last argument",
-    )
-    parser.add_argument(
-        "--by-sysid", action="store_true", help="with --watch: name directories by system ids, not unique ids"
-    )
-    parser.add_argument(
-        "--again", action="store_true", help="with --watch: also what was brought before and was moved away"
     )
     _add_verify(parser)
     return parser

@@ -152,25 +152,21 @@ def sync(args: Args) -> int:
     wish = download.Wish(Path(args.local), place, choice, args.dry_run)
     if args.watch:
         return watching.watch(args, wish, lambda work: run(args, work, component))
-    if args.command is not None or args.again or args.by_sysid:
-        raise UsageError("--exec, --again and --by-sysid go with --watch")
+    if args.command is not None:
+        raise UsageError("--exec goes with --watch")
     outcome = download.Outcome()
-    tell = _ignore if args.json else _tell
     error: MavftpfsError | None = None
 
     async def work(downloads: download.Downloads) -> None:
         await (downloads.check(wish) if args.check else downloads.sync(wish))
 
     try:
-        _download(args, outcome, work, component, tell)
+        _download(args, outcome, work, component)
     except MavftpfsError as exc:
         if not outcome.wanted and not outcome.here:
             raise
         error = exc
-    if args.json:
-        print(json.dumps(outcome.facts(), indent=2))
-    else:
-        _print_outcome(args, outcome)
+    _print_outcome(args, outcome)
     _say_what_is_not_proven(outcome)
     if error is not None:
         say(f"{error}; {_here(outcome)}" if not args.check else str(error))
@@ -257,7 +253,6 @@ def _download(
     outcome: download.Outcome,
     function: Callable[[download.Downloads], Coroutine[Any, Any, None]],
     component: int | None,
-    tell: Callable[[Fetched], None] = _tell,
 ) -> None:
     """Bring files with progress on the screen; Ctrl-C says how many are here."""
     bar = Progress()
@@ -265,7 +260,7 @@ def _download(
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify)
         async with noting_losses(session, bar):
-            await function(download.Downloads(fetcher, outcome, tell, say))
+            await function(download.Downloads(fetcher, outcome, _tell, say))
 
     with _on_interrupt(lambda: _here(outcome)), shown(bar):
         with_session(args, work, component)

@@ -21,7 +21,7 @@ from mavftpfs.client.download import Wish
 from mavftpfs.client.files import Target
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.watch import Watch, WatchWish
-from mavftpfs.shared.errors import ExitCode, UsageError
+from mavftpfs.shared.errors import ExitCode
 from mavftpfs.shared.readable import readable, readable_time
 
 EXEC_LIMIT = 600.0
@@ -41,10 +41,8 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
     Raises:
         UsageError: LOCAL or the options are wrong.
     """
-    if args.json:
-        raise UsageError("--watch prints lines; leave out --json")
     hand_on = None if args.command is None else partial(run_command, args.command, limit=EXEC_LIMIT)
-    wanted = WatchWish(wish, args.verify, args.by_sysid, args.again)
+    wanted = WatchWish(wish, args.verify)
     bar = Progress()
 
     async def work(target: Target) -> None:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.brought import NAME as MEMORY
@@ -17,7 +16,6 @@ from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
     LocalDiskFull,
-    StillGrowing,
     Take,
     Wanted,
     known_time,
@@ -62,8 +60,7 @@ class Outcome:
     """How far a run came. place: the directory of logs; here: files that were here already.
 
     proofs: how the compared files were verified. failed: why a file, or the files of a directory, are not
-    here. grown: (bytes that were here, bytes that are here) for each file that is still growing. differing:
-    what `check` found. checked: this was a run of `check`.
+    here. differing: what `check` found. checked: this was a run of `check`.
     """
 
     place: bytes = b""
@@ -72,7 +69,6 @@ class Outcome:
     fetched: list[Fetched] = field(default_factory=list)
     proofs: dict[bytes, Proof] = field(default_factory=dict)
     failed: dict[bytes, MavftpfsError] = field(default_factory=dict)
-    grown: dict[bytes, tuple[int, int]] = field(default_factory=dict)
     differing: dict[bytes, str] = field(default_factory=dict)
     checked: bool = False
     finished: bool = False
@@ -87,42 +83,6 @@ class Outcome:
     def lacking(self) -> Counter[str]:
         """Why checksums were not compared although they should have been, and for how many files."""
         return Counter(proof.lacking for proof in self.proofs.values() if proof.lacking)
-
-    def facts(self) -> dict[str, Any]:
-        """Return what `sync --json` prints; the guide describes it."""
-        files = [(wanted, "here") for wanted in self.here] + [(wanted, "wanted") for wanted in self.wanted]
-        known = {wanted.remote for wanted, _ in files}
-        fetched = {one.wanted.remote: one for one in self.fetched}
-        moved = sum(one.size - one.resumed for one in self.fetched)
-        return {
-            "from": os.fsdecode(self.place),
-            "complete": self.complete,
-            "bytes_fetched": moved + sum(now - before for before, now in self.grown.values()),
-            "files": [self._facts(wanted, state, fetched.get(wanted.remote)) for wanted, state in files],
-            "errors": [named(path, error) for path, error in self.failed.items() if path not in known],
-        }
-
-    def _facts(self, wanted: Wanted, state: str, fetched: Fetched | None) -> dict[str, Any]:
-        why = self.failed.get(wanted.remote)
-        size, resumed = wanted.size, wanted.size if state == "here" else wanted.begun
-        if fetched is not None:
-            state, size, resumed = "fetched", fetched.size, fetched.resumed
-        if wanted.remote in self.grown:
-            state, (resumed, size) = "growing", self.grown[wanted.remote]
-        elif why is not None:
-            state = "failed"
-        proof = self.proofs.get(wanted.remote)
-        return {
-            "path": os.fsdecode(wanted.remote),
-            "local": str(wanted.local),
-            "size": size,
-            "mtime": wanted.mtime,
-            "state": "differs" if wanted.remote in self.differing else state,
-            "resumed_at": resumed,
-            "proof": None if proof is None else proof.words,
-            "not_proven": (None if proof is None else proof.lacking) or None,
-            "error": self.differing.get(wanted.remote) or (None if why is None else str(why)),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,13 +257,10 @@ class Downloads:
         progress.plan(len(wanted), sum(one.size for one in wanted))
         timeouts = 0
         for one in wanted:
-            begun = one.begun
             try:
                 fetched = await self.fetcher.fetch(one)
             except MavftpfsError as exc:
                 timeouts = timeouts + 1 if isinstance(exc, RequestTimeout) else 0
-                if isinstance(exc, StillGrowing):
-                    self.outcome.grown[one.remote] = begun, exc.came
                 self.fail(one.remote, exc, one.name, alone=alone or timeouts == MAX_TIMEOUTS)
             else:
                 timeouts = 0

@@ -46,13 +46,10 @@ HandOn = Callable[[Path], Awaitable[str]]
 
 @dataclass(frozen=True, slots=True)
 class WatchWish:
-    """What is to be brought. logs: as `sync` has it; by_system: directories are named by system ids; again:
-    also bring logs that were brought before and are not here any more."""
+    """What is to be brought. logs: as `sync` has it."""
 
     logs: Wish
     verify: Verify = "auto"
-    by_system: bool = False
-    again: bool = False
 
 
 class Watch:
@@ -84,7 +81,6 @@ class Watch:
         self._names: dict[int, str] = {}
         self._target: Target | None = None
         self._same_heads: set[tuple[str, str]] = set()
-        self._done_here: set[tuple[str, str]] = set()
         self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
         self._complaints: dict[str, str] = {}
         with local_disk(self._local):
@@ -240,7 +236,7 @@ class Watch:
     async def _look(self, system: int, contact: Contact, session: Session) -> None:
         """List the logs, and tell the policy which are new."""
         name = self._names[system] = await contact.identity() or f"system-{system}"
-        local = self._local / (str(system) if self._wish.by_system else name)
+        local = self._local / name
         self._complain(f"name of {system}", f"vehicle {system} is {name}; its logs go into {local}")
         await session.files.refresh()
         self._logs[system] = {}
@@ -276,8 +272,6 @@ class Watch:
         key = name, os.fsdecode(session.on_vehicle(log.remote))
         known = self._memory.of(*key)
         if known is None or known.size != log.size or not known.proven:
-            return False
-        if self._wish.again and key not in self._done_here and not log.here:
             return False
         if log.mtime is not None and known.mtime is not None:
             return log.mtime == known.mtime
@@ -334,7 +328,6 @@ class Watch:
             self._say(f"vehicle {system}: {wanted.name} is here, not proven: {proof.lacking}")
             return
         self._policy.fetched(system, log)
-        self._done_here.add(key)
         self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}{fetched.kept_words}")
         if self._hand_on is not None:
             self._to_hand_on.send_nowait(brought)

@@ -98,6 +98,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("mv", SOURCE, "/a"), "NEW"),
         (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
         (("ls", SOURCE, "/", "-o", "tlog=/proc/none/t"), "/proc/none/t"),
+        (("sync", SOURCE, "/tmp", "--json"), "--json"),
         (("recover", SOURCE, "--all", "--force"), "--force"),
         (("recover", "--json"), "--json"),
         (("ls", "-t", SOURCE), "-t"),
