@@ -176,7 +176,7 @@ VALUES: Values = {
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
     "read_mode": Value(Choice("window", "burst"), "window or burst"),
     "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
-    "bwlimit": Value(size(100, _SIZE_MAX), "bytes per second that we may cause on the link"),
+    "bwlimit": Value(size(100, _SIZE_MAX), "use about so many bytes per second of the link"),
     "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
     "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),

@@ -20,7 +20,7 @@ from math import inf
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.pathgate import PathGate
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload, reply_of, split_run
 from mavftpfs.protocol.requests import Operation, Request, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
@@ -290,7 +290,7 @@ class Engine:
                 self.remove(op)
         if starved:
             self.flow.on_starved()
-        if self.flow.budget is not None and self.flow.budget.exhausted:
+        if self.flow.limited:  # it is not the vehicle that is silent
             for op in self._ops:
                 op.progress_at = max(op.progress_at, now)
         return wires
@@ -312,7 +312,7 @@ class Engine:
         urgent = op.urgent
         in_flight = len(ledger.flying) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
-        left = room
+        left, size = room, 0
         while left > 0:
             again = ledger.take_again(op, now) if ledger.again else None
             requests = op.next_requests(left, now) if again is None else [again]
@@ -320,9 +320,10 @@ class Engine:
                 break
             wires += self._transmit(requests, now)
             left -= len(requests)
+            size += sum(MAX_DATA if urgent else request.size for request in requests)
         if sent := room - left:
             self.stats.requests += sent
-            self.flow.on_sent(sent, now)
+            self.flow.on_sent(sent, size, now)
         return left > 0
 
     def _waits_for_lone(self, op: Operation) -> bool:

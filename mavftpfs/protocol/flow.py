@@ -21,15 +21,15 @@ pauses some answers are kept in the link's queue, and while the card pauses, req
 pace.
 
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
-stand `pacing`, for servers that queue five requests, and `budget`, for the user's `bwlimit=`."""
+stands `pacing`, for servers that queue five requests. The user's `bwlimit=` is an upper limit of the pace."""
 
 from __future__ import annotations
 
 from collections import deque
 from math import inf, sqrt
 
-from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.pacing import Pacer
+from mavftpfs.protocol.payload import MAX_DATA
 
 # The table of constants: all that decide the window. Requests, unless a unit is given.
 
@@ -124,6 +124,9 @@ BRIDGE_FROM = 0.03
 """Seconds: with a shorter round trip there is no reserve and no bridge. The requests in a server's buffer
 last for so long."""
 
+OVERHEAD = 58
+"""Bytes that a request and its answer take on the link besides the data that one of them carries."""
+
 
 class Flow:
     """The in-flight window.
@@ -131,7 +134,7 @@ class Flow:
     Args:
         serial: the way begins with a serial port.
         limit: the most requests that may ever be in flight, None for the default.
-        budget: the user's limit in bytes per second.
+        bwlimit: bytes per second that requests and answers may take together, about.
 
     Attributes:
         window: requests that may be in flight. cap: the widest window now.
@@ -143,9 +146,9 @@ class Flow:
     """
 
     def __init__(
-        self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
+        self, *, serial: bool = False, limit: int | None = None, bwlimit: float | None = None
     ) -> None:
-        self.budget = budget
+        self._ceiling = inf if bwlimit is None else bwlimit / (OVERHEAD + MAX_DATA)  # full requests a second
         self.alone = False
         self.loss = 0.0
         self._depth = DEPTH_SERIAL if serial else DEPTH
@@ -175,7 +178,7 @@ class Flow:
         # The pace.
         self._pace = inf  # requests that may go out in a second
         self._tokens, self._tokens_at = float(DEPTH), 0.0
-        self._blocked = False
+        self._blocked, self._lent = False, 0.0  # _lent: tokens that an urgent request need not wait for
 
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
@@ -191,11 +194,9 @@ class Flow:
     def begin(self) -> None:
         """Begin to look at all operations: `room` is called for each that has something to send."""
         self._hurried = self._blocked = False
-        self._wake = inf
+        self._lent, self._wake = 0.0, inf
         if self._pacer is not None:
             self._pacer.begin()
-        if self.budget is not None:
-            self.budget.begin()
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
@@ -208,17 +209,26 @@ class Flow:
             room += int(self._beyond(now, paced) * self._rate)
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
-        elif room > 0 and not urgent and self._pace < inf:
-            earned = (now - self._tokens_at) * self._pace
-            self._tokens = min(max(self._depth, self._pace * TICK), self._tokens + earned)
+        pace = self._highest_pace()
+        if room > 0 and pace < inf and (not urgent or pace == self._ceiling):
+            earned = (now - self._tokens_at) * pace
+            self._tokens = min(max(self._depth, pace * TICK), self._tokens + earned)
             self._tokens_at = now
-            self._blocked = self._tokens < room
-            room = min(room, int(self._tokens))
-        if self.budget is None or room <= 0:
-            return room
-        allowed = self.budget.room(now, urgent=urgent)
-        self.starved |= allowed < room
-        return min(allowed, room)
+            tokens = self._tokens + (DEPTH if urgent else 0)
+            if tokens < room:
+                self._blocked, self._lent = True, max(self._lent, tokens - self._tokens)
+                self.starved |= self.limited
+            room = min(room, max(0, int(tokens)))
+        return room
+
+    def _highest_pace(self) -> float:
+        """Return how many requests may go out in a second. A Pacer has a pace of its own."""
+        return self._ceiling if self._pacer is not None else min(self._pace, self._ceiling)
+
+    @property
+    def limited(self) -> bool:
+        """Whether requests wait for `bwlimit=`."""
+        return self._blocked and self._highest_pace() == self._ceiling
 
     def _room_beside_pacer(
         self, pacer: Pacer, room: int, in_flight: int, now: float, paced: bool, urgent: bool
@@ -248,23 +258,23 @@ class Flow:
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
-        if self.budget is not None and self.budget.next_room_at() < inf:
-            return self.budget.next_room_at()  # before that, nothing goes out in any case
-        if self._pacer is not None:
+        if self._pacer is not None and (not self._blocked or self._pacer.urgent_at > -inf):
             return self._pacer.next_at()
-        if not self._blocked or self._tokens >= 1.0:
+        lacking = 1.0 - self._tokens - self._lent
+        if not self._blocked or lacking <= 0.0:
             return self._wake
-        return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace + 1e-6)
+        return min(self._wake, self._tokens_at + lacking / self._highest_pace() + 1e-6)
 
     # --- what happens
 
-    def on_sent(self, count: int, now: float) -> None:
-        """Note that so many requests, at least one, go out. There was room for them."""
-        if self.budget is not None:
-            self.budget.on_sent(count)
+    def on_sent(self, count: int, size: int, now: float) -> None:
+        """Note that so many requests, at least one, go out. There was room for them. size: bytes of data that
+        they and their answers carry, at most."""
         if self._pacer is not None:
             self._pacer.on_sent(count, now)
-        self._tokens = max(-float(DEPTH), self._tokens - count)
+        by_size = self._highest_pace() == self._ceiling < inf
+        cost = (count * OVERHEAD + size) / (OVERHEAD + MAX_DATA) if by_size else count
+        self._tokens = max(-float(DEPTH), self._tokens - cost)
 
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""

@@ -64,6 +64,7 @@ class Pacer:
     Attributes:
         rate: requests per second that seem to be survived; None while nothing is known.
         window: the most that may be in flight.
+        urgent_at: when an urgent request that waits may go out; -inf if none waits.
     """
 
     def __init__(self, queue: int, limit: int) -> None:
@@ -73,7 +74,7 @@ class Pacer:
         self.window = queue
         self.blocked = False
         self._sent_at = -inf
-        self._urgent_at = -inf
+        self.urgent_at = -inf
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
         self._usual_loss = 0.0
@@ -96,7 +97,7 @@ class Pacer:
 
     def begin(self) -> None:
         """See Flow.begin."""
-        self.blocked, self._urgent_at = False, -inf
+        self.blocked, self.urgent_at = False, -inf
 
     def room(self, in_flight: int, now: float) -> int:
         """Return how many requests may go out now although the server's queue may be full."""
@@ -114,13 +115,13 @@ class Pacer:
         if self.rate is None or in_flight >= self.window:
             return 0
         due = self._sent_at + self.queue / self._best
-        self._urgent_at = due if now < due else -inf
+        self.urgent_at = due if now < due else -inf
         return int(now >= due)
 
     def next_at(self) -> float:
         """Return when there will be room for one that has to wait for its time; inf if none has to."""
-        if self._urgent_at > -inf:
-            return self._urgent_at
+        if self.urgent_at > -inf:
+            return self.urgent_at
         if self.rate is None or not self.blocked:
             return inf
         return self._tokens_at + (1.0 - self._tokens) / self.rate + 1e-6

@@ -25,7 +25,6 @@ from mavftpfs.link.messages import (
     Address,
 )
 from mavftpfs.link.peers import names_of
-from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import Payload
@@ -71,8 +70,8 @@ _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written
 class ConnectOptions:
     """How to talk to the vehicle. 0 = find out; seconds for times.
 
-    bwlimit: bytes per second that we may cause on the link (see protocol.budget). With it nothing is read by
-    bursts, whose pace is the server's.
+    bwlimit: bytes per second that we cause on the link, about. With it nothing is read by bursts, whose pace
+    is the server's.
     """
 
     target_system: int = 0
@@ -134,9 +133,7 @@ class Connection:
             on_double=self._move_away,
             on_doubt=self._on_doubt,
         )
-        signature = 0 if options.signing_key is None else SIGNATURE
-        budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
-        flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
+        flow = Flow(serial=link.is_serial, limit=options.window, bwlimit=options.bwlimit)
         self.engine = Engine(
             rng,
             flow,
@@ -149,7 +146,7 @@ class Connection:
             self.driver,
             clock=clock,
             op_deadline=options.op_deadline,
-            read_mode=options.read_mode if budget is None else "window",
+            read_mode=options.read_mode if options.bwlimit is None else "window",
             chunk=options.chunk,
         )
         self.store = Store(self.scheduler)

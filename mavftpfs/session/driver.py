@@ -85,7 +85,6 @@ class Driver:
         self._to_begin: set[Operation] = set()  # when the silence is over
         self._silences = 0
         self._changed = trio.lowlevel.ParkingLot()  # what is under way, or silence, ended
-        self._budget = engine.flow.budget
         self._gathered: list[bytes] = []
 
     async def pump(self) -> None:
@@ -214,8 +213,6 @@ class Driver:
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
-        if self._budget is not None:
-            self._budget.spend(len(frame), self._clock())
         self.link.send_nowait([frame])
 
     def _handle(self, messages: list[Message], now: float, sender: NetAddress | None) -> None:
@@ -247,9 +244,6 @@ class Driver:
         if not wires:
             return
         self._gathered = []
-        if self._budget is not None:
-            for wire in wires:
-                self._budget.on_reply(wire, now)
         self.vehicle.identity.heard(now)
         if self.vehicle.identity.standing is not Standing.TRUSTED:
             return  # requests are repeated when the vehicle has told its id
@@ -302,9 +296,6 @@ class Driver:
         payloads = self.engine.outgoing(now)
         if not payloads:
             return
-        if self._budget is not None:
-            for wire in payloads:
-                self._budget.on_request(wire, now)
         if self._trace is not None:
             for wire in payloads:
                 self._trace(now, "request", wire)
