@@ -64,6 +64,9 @@ _IDENTITY_PERIOD = 0.5
 _TIME_TRIES = 5
 _SELDOM = 5.0
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
+_TELLS_NO_ID = (
+    "%d/%d does not tell its unique id any more: nothing is read from it or written to it until it does"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +135,7 @@ class Connection:
             on_refusal=partial(self._tell, "arming refused"),
             on_double=self._move_away,
             on_doubt=self._on_doubt,
+            patience=options.op_deadline,
         )
         flow = Flow(serial=link.is_serial, limit=options.window, bwlimit=options.bwlimit)
         self.engine = Engine(
@@ -325,12 +329,10 @@ class Connection:
                     asked, asked_at = asked + 1, self.clock()
                 await trio.sleep(_IDENTITY_PERIOD)
                 in_doubt = in_doubt or self._doubted.is_set()
+                expired = identity.expire(self.clock())
                 if identity.standing is Standing.STRANGER and not warned:
                     warned = True
-                    log.warning(_ANOTHER, *vehicle.address)
-                elif in_doubt and identity.heard_since(asked_at):
-                    identity.unanswered()
-                    driver.kick()
+                    log.warning(_TELLS_NO_ID if expired else _ANOTHER, *vehicle.address)
             await self._doubted.wait()
             self._doubted = trio.Event()
             in_doubt = True

@@ -268,7 +268,7 @@ class Driver:
                 self._impostor_at = self.second = None
                 if self.peer is not None:
                     log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
-                    self.vehicle.identity.moved(now)
+                    self.vehicle.identity.reopened(now)
             self._send_to(sender)
         return True
 

@@ -46,10 +46,7 @@ ABSENCE = 2.5
 """Seconds of silence in which a vehicle may have restarted, or have been exchanged for another: no autopilot
 starts faster. (A cable that is moved reopens the link, which is told.)"""
 
-MOST_UNANSWERED = 20
-"""Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one."""
-
-_REPLACED = "another vehicle answers in place of the one that was mounted"
+_REPLACED = "another vehicle answers, or the one that was mounted does not tell its unique id any more"
 _SILENT = "the vehicle is silent; waiting for its heartbeat"
 
 _OPCODE_INDEX = 3
@@ -77,11 +74,10 @@ class Identity:
     | what happens | standing |
     |---|---|
     | it was silent, it restarted, or the link was reopened | DOUBTED, if it ever told its id |
-    | it answers from another network address | DOUBTED |
+    | it answers from another network address | the same |
     | it tells the id that is known, or the first one | TRUSTED |
     | it tells another id | STRANGER |
-    | while DOUBTED it is heard, and answers none of MOST_UNANSWERED questions | TRUSTED: not all tell an id |
-    | the same, at another network address, and it told its id before | STRANGER |
+    | while DOUBTED it is heard, and does not tell its id for `patience` seconds | STRANGER |
 
     Attributes:
         standing: of the one that answers now. Only a trusted one is asked for files.
@@ -89,18 +85,18 @@ class Identity:
         heard_at: when it was heard last.
     """
 
-    def __init__(self, on_doubt: Callable[[], None], on_trusted: Callable[[bool], None]) -> None:
+    def __init__(
+        self, on_doubt: Callable[[], None], on_trusted: Callable[[bool], None], patience: float
+    ) -> None:
         """on_doubt: it may have restarted, or be another one: it is to be asked. on_trusted: called with
         whether it was a stranger meanwhile: it is trusted again."""
+        self._patience = patience
         self.standing = Standing.TRUSTED
         self._on_doubt, self._on_trusted = on_doubt, on_trusted
         self._known: AutopilotVersion | None = None  # its id, once it was told
         # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
         self._strange = False
-        # It answers from another network address. If it does not tell its id there, it is a stranger: else
-        # any sender that keeps silent about its id could take the vehicle's place (promise 1).
-        self._moved = False
-        self._unanswered = 0  # questions, since it is doubted
+        self._doubted_from: float | None = None  # when it was first heard while it was doubted
         self.heard_at: float | None = None
         self._back_at = self.left_at = -inf  # the end of the last absence, and its beginning
 
@@ -116,17 +112,15 @@ class Identity:
         if before is not None and now - before > ABSENCE:
             self.left_at, self._back_at = before, now
             self.doubt()
+        if self.standing is Standing.DOUBTED and self._doubted_from is None:
+            self._doubted_from = now
 
     def reopened(self, now: float) -> None:
-        """The link was: it may have been away for less than that, or be another one."""
+        """The link was, or it answers from another network address: it may have been away for less than that,
+        or be another one."""
         if self.heard_at is not None:
             self.left_at, self._back_at = self.heard_at, now
         self.doubt()
-
-    def moved(self, now: float) -> None:
-        """It answers from another network address. If it ever told its id, it has to tell it there."""
-        self.reopened(now)
-        self.standing, self._moved, self._unanswered = Standing.DOUBTED, True, 0
 
     def away_since(self, when: float, now: float) -> bool:
         """Return whether it was away after that, so that it may have restarted."""
@@ -141,8 +135,7 @@ class Identity:
         """It may be another one since now: it restarted, or was silent."""
         if self._known is not None and self.standing is not Standing.DOUBTED:
             self._strange |= self.standing is Standing.STRANGER
-            self.standing = Standing.DOUBTED
-            self._unanswered = 0
+            self.standing, self._doubted_from = Standing.DOUBTED, None
         self._on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
@@ -155,15 +148,14 @@ class Identity:
         self._trust()
         return True
 
-    def unanswered(self) -> None:
-        """It was heard, and did not tell its id though it was asked."""
-        self._unanswered += 1
-        if self._unanswered < MOST_UNANSWERED or self.standing is not Standing.DOUBTED:
-            return
-        if self._moved and self._known is not None:
+    def expire(self, now: float) -> bool:
+        """If it was heard for long and does not tell its id, take it for a stranger; return whether it is one
+        since now."""
+        since = self._doubted_from
+        late = self.standing is Standing.DOUBTED and since is not None and now - since > self._patience
+        if late:
             self._is_stranger()
-        else:
-            self._trust()
+        return late
 
     def _is_stranger(self) -> None:
         was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
@@ -174,7 +166,7 @@ class Identity:
         if self.standing is Standing.TRUSTED:
             return
         strange = self._strange or self.standing is Standing.STRANGER
-        self.standing, self._strange, self._moved = Standing.TRUSTED, False, False
+        self.standing, self._strange = Standing.TRUSTED, False
         self._on_trusted(strange)
 
 
@@ -196,7 +188,7 @@ class Vehicle:
     write_armed: write in flight, too.
     own: our address; replies to anyone else are another FTP client's. on_another_client: called with each
     payload of its, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
-    on_double: somebody else uses our address. on_doubt: see Identity.
+    on_double: somebody else uses our address. on_doubt, patience: see Identity.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
@@ -214,6 +206,7 @@ class Vehicle:
     on_refusal: Callable[[], None] = lambda: None
     on_double: Callable[[], None] = lambda: None
     on_doubt: Callable[[], None] = lambda: None
+    patience: float = 30.0
     address: Address | None = None
     heartbeat: Heartbeat | None = None
     heartbeat_at: float | None = None
@@ -234,7 +227,7 @@ class Vehicle:
     _timed_out: bool = False
 
     def __post_init__(self) -> None:
-        self.identity = Identity(self.on_doubt, self._on_trusted)
+        self.identity = Identity(self.on_doubt, self._on_trusted, self.patience)
         self.may_write = self.write_armed
 
     @property

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion
-from mavftpfs.session.vehicle import ABSENCE, MOST_UNANSWERED, Identity, Standing, is_another
+from mavftpfs.session.vehicle import ABSENCE, Identity, Standing, is_another
 
 pytestmark = pytest.mark.holds("fault another vehicle")
 
 VEHICLE = Address(1, 1)
+PATIENCE = 30.0
 
 
 def version(uid: int = 0, uid2: int = 0) -> AutopilotVersion:
@@ -27,7 +28,7 @@ class Watched(Identity):
     def __init__(self) -> None:
         self.doubts = 0
         self.trusted: list[bool] = []
-        super().__init__(self._count, self.trusted.append)
+        super().__init__(self._count, self.trusted.append, PATIENCE)
 
     def _count(self) -> None:
         self.doubts += 1
@@ -73,8 +74,6 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity.told(version(1))
     assert not identity.told(version(2))
     assert identity.doubts == 1
-    for _ in range(2 * MOST_UNANSWERED):
-        identity.unanswered()
     assert standing(identity) is Standing.STRANGER
     identity.doubt()  # it went: the next one may be ours
     assert standing(identity) is not Standing.STRANGER
@@ -85,15 +84,30 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
 
 
 @pytest.mark.parametrize("silences", [False, True])
-def test_a_vehicle_that_is_heard_but_tells_no_id_is_believed_in_the_end(silences: bool) -> None:
-    """Silences between the questions do not make the count begin again."""
+def test_a_vehicle_that_told_its_id_and_does_not_tell_it_again_is_a_stranger_in_the_end(
+    silences: bool,
+) -> None:
+    """Silences between the questions do not make the time begin again; before it is heard no time runs."""
     identity = Watched()
+    identity.heard(0.0)
     identity.told(version(1))
     identity.doubt()
-    for beat in range(MOST_UNANSWERED):
-        assert standing(identity) is not Standing.TRUSTED
-        if silences:
-            identity.heard(beat * 2 * ABSENCE)
-        identity.unanswered()
+    assert not identity.expire(1000.0)
+    for beat in range(1000, 1000 + int(PATIENCE), 3 if silences else 1):
+        identity.heard(float(beat))
+        assert not identity.expire(float(beat))
+        assert standing(identity) is Standing.DOUBTED
+    assert identity.expire(1000.1 + PATIENCE)
+    assert standing(identity) is Standing.STRANGER
+    assert not identity.expire(1001.0 + PATIENCE), "that is told once"
+    assert identity.told(version(1))
+    assert identity.trusted == [True]
+
+
+def test_one_that_never_told_an_id_need_not_tell_one() -> None:
+    identity = Watched()
+    identity.heard(0.0)
+    identity.reopened(10.0)
+    identity.heard(10.0)
+    assert not identity.expire(10.0 + 2 * PATIENCE)
     assert standing(identity) is Standing.TRUSTED
-    assert identity.trusted == [False]
