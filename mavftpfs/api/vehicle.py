@@ -42,9 +42,6 @@ logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
 PathLike = str | bytes | os.PathLike[str]
 """A path on the vehicle. A relative one begins at the root."""
 
-NEVER_LOCAL = ""
-"""local=: a mount keeps editors' swap files in memory, but a program's files are meant for the card."""
-
 
 @dataclass(frozen=True, slots=True)
 class Entry:
@@ -488,7 +485,8 @@ async def connect(source: str, *, use_mount: bool = True, **options: object) -> 
         opened. UsageError (a ValueError): source or an option is wrong; the text names it.
     """
     with translated():
-        target = target_of(source, options_of({"local": NEVER_LOCAL, **options}))
+        # A mount keeps editors' swap files in memory, but a program's files are meant for the card.
+        target = target_of(source, replace(options_of(options), local=()))
         if target.mount is not None and not use_mount:
             raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
         with open_sinks(target.options, debug=False, tell=log.info) as sinks:

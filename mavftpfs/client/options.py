@@ -45,10 +45,8 @@ class Options:
     cache_size: int = 64 << 20
     dirty_max: int | None = None
     spool_max: int = 1 << 30
-    rmw_max: int | None = None
     verify_max: int = 4 << 20
     when_armed: Literal["ro", "ok"] = "ro"
-    force: bool = False
     inplace: bool = False
     local: tuple[str, ...] = DEFAULT_LOCAL
     tlog: str | None = None
@@ -135,14 +133,6 @@ def remote_path(text: str) -> bytes:
     return normalise(text_value(text).encode("utf-8", "surrogateescape"))
 
 
-def patterns(text: str) -> tuple[str, ...]:
-    """Parse colon-separated name patterns: a bare list replaces the defaults, `+` before it adds to them,
-    and an empty one switches the feature off."""
-    added = text.startswith("+")
-    given = tuple(part for part in text.removeprefix("+").split(":") if part)
-    return (*DEFAULT_LOCAL, *given) if added else given
-
-
 def endpoint(text: str) -> str:
     """Parse where frames are forwarded to; return it in one spelling."""
     return parse_endpoint(text_value(text)).description
@@ -171,7 +161,6 @@ VALUES: Values = {
     "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
     "dirty_max": Value(size(1 << 16, _SIZE_MAX, auto=True), "memory for what is not on the card yet: auto"),
     "spool_max": Value(size(0, _SIZE_MAX), "local disk for what is not on the card yet: 1G"),
-    "rmw_max": Value(size(0, _SIZE_MAX, auto=True), "largest file sent again whole for a changed part: auto"),
     "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
     "read_mode": Value(Choice("window", "burst"), "window or burst"),
@@ -179,7 +168,6 @@ VALUES: Values = {
     "bwlimit": Value(size(100, _SIZE_MAX), "use about so many bytes per second of the link"),
     "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
     "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
-    "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
     "tlog": Value(text_value, "raw MAVLink log there"),
     "forward": Value(endpoint, "pass all frames on to there and back; several count", many=True),
 }
@@ -198,7 +186,6 @@ Flags = Mapping[str, Flag]
 FLAGS: Flags = {
     "ro": Flag("read_only", True, "nothing is changed"),
     "rw": Flag("read_only", False, "the default"),
-    "force": Flag("force", True, "change files that are seen to grow, too"),
     "inplace": Flag("inplace", True, "replace files in place where the card cannot rename"),
 }
 
@@ -231,6 +218,11 @@ GONE: Mapping[str, Gone] = {
     ),
     "window": Gone("mavftpfs finds out how many requests the link carries"),
     "trace": Gone("-d prints every request and reply, and tlog=FILE records the link"),
+    "rmw_max": Gone("a change that needs more than two minutes of the link is refused (EFBIG)"),
+    "local": Gone("the list of names that stay in memory is fixed; see the guide, Writing"),
+    "force": Gone(
+        "a file that the vehicle is writing is never changed (EBUSY); leave the word out", refused=True
+    ),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
     "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
     "verify=auto": Gone("that is how written files are checked"),

@@ -147,7 +147,7 @@ class NotSupported(MavftpfsError):
 
 
 class FileTooLarge(MavftpfsError):
-    """A partial change would need more of the file to be copied than rmw_max allows (EFBIG)."""
+    """A partial change would take too long, because the whole file is sent again (EFBIG)."""
 
 
 class NoSpace(MavftpfsError):

@@ -139,6 +139,44 @@ def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert "SOURCE MOUNTPOINT" in capsys.readouterr().err
 
 
+UNITS_OF_0_2 = [
+    ("/dev/ttyACM0", "/home/me/drone-ttyACM0", "-o", ""),
+    ("/dev/ttyACM0", "/home/me/drone-ttyACM0", "-o", "ro,cache_dir=/var/tmp/drone"),
+    ("sync", SOURCE, "/home/me/drone-logs", "--watch"),
+    ("sync", SOURCE, "/home/me/drone-logs", "--watch", "--by-sysid", "--exec", "upload-log"),
+]
+"""What ExecStart of the units ran, as they were and as their own examples changed them."""
+
+
+@pytest.mark.parametrize("words", UNITS_OF_0_2)
+def test_units_of_0_2_go_on_to_start(monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]) -> None:
+    started: list[MountOptions] = []
+
+    def start(args: argparse.Namespace) -> int:
+        started.append(commands.connection_of(args)[0])
+        return 0
+
+    monkeypatch.setattr(commands, "mount", start)
+    monkeypatch.setitem(cli._COMMANDS, "sync", (cli._COMMANDS["sync"][0], start))
+    assert cli.main(words) == 0
+    assert len(started) == 1
+
+
+FSTAB_OF_0_2 = (
+    "noauto,nofail,_netdev,x-systemd.automount,x-systemd.mount-timeout=40,allow_other,uid=1000,auto_unmount,"
+    "fsname=drone,root=/fs/microsd,attr_timeout=5,negative_timeout=5,cache_dir=/var/cache/drone,"
+    "verify=size,dirty_max=1M,spool_max=2G,rmw_max=16M,source_component=25,heartbeat=onboard,window=8,"
+    "local=+*.tmp,log_file=/var/log/drone.log,trace=/var/log/drone.json"
+)
+
+
+def test_a_line_of_fstab_of_0_2_goes_on_to_mount(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`-f` only checks the words. mount(8) adds some of its own."""
+    words = ["mount.mavftpfs", SOURCE, "/mnt/drone", "-f", "-o", f"rw,{FSTAB_OF_0_2}"]
+    monkeypatch.setattr("sys.argv", words)
+    assert cli.mount_helper() == 0
+
+
 def test_words_of_0_2_that_belong_to_source_are_translated() -> None:
     args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,root=/fs/microsd/"])
     options, spec = commands.connection_of(args)

@@ -28,7 +28,6 @@ OTHER: dict[str, Any] = {
     "read_mode": "burst",
     "when_armed": "ok",
     "local": (),
-    "force": True,
     "inplace": True,
     "kernel_words": ("noatime",),
 }

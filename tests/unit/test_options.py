@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.options import DEFAULT_LOCAL, CacheOptions
+from mavftpfs.cache.options import CacheOptions
 from mavftpfs.client.options import GONE, Options, options_of
 from mavftpfs.mount.options import (
     FLAGS,
@@ -30,13 +30,13 @@ OWN, SHARED, PASSED_ON = (
 )
 
 
-OF_SOURCE = {"root", "baud"}
-"""Fields that SOURCE sets, and words of 0.2."""
+ELSEWHERE = {"root", "baud", "local"}
+"""Fields that SOURCE, words of 0.2 and the library set."""
 
 
 def test_the_table_fills_fields_and_no_others() -> None:
     named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
-    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone", *OF_SOURCE}
+    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone", *ELSEWHERE}
     assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
 
 
@@ -63,9 +63,6 @@ def test_words_for_others_are_ignored(word: str) -> None:
         ("dirty_max=auto", "dirty_max", None),
         ("dirty_max=512K", "dirty_max", 512 << 10),
         ("chunk=110", "chunk", 110),
-        ("local=*.tmp:.x*", "local", ("*.tmp", ".x*")),
-        ("local=", "local", ()),
-        ("local=+*.tmp:.x*", "local", (*DEFAULT_LOCAL, "*.tmp", ".x*")),
         ("tlog=a=b", "tlog", "a=b"),
         (r"tlog=a\,b", "tlog", "a,b"),
         ("allow_other", "allow_other", True),
@@ -145,7 +142,7 @@ def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> 
         ({"ro": "yes"}, "option ro is True or False"),
         ({"target_system": True}, "option target_system cannot be True"),
         ({"target_system": 2.5}, "target_system=2.5: must be a whole number"),
-        ({"local": ["a"]}, "option local cannot be"),
+        ({"tlog": ["a"]}, "option tlog cannot be"),
         ({"verify": "perhaps"}, "unknown option 'verify'"),
         ({"cache_size": 1}, "cache_size=1: must be within"),
     ],
@@ -223,7 +220,6 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "cache_size",
         "spool_max",
         "verify_max",
-        "local",
         "chunk",
     } <= checked
 
@@ -242,6 +238,9 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
         "negative_timeout=0",
         "verify=auto",
         "source_component=3",
+        "rmw_max=1G",
+        "local=",
+        "local=+*.tmp",
         "heartbeat=onboard",
         "window=4",
         "trace=/tmp/trace",
@@ -277,6 +276,7 @@ def test_some_words_of_0_2_are_translated(word: str, field: str, value: object) 
     ("word", "advice"),
     [
         ("verify=crc", "write verify_max=1024G"),
+        ("force", "leave the word out"),
         ("heartbeat=gcs", "leave the option out"),
         ("heartbeat=none", "leave the option out"),
     ],
@@ -286,7 +286,7 @@ def test_words_of_0_2_that_changed_a_promise_are_errors(word: str, advice: str) 
     with pytest.raises(UsageError, match=f"option {name} is gone: .*{advice}"):
         parse_options([f"ro,{word}"])
     with pytest.raises(UsageError, match=f"option {name} is gone: .*{advice}"):
-        options_of({name: value})
+        options_of({name: value or True})
 
 
 def test_words_that_are_gone_are_in_no_help_and_free_for_nothing_else() -> None:
