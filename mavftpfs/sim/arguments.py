@@ -13,15 +13,22 @@ from mavftpfs.sim.profiles import PROFILES
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
 DEFAULT_QUEUE = 8192
+_PROFILES_SHOWN = "\n".join(f"  {name:<11}{profile.about}" for name, profile in PROFILES.items())
 
-EPILOG = """\
-The link is given as the vehicle sees it: udpout:127.0.0.1:14550 pushes to a ground station on this computer,
-as PX4's simulator does; udpin:0.0.0.0:14550 waits to be spoken to; tcpin:127.0.0.1:5760 is what ArduPilot's
-simulator does; pty makes a serial port and prints its name. With any of --rate, --mtu, --delay, --jitter,
---loss, --burst-loss, --dup, --corrupt or --reorder, frames go through the model of a bad link.
+EPILOG = f"""\
+Profiles:
+{_PROFILES_SHOWN}
 
-Signals: SIGUSR1 arms or disarms (kill -USR1 PID), SIGUSR2 cuts or mends the link, SIGPWR reboots. It ends by
-SIGINT (Ctrl-C), by SIGTERM, and with its terminal.
+The link is given as the vehicle sees it: udpout:127.0.0.1:14550 pushes to a
+ground station on this computer, as PX4's simulator does; udpin:0.0.0.0:14550
+waits to be spoken to; tcpin:127.0.0.1:5760 is what ArduPilot's simulator does;
+pty makes a serial port and prints the SOURCE for it. With any of --rate, --mtu,
+--delay, --jitter, --loss, --burst-loss, --dup, --corrupt or --reorder, frames
+go through the model of a bad link.
+
+Signals: SIGUSR1 arms or disarms (kill -USR1 PID), SIGUSR2 cuts or mends the
+link, SIGPWR reboots. SIGINT (Ctrl-C), SIGTERM and the end of its terminal end
+it.
 """
 
 
@@ -32,7 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("directory", metavar="DIR", help="what the vehicle's card holds")
     parser.add_argument(
-        "--profile", default="px4", choices=sorted(PROFILES), help="whose FTP server (default px4)"
+        "--profile",
+        metavar="NAME",
+        default="px4",
+        choices=sorted(PROFILES),
+        help="whose FTP server, see below (default px4)",
     )
     parser.add_argument("--link", default=DEFAULT_LINK, metavar="URL", help=f"default {DEFAULT_LINK}")
     parser.add_argument("--system", type=_system, default=1, metavar="ID", help="its system id (default 1)")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import shlex
 import signal
 import sys
 import tty
@@ -33,6 +34,9 @@ from mavftpfs.sim.tree import DirectoryTree
 from mavftpfs.sim.vehicle import AUTOPILOT, SimVehicle
 
 _PTY_OUTBOX = 16 * 1024
+_FASTEST = 4_000_000
+_SLOWEST = 50
+"""Baud rates that every serial driver takes."""
 _ANSWER_AT = 16
 """So many replies at most wait for others before all are sent."""
 
@@ -130,17 +134,18 @@ class Endpoint:
             self._send([frame])  # one each: a radio's frames are lost one by one
 
 
-def open_endpoint(text: str) -> AbstractAsyncContextManager[Link]:
+def open_endpoint(text: str, rate: float | None = None) -> AbstractAsyncContextManager[Link]:
     """Return an async context manager that opens the vehicle's end of a link.
 
     text: a SOURCE as the vehicle would write it (`udpout:127.0.0.1:14550` pushes to a ground station, as
-    PX4's simulator does), or `pty`. A `tcp:` peer may come later.
+    PX4's simulator does), or `pty`. A `tcp:` peer may come later. rate: bytes/s of the link's model, which
+    the baud rate of a pty tells to clients, because programs that share the port pace themselves by it.
 
     Raises:
         UsageError: at once, if the text cannot be understood.
     """
     if text == "pty":
-        return _open_pty()
+        return _open_pty(_FASTEST if rate is None else min(_FASTEST, max(_SLOWEST, round(rate * 10))))
     spec = parse_source(text)
     return open_tcp(spec, patient=True) if spec.kind is LinkKind.TCP_OUT else open_link(spec)
 
@@ -151,7 +156,7 @@ def client_source(link: Link) -> str:
     host = "127.0.0.1" if spec.host == "0.0.0.0" else "::1" if spec.host == "::" else spec.host
     match spec.kind:
         case LinkKind.SERIAL:
-            return spec.device
+            return spec.description
         case LinkKind.UDP_OUT:
             kind = LinkKind.UDP_IN
         case LinkKind.UDP_IN:
@@ -164,13 +169,13 @@ def client_source(link: Link) -> str:
 
 
 @asynccontextmanager
-async def _open_pty() -> AsyncIterator[Link]:
+async def _open_pty(baud: int) -> AsyncIterator[Link]:
     master, slave = os.openpty()
     try:
         tty.setraw(slave)
         os.set_blocking(master, False)
         # The slave stays open here, so the master stays readable while clients come and go.
-        description = os.ttyname(slave)
+        description = f"{os.ttyname(slave)},{baud}"
         pipe = FileIO(master, "r+")
         link = StreamLink(description, None, pipe, is_serial=True, outbox_limit=_PTY_OUTBOX)
         async with background(link.run, link.aclose):
@@ -187,11 +192,11 @@ def run(args: argparse.Namespace) -> int:
         LinkClosed: the link cannot be opened.
     """
     rng = random.Random(args.seed)
+    profile = PROFILES[args.profile]
     try:
         tree = DirectoryTree(args.directory)
     except OSError as exc:
-        raise UsageError(f"cannot serve {args.directory}: {exc.strerror}") from exc
-    profile = PROFILES[args.profile]
+        raise UsageError(f"cannot serve {args.directory}: {exc.strerror}{_remedy(args, exc)}") from exc
     storage = os.fsdecode(profile.writable_root.strip(b"/"))
     if not os.path.isdir(os.path.join(args.directory, storage)):
         hint = (
@@ -213,13 +218,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _remedy(args: argparse.Namespace, error: OSError) -> str:
+    """Return the command that makes a missing card, with the directory for its logs."""
+    if not isinstance(error, FileNotFoundError):
+        return ""
+    place = os.path.join(args.directory, PROFILES[args.profile].log_place)
+    return f"; make a card, and put files into it: mkdir -p {shlex.quote(place)}"
+
+
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _REACTING = (signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR)
 
 
 async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, out: TextIO) -> None:
     with trio.open_signal_receiver(*_ENDING, *_REACTING) as arriving:
-        async with open_endpoint(link_text) as link:
+        rate = None if model is None else model.settings.rate
+        async with open_endpoint(link_text, rate) as link:
             # The vehicle was built before its link. Whether it hears a stream is clear only now.
             vehicle.set_stream(link.is_stream)
             endpoint = Endpoint(vehicle, link, model)

@@ -38,6 +38,12 @@ class Profile:
 
     name: str
     family: Family
+    about: str = ""
+    """What it simulates, for `sim --help`."""
+    version: int = 0
+    """The firmware's version as AUTOPILOT_VERSION has it; the last byte is 255 in releases."""
+    log_place: str = "log"
+    """Where logs lie on the card."""
     storage: Storage = Storage.POSIX
     case_fold: bool = False
     """Names are found whatever their case (FatFs)."""
@@ -129,12 +135,18 @@ class Profile:
 _PX4 = Profile(
     name="px4",
     family=Family.PX4,
+    about="PX4 1.16 on Linux: one session, no times, no parameters",
+    version=0x011000FF,
+    log_place="fs/microsd/log",
     path_limit=237,
     idle_close=10.0,
 )
 _ARDUPILOT = Profile(
     name="ardupilot",
     family=Family.ARDUPILOT,
+    about="ArduPilot 4.6: one session, no times; @SYS, @PARAM, @MISSION",
+    version=0x040603FF,
+    log_place="APM/LOGS",
     unknown_code=1,
     virtual_trees=TREES,
     double_nul=True,
@@ -149,6 +161,9 @@ _ARDUPILOT = Profile(
 _ARDUPILOT5 = Profile(
     name="ardupilot5",
     family=Family.ARDUPILOT,
+    about="ArduPilot 4.7-dev on a FAT card: five sessions, times",
+    version=0x04070000,
+    log_place="APM/LOGS",
     storage=Storage.FATFS,
     case_fold=True,
     newlib_errnos=True,
@@ -164,6 +179,7 @@ _ARDUPILOT5 = Profile(
 _MAVSDK = Profile(
     name="mavsdk",
     family=Family.MAVSDK,
+    about="MAVSDK's own server: one session, times, no size of the card",
     tells_storage=False,
     list_with_time=True,
     path_limit=239,
@@ -178,6 +194,7 @@ _ALL = (
     replace(
         _PX4,
         name="px4-nuttx",
+        about="PX4 1.16 on a board: a FAT card that pauses, /fs/microsd",
         storage=Storage.NUTTX_FAT,
         path_limit=238,
         writable_root=b"/fs/microsd/",
@@ -191,6 +208,9 @@ _ALL = (
     replace(
         _PX4,
         name="px4-2026",
+        about="PX4 of September 2026: times, @PARAM, and /log as #/@MAV_LOG",
+        version=0x01120000,
+        log_place="log",
         idle_close=30.0,
         open_replaces=True,
         checks_sender=True,
@@ -208,6 +228,7 @@ _ALL = (
     replace(
         _ARDUPILOT5,
         name="littlefs",
+        about="ArduPilot 4.7-dev on LittleFS, which cannot rename",
         storage=Storage.LITTLEFS,
         case_fold=False,
         list_with_time=False,

@@ -47,6 +47,9 @@ def _default_parameters() -> list[Parameter]:
     ]
     made += [parameter(f"INS_GYR{i}OFFS_{axis}", FLOAT, i / 64, 0) for i in range(1, 4) for axis in "XYZ"]
     made += [
+        parameter("BATT_MONITOR", INT8, 4, 0),
+        parameter("BATT_CAPACITY", INT32, 5200, 3300),
+        parameter("BATT_LOW_VOLT", FLOAT, 10.5, 10.5),
         parameter("WPNAV_SPEED", FLOAT, 1000, 1000),
         parameter("RTL_ALT", INT32, 1500, 1500),
         parameter("LOG_BITMASK", INT32, 176126, 176126),

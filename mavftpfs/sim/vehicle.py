@@ -333,7 +333,7 @@ class SimVehicle:
     def _version(self) -> bytes:
         # MAVSDK's server never says that it speaks FTP (servers.md 5).
         ftp = 0 if self.profile.family is Family.MAVSDK else MAV_PROTOCOL_CAPABILITY_FTP
-        versions = (ftp | _MAVLINK2, 0x01100000, 0, 0, 0, b"simulate", bytes(8), bytes(8), 0, 0)
+        versions = (ftp | _MAVLINK2, self.profile.version, 0, 0, 0, b"simulate", bytes(8), bytes(8), 0, 0)
         return self.framer.encode("autopilot_version", *versions, self._uid, list(bytes(18)))
 
 

@@ -42,6 +42,20 @@ def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("profile", "told"),
+    [
+        ("px4", "PX4 quadrotor, disarmed, firmware 1.16.0"),
+        ("ardupilot", "ArduPilot quadrotor, disarmed, firmware 4.6.3"),
+    ],
+)
+def test_a_simulated_vehicle_tells_its_own_version(
+    field: Field, small_tree: Path, profile: str, told: str
+) -> None:
+    out, _ = mavftpfs("scan", field.sim(small_tree, profile).source)
+    assert told.split(", ") == [*out.split("\t")[1].split(", "), f"firmware {out.split(chr(9))[2]}"]
+
+
 @pytest.mark.holds("promise 1")
 def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) -> None:
     out, _ = mavftpfs("get", vehicle.source, "/sizes/35850.bin", "/README.txt", "--to", tmp_path)

@@ -39,6 +39,7 @@ def said(source: str, *words: object, code: int = 0) -> str:
 
 def test_printing(source: str) -> None:
     assert param(source, "wpnav*", "RTL_ALT") == ["WPNAV_SPEED,1000", "RTL_ALT,1500"]
+    assert param(source, "BATT*")  # as the guide shows it
     assert len(param(source)) > 60
     assert "SERVO1_MIN,1101 # default 1100" in param(source, "--changed")
     assert not any(line.startswith("RTL_ALT") for line in param(source, "--changed"))

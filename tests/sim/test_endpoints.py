@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.arguments import add_arguments, link_settings
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from mavftpfs.sim.profiles import PROFILES
 from tests.support.replies import request
 from tests.support.vehicles import free_udp_port
 
@@ -131,6 +133,20 @@ def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path
         child.send_signal(signal.SIGTERM)
         assert line(child.stdout) == "ended after 0 FTP requests, open sessions: 0"
         assert child.wait(60) == 0
+
+
+@pytest.mark.parametrize(("words", "baud"), [((), 4_000_000), (("--rate", "5760"), 57_600)])
+def test_a_serial_port_is_as_fast_as_the_link(tmp_path: Path, words: tuple[str, ...], baud: int) -> None:
+    """Programs that share a port pace themselves by its baud rate."""
+    with running(str(tmp_path), "--link", "pty", *words) as child:
+        assert re.fullmatch(rf"mavftpfs /dev/pts/\d+,{baud} MOUNTPOINT", line(child.stdout))
+
+
+def test_the_help_says_what_each_profile_simulates() -> None:
+    parser = argparse.ArgumentParser("sim")
+    add_arguments(parser)
+    for profile in PROFILES.values():
+        assert re.search(rf"^  {profile.name} +\w.{{20,}}$", parser.format_help(), re.MULTILINE)
 
 
 def test_it_ends_with_its_terminal(tmp_path: Path) -> None:

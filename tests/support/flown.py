@@ -120,7 +120,7 @@ async def serve(
 ) -> None:
     """Serve until SIGTERM."""
     with trio.open_signal_receiver(signal.SIGTERM) as ending:
-        async with open_endpoint(args.link) as link, trio.open_nursery() as nursery:
+        async with open_endpoint(args.link, args.rate) as link, trio.open_nursery() as nursery:
             vehicle.set_stream(link.is_stream)
             endpoint = RecordedEndpoint(vehicle, link, model, record)
             print(f"mavftpfs {client_source(link)} MOUNTPOINT", flush=True)
