@@ -17,13 +17,13 @@ from pathlib import Path
 
 from mavftpfs.cli import report
 from mavftpfs.client import control, mountpoint
-from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours
+from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
 from mavftpfs.client.options import at_source, split_words
-from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, with_vehicles
+from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, statuses_at
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.mount import daemon
+from mavftpfs.mount import daemon, places
+from mavftpfs.mount.members import Member
 from mavftpfs.mount.options import LOCAL_PATHS, MountOptions, parse_options
-from mavftpfs.mount.roster import Member
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
@@ -47,8 +47,9 @@ def mount(args: argparse.Namespace) -> int:
     try:
         mountpoint.check_mountpoint(place)
     except DeadMount as exc:
-        raise DeadMount(_with_what_is_left(str(exc))) from exc
-    inside = None if args.member else mountpoint.enclosing_mount(os.path.dirname(place))
+        if not args.member:  # else the mount takes the dead one away when it is ready itself
+            raise DeadMount(_with_what_is_left(str(exc))) from exc
+    inside = mountpoint.enclosing_mount(os.path.dirname(place))
     if inside is not None:
         raise MountFailed(f"{place} lies in the mount on {inside[0]}; mount on a directory of this computer")
     work = partial(_serve, args, options, spec, place)
@@ -94,13 +95,14 @@ def _serve(
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
     with open_sinks(options.client, debug=args.debug, tell=say) as sinks:
-        if not args.member and os.listdir(place):
-            say(f"{place} is not empty: what is in it is hidden until it is unmounted")
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         if options.all:
             from mavftpfs.mount.supervisor import run_all
 
+            places.check(place)
             return run_all(request, _member_command(args, place), report)
+        if not args.member and os.listdir(place):
+            say(f"{place} is not empty: what is in it is hidden until it is unmounted")
         return run_mount(request, report)
 
 
@@ -121,7 +123,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
 
     def command(member: Member) -> list[str]:
         mount = [sys.executable, "-m", "mavftpfs", "mount", args.source, os.path.join(place, member.name)]
-        target = f"-otarget_system={member.system},target_component={member.component}"
+        target = f"-otarget_system={member.system}"
         words = [f"{word}.{member.name}" if each else word for word, each in own]
         return [*mount, "--member", target, *shown, *words]
 
@@ -183,9 +185,10 @@ def _umount(place: str, *, lazy: bool) -> int:
         finally:
             progress.end()
     except control.NobodyThere as exc:
-        if not is_ours(place):
+        vehicles = vehicles_below(place)
+        if not vehicles and not is_ours(place):
             raise MountFailed(_with_what_is_left(f"no vehicle is mounted on {place}")) from exc
-        return _umount_unasked(place, lazy=lazy)
+        return _umount_all(place, vehicles, lazy=lazy) if vehicles else _umount_unasked(place, lazy=lazy)
     except KeyboardInterrupt:
         say("the mount goes on delivering, and then ends; see: mavftpfs status")
         return ExitCode.INTERRUPTED
@@ -195,10 +198,18 @@ def _umount(place: str, *, lazy: bool) -> int:
     return int(reply["exit_code"])
 
 
+def _umount_all(place: str, vehicles: list[str], *, lazy: bool) -> int:
+    """Unmount all vehicles below a directory where the process that started their mounts was killed."""
+    code = max(_umount(path, lazy=lazy) for path in vehicles)
+    places.remove(place)
+    return code
+
+
 def _umount_unasked(place: str, *, lazy: bool) -> int:
-    """Unmount where the mount's process was killed, or lost its socket (systemd removes a user's at logout).
-    The mounts of several vehicles may be there still."""
-    codes = [_umount(path, lazy=lazy) for path in mountpoint.ours_below(place)]
+    """Unmount where the mount's process was killed, or lost its socket.
+
+    systemd removes a user's sockets at logout.
+    """
     held = 0
     with suppress(control.NobodyThere):  # we may not ask
         held = status_of(place).get("held", {}).get("files", 0)
@@ -209,7 +220,7 @@ def _umount_unasked(place: str, *, lazy: bool) -> int:
             "log says what becomes of it (it cannot be asked: its socket was removed)"
         )
         return ExitCode.UNDELIVERED
-    return max([*codes, _after_a_killed_mount()])
+    return _after_a_killed_mount()
 
 
 class _Delivery:
@@ -319,7 +330,7 @@ def status(args: argparse.Namespace) -> int:
         place = canonical(args.mountpoint)
 
         def fetch() -> list[Status]:
-            return with_vehicles(status_of(place))
+            return statuses_at(place)
 
     if args.json:
         report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)

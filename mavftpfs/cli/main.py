@@ -86,8 +86,13 @@ def mount_helper() -> int:
     try:
         args = parser.parse_args()
         words = [args.source, args.mountpoint, *(f"-o{text}" for text in args.options)]
+        options, _ = commands.connection_of(args)
+        if options.all:
+            raise UsageError(
+                "option all cannot be used in /etc/fstab, because the directory itself is no mount; start it "
+                "by a systemd service, or have a line with target_system= for each vehicle"
+            )
         if args.f:
-            commands.connection_of(args)
             return ExitCode.OK
     except MavftpfsError as exc:
         return _complain(str(exc), exit_code_for(exc))

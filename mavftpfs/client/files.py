@@ -21,10 +21,10 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
-from mavftpfs.client.mountpoint import OUR_TYPE, enclosing_mount, mounts
+from mavftpfs.client.mountpoint import OUR_TYPE, canonical, enclosing_mount, mounts
 from mavftpfs.client.options import Options
 from mavftpfs.client.several import Unnamed
-from mavftpfs.client.status import Facts, has_link, is_wanted, told_by, vehicle_below
+from mavftpfs.client.status import Facts, has_link, is_wanted, several_above, told_by, vehicle_below
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import HEARD_SOON, Connection
@@ -305,15 +305,25 @@ async def walk(files: Files, top: bytes) -> tuple[Found, Unlisted]:
 
 
 def mountpoint_of(source: str) -> tuple[str, bytes] | None:
-    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None."""
+    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None.
+
+    The directory of a mount of all vehicles counts as a mountpoint.
+    """
     place, _, subtree = source.partition("#")
     if not place or (":" in place and not place.startswith("/")):
         return None
-    found = enclosing_mount(place)
+    found = enclosing_mount(place) or _below_several(place)
     if found is None:
         return None
     mountpoint, below = found
     return mountpoint, normalise(os.fsencode(f"{below}/{subtree}"))
+
+
+def _below_several(place: str) -> tuple[str, str] | None:
+    """Return (directory, path below it) if a path leads into the directory of a mount of all vehicles."""
+    path = canonical(place)
+    above = several_above(path)
+    return None if above is None else (above, path[len(above) :])
 
 
 async def find_mount(spec: LinkSpec, options: Options) -> Session | None:

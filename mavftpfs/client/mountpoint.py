@@ -154,12 +154,14 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
     return found
 
 
-def ours_below(path: str) -> list[str]:
-    """Return the mountpoints of ours below another one, sorted."""
-    above = path.rstrip("/") + "/"
-    return sorted(
-        known for known, mount in mounts().items() if known.startswith(above) and mount.type == OUR_TYPE
-    )
+def vehicles_below(place: str) -> list[str]:
+    """Return the mountpoints of vehicles that a mount of all vehicles has below its directory, sorted."""
+    found = {path for path, mount in mounts().items() if mount.type == OUR_TYPE}
+    return sorted(path for path in found if os.path.dirname(path) == place and _is_number(path))
+
+
+def _is_number(path: str) -> bool:
+    return bool(re.fullmatch("[0-9]{1,3}", os.path.basename(path)))
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 from mavftpfs import __version__
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
-from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts, ours_below
+from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts, vehicles_below
 from mavftpfs.client.options import Options
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.samelink import same_link
@@ -144,10 +144,28 @@ def told_by(mountpoint: str, patience: float) -> Status:
         NobodyThere: nothing is mounted there, or this user may not ask.
     """
     mount = mounts().get(mountpoint)
-    status = None if mount is None else _by_attribute(mountpoint, mount, patience)
+    status = several_at(mountpoint) if mount is None else _by_attribute(mountpoint, mount, patience)
     if status is None:
         raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
     return status
+
+
+def several_at(place: str) -> Status | None:
+    """Return the status of the mount of all vehicles below a directory; None if there is none."""
+    try:
+        status = _ask(control.find_socket(place, control.own_directories()))
+    except ControlError:
+        return None
+    return status if "members" in status else None
+
+
+def several_above(path: str) -> str | None:
+    """Return the directory at or above a path below which all vehicles are mounted; None if there is none."""
+    while path != "/":
+        if several_at(path) is not None:
+            return path
+        path = os.path.dirname(path)
+    return None
 
 
 def second_vehicle(status: Status) -> str:
@@ -173,13 +191,12 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
     """
     place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
     first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
-    system, component = options.target_system, options.target_component
-    wanted = f"{system}-{component}" if component else str(system)
-    if first.replace("-", "").isdigit():
+    wanted = str(options.target_system)
+    if first.isdigit():
         raise NotFound(f"no vehicle is mounted on {place}/{first}")
-    if not system and len(names) == 1:
+    if not options.target_system and len(names) == 1:
         (wanted,) = names
-    elif not system:
+    elif not options.target_system:
         shown = ", ".join(names) or "none yet"
         raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
     if wanted not in names:
@@ -190,13 +207,31 @@ def vehicle_below(status: Mapping[str, Any], subtree: bytes, options: Options) -
     return os.path.join(place, wanted)
 
 
+def statuses_at(place: str) -> list[Status]:
+    """Return the statuses that belong to a mountpoint, or to the directory of a mount of all vehicles.
+
+    The first one is dead if the process that started the vehicles' mounts is gone.
+
+    Raises:
+        NobodyThere: no vehicle is mounted there, or this user may not ask.
+    """
+    try:
+        return with_vehicles(status_of(place))
+    except NobodyThere:
+        vehicles = [status_of(path) for path in vehicles_below(place)]
+        if not vehicles:
+            raise
+        problem = f"DEAD: no more vehicles are mounted; run: mavftpfs umount {place}"
+        return [{**_unasked(place, vehicles[0]["source"], "dead", problem), "vehicles": vehicles}, *vehicles]
+
+
 def with_vehicles(status: Status) -> list[Status]:
     """Return the statuses that belong to one mountpoint: its own, and those of its vehicles if it has
     several, which are also under `vehicles` of the first."""
     if "members" not in status:
         return [status]
     vehicles: list[Status] = []
-    for path in ours_below(status["mountpoint"]):
+    for path in vehicles_below(status["mountpoint"]):
         with suppress(NobodyThere):
             vehicles.append(status_of(path))
     return [{**status, "vehicles": vehicles}, *vehicles]

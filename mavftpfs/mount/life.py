@@ -40,7 +40,7 @@ class State(Enum):
     """What a mount is doing."""
 
     STARTING = "starting"
-    """The vehicle is waited for; the kernel has no mount yet."""
+    """The mount waits for the vehicle; the kernel has no mount yet."""
     MOUNTED = "mounted"
     """Programs get answers."""
     LEAVING = "leaving"

@@ -19,7 +19,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.control import Reply
 from mavftpfs.client.controlserver import Command
-from mavftpfs.client.mountpoint import unmount
+from mavftpfs.client.mountpoint import is_dead, unmount
 from mavftpfs.client.status import network_namespace
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.farewell import say_goodbye
@@ -79,6 +79,8 @@ class SingleMount(Life):
             )
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
             words = fuse_words(self.request.options, self.request.source)
+            if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
+                unmount(self.request.mountpoint, lazy=True)
             with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
                 self.enter(State.MOUNTED)
                 await self.start_control(_commands(vehicle, operations, invalidator), nursery)

@@ -1,7 +1,8 @@
 """A mount of all vehicles on a link: one ordinary mount for each, in a process of its own. Layer: mount.
 
-This process has no vehicle. It hears heartbeats through the hub, shows the directory in which the mounts are
-(`mount.root`), and starts, watches and ends their processes. If it is killed they go on.
+This process has no vehicle, and no mount. It hears heartbeats through the hub, and starts, watches and ends
+the mounts of the vehicles, each on a directory below the mountpoint (`mount.places`). If it is killed they go
+on.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs.client import control
 from mavftpfs.client.connect import connect_options, opened, plain_nursery
-from mavftpfs.client.mountpoint import is_ours, unmount
+from mavftpfs.client.mountpoint import is_dead, is_ours
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
@@ -31,24 +31,18 @@ from mavftpfs.link.messages import (
     Heartbeat,
 )
 from mavftpfs.link.sharing import own_environment
+from mavftpfs.mount import places
 from mavftpfs.mount.daemon import Report
-from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
 from mavftpfs.mount.life import Life, MountRequest, State
-from mavftpfs.mount.options import fuse_words
-from mavftpfs.mount.root import RootOperations
-from mavftpfs.mount.roster import Member, MemberState, Roster
-from mavftpfs.session.connection import connected, signing_now
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, MountFailed
-from mavftpfs.shared.model import ROOT
+from mavftpfs.mount.members import Member, Members, MemberState
+from mavftpfs.session.connection import signing_now
+from mavftpfs.shared.errors import MountFailed
 
 log = logging.getLogger("mavftpfs.mount")
 
-FIRST_PATIENCE = 5.0
-"""Seconds in which the command that mounts waits for the first vehicle; others come later."""
 PERIOD = 0.1
 END_PATIENCE = 3600.0
 """Seconds for a vehicle's mount to deliver and end."""
-_OWNER_ONLY = 0o077
 
 Command = Callable[[Member], list[str]]
 """Returns the words that mount one vehicle below the mountpoint, in the foreground."""
@@ -63,42 +57,30 @@ class Supervisor(Life):
     """The mount of all vehicles. To leave is to have all of theirs deliver and end."""
 
     def __init__(self, request: MountRequest, command: Command, report: Report) -> None:
-        # The root itself refuses writes; fusermount3 mounts only where the user may write.
-        client = replace(request.options.client, read_only=False)
-        options = replace(request.options, client=client)
-        if os.geteuid() != 0 and not options.allow_other:
-            # fusermount3 works as root, and the kernel lets root into a user's mount only so.
-            options = replace(options, allow_other=True, dmask=_OWNER_ONLY)
-        super().__init__(replace(request, options=options), report)
+        super().__init__(request, report)
         self._command = command
-        self._roster = Roster()
+        self._members = Members()
         self._processes: dict[str, trio.Process] = {}
         self._first = trio.Event()
-        self._loop = FuseLoop()
+        self._left = trio.Event()
         self._ending = trio.Lock()
         self._nursery: trio.Nursery | None = None
 
     async def serve(self, nursery: trio.Nursery) -> None:
         """See Life.serve."""
         self._nursery = nursery
-        options, place = self.request.options, self.request.mountpoint
-        operations = RootOperations(self._roster, presentation(options), self._look, self.facts)
-        async with opened(self.request.spec, options.client, beats=True) as link:
-            try:
-                with kernel_mount(operations, place, fuse_words(options, self.request.source)):
-                    self.enter(State.MOUNTED)
-                    await self.start_control({}, nursery)
-                    async with plain_nursery() as tasks:
-                        tasks.start_soon(self._hear, link)
-                        tasks.start_soon(self._keep_members, tasks)
-                        tasks.start_soon(self._tell_when_up)
-                        await self._loop.run()
-                        await self._leave()  # another program may have unmounted the root, lazily
-            except MountFailed as exc:
-                raise _explained(exc) from exc
+        async with opened(self.request.spec, self.request.options.client, beats=True) as link:
+            self.enter(State.MOUNTED)
+            await self.start_control({}, nursery)
+            async with plain_nursery() as tasks:
+                tasks.start_soon(self._hear, link)
+                tasks.start_soon(self._keep_members, tasks)
+                tasks.start_soon(self._tell_when_up)
+                await self._left.wait()
+        await trio.to_thread.run_sync(places.remove, self.request.mountpoint)
 
     async def _tell_when_up(self) -> None:
-        with trio.move_on_after(FIRST_PATIENCE):
+        with trio.move_on_after(self.request.options.client.connect_timeout):
             await self._first.wait()
             self.tell_mounted("")
             return
@@ -130,31 +112,13 @@ class Supervisor(Life):
                 for chunk in await link.receive():
                     for message in framer.feed(chunk):
                         if isinstance(message, Heartbeat):
-                            self._roster.hear(message, trio.current_time())
-
-    async def _look(self, system: int, component: int) -> bool:
-        """Return whether a component of a system answers MAVLink FTP."""
-        options = replace(
-            self.request.options.client, target_system=system, target_component=component, forward=()
-        )
-        try:
-            async with (
-                opened(self.request.spec, options) as link,
-                connected(link, connect_options(options)) as connection,
-            ):
-                await connection.ready(options.connect_timeout)
-                await connection.store.list_directory(ROOT)
-        except FtpNak:
-            return True
-        except MavftpfsError:
-            return False
-        return True
+                            self._members.hear(message, trio.current_time())
 
     async def _keep_members(self, nursery: trio.Nursery) -> None:
         """Start a mount for each vehicle that is heard and has none."""
         while True:
             if self.state is State.MOUNTED:
-                for member in self._roster.due(trio.current_time()):
+                for member in self._members.due(trio.current_time()):
                     member.start()
                     nursery.start_soon(self._keep_mounted, member)
             await trio.sleep(PERIOD)
@@ -162,8 +126,9 @@ class Supervisor(Life):
     async def _keep_mounted(self, member: Member) -> None:
         """Run a vehicle's mount until it ends."""
         place = self._place(member)
-        # In a session of its own: Ctrl-C reaches only us, and we end it in order.
         try:
+            await trio.to_thread.run_sync(places.make, self.request.mountpoint, member.name)
+            # In a session of its own: Ctrl-C reaches only us, and we end it in order.
             process = await trio.lowlevel.open_process(
                 self._command(member),
                 stdin=subprocess.DEVNULL,
@@ -172,8 +137,9 @@ class Supervisor(Life):
                 env=own_environment(),
                 start_new_session=True,
             )
-        except OSError as exc:
-            member.ended(1, f"its mount cannot be started: {exc.strerror}", trio.current_time())
+        except (OSError, MountFailed) as exc:
+            reason = exc.strerror if isinstance(exc, OSError) else exc
+            member.ended(1, f"its mount cannot be started: {reason}", trio.current_time())
             log.warning("vehicle %s: %s", member.name, member.problem)
             return
         self._processes[member.name] = process
@@ -181,7 +147,7 @@ class Supervisor(Life):
         async with trio.open_nursery() as nursery:
             nursery.start_soon(_collect, process, said)
             while member.state is MemberState.STARTING and process.poll() is None:
-                if await trio.to_thread.run_sync(is_ours, place):
+                if await trio.to_thread.run_sync(_is_up, place):
                     member.mounted()
                     self._first.set()
                     log.info("vehicle %s is mounted on %s", member.name, place)
@@ -191,7 +157,6 @@ class Supervisor(Life):
         member.ended(code, said[-1] if said else f"its mount ended with {code}", trio.current_time())
         if member.state is MemberState.FAILED:
             log.warning("the mount of vehicle %s ended: %s", member.name, member.problem)
-            await trio.to_thread.run_sync(_take_away, place)
 
     def _place(self, member: Member) -> str:
         return os.path.join(self.request.mountpoint, member.name)
@@ -209,7 +174,7 @@ class Supervisor(Life):
             if self.state is State.MOUNTED:
                 self.enter(State.LEAVING)
             await self._end_members(lazy=True)
-        self._loop.stop()
+        self._left.set()
 
     def hurry(self) -> None:
         """See Life.hurry: each vehicle's mount gets a signal of its own."""
@@ -224,22 +189,18 @@ class Supervisor(Life):
             self.enter(State.LEAVING)
             outcomes = await self._end_members(lazy=lazy)
             problems = "; ".join(filter(None, outcomes.values()))
-            try:
-                if problems:
-                    raise MountFailed(problems)
-                await trio.to_thread.run_sync(partial(unmount, self.request.mountpoint, lazy=lazy))
-            except MountFailed as exc:
+            if problems:
                 self.enter(State.MOUNTED)
                 gone = ", ".join(name for name, problem in outcomes.items() if not problem)
-                raise MountFailed(f"{exc}; unmounted: {gone}" if gone else str(exc)) from exc
-        self._loop.stop()  # after a lazy unmount the kernel ends it only with its last user
+                raise MountFailed(f"{problems}; unmounted: {gone}" if gone else problems)
+        self._left.set()
 
     async def _end_members(self, *, lazy: bool) -> dict[str, str]:
         """Have all vehicles' mounts deliver and end, at the same time; return for each name why it did not,
         or "". If lazy, all do."""
-        outcomes = {member.name: "" for member in self._roster if member.name in self._processes}
+        outcomes = {member.name: "" for member in self._members if member.name in self._processes}
         async with trio.open_nursery() as nursery:
-            for member in self._roster:
+            for member in self._members:
                 if member.name in outcomes:
                     nursery.start_soon(self._end_member, member, lazy, outcomes)
         return outcomes
@@ -264,26 +225,14 @@ class Supervisor(Life):
         """See Life.status."""
         members = [
             {"name": member.name, "state": member.state.value, "problem": member.problem or None}
-            for member in self._roster
+            for member in self._members
         ]
         return {"members": members}
 
 
-def _explained(error: MountFailed) -> MountFailed:
-    if "user_allow_other" not in str(error):
-        return error
-    return MountFailed(
-        "to mount below a mount of yours, fusermount3 needs the line user_allow_other in /etc/fuse.conf: "
-        "echo user_allow_other | sudo tee -a /etc/fuse.conf; or mount each vehicle by -o target_system="
-    )
-
-
-def _take_away(place: str) -> None:
-    """Unmount what a killed mount left."""
-    try:
-        unmount(place, lazy=True)
-    except MountFailed as exc:
-        log.warning("%s", exc)
+def _is_up(place: str) -> bool:
+    """Return whether a vehicle is mounted there; a killed mount may still be in its place."""
+    return is_ours(place) and not is_dead(place)
 
 
 async def _collect(process: trio.Process, said: list[str]) -> None:

@@ -19,8 +19,6 @@ from mavftpfs.client.connect import Space
 from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
 from mavftpfs.mount.handles import ROOT_INO, DirectoryHandle, Presentation
 from mavftpfs.mount.operations import UNKNOWN_SPACE, Operations
-from mavftpfs.mount.root import RootOperations
-from mavftpfs.mount.roster import Roster
 from mavftpfs.shared.errors import ListingIncomplete, PathTooLong
 from tests.ops.faketree import FakeTree
 
@@ -291,16 +289,3 @@ async def test_the_kernel_s_reads_ahead_end_with_the_program_that_closed_a_descr
         expected = sorted([(began + (5.0 if errno_then else 20.0), errno_then), (began + 20.0, 0)])
         assert sorted(ends) == expected
         ends.clear()
-
-
-# -- the directory of several vehicles -----------------------------------------------------------------
-
-
-async def test_looking_for_a_part_of_a_vehicle_ends_no_mount() -> None:
-    async def no_descriptors(system: int, component: int) -> bool:
-        raise OSError(errno.EMFILE, "too many open files")
-
-    root = RootOperations(Roster(), LOOK, no_descriptors, dict)
-    with pytest.raises(FUSEError) as caught:
-        await root.lookup(ROOT_INO, b"1-100", CTX)
-    assert caught.value.errno == errno.EIO

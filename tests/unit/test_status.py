@@ -22,7 +22,6 @@ def below(members: list[dict[str, Any]], subtree: bytes = b"/", **options: Any) 
 def test_a_vehicle_is_named_or_the_only_one() -> None:
     assert below([ONE]) == "/mnt/1"
     assert below([ONE, TWO], target_system=1) == "/mnt/1"
-    assert below([{**ONE, "name": "1-100"}], target_system=1, target_component=100) == "/mnt/1-100"
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,10 @@
 """Which vehicles a mount of all of them has, and in which state each is. Layer: mount; pure.
 
-A vehicle is known by its system id; another part of it than the autopilot by both ids. A name never
-disappears, so that no program takes a lost vehicle for an empty directory.
+A vehicle is known by its system id.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -14,8 +12,6 @@ from enum import Enum
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Heartbeat
 from mavftpfs.shared.errors import ExitCode
 
-FIRST_INO = 2
-"""1 is the root's."""
 HEARD_LATELY = 10.0
 """Seconds after its last heartbeat in which a vehicle's mount is worth starting."""
 FIRST_PAUSE = 1.0
@@ -23,8 +19,6 @@ LONGEST_PAUSE = 30.0
 """Seconds before a mount that failed is started again; doubled each time."""
 MOST = 64
 """Vehicles of one mount. A limit, because any program can send heartbeats with any id."""
-
-_NAME = re.compile(rb"([1-9][0-9]{0,2})(?:-([1-9][0-9]{0,2}))?")
 
 
 class MemberState(Enum):
@@ -49,14 +43,9 @@ NEXT = {
 
 @dataclass(slots=True)
 class Member:
-    """A vehicle, or a part of one. component: 0 = its autopilot. ino: its directory's number.
-
-    problem: why its mount failed, or "". due_at: when it is started again.
-    """
+    """A vehicle. problem: why its mount failed, or "". due_at: when its mount is started again."""
 
     system: int
-    component: int
-    ino: int
     state: MemberState = MemberState.HEARD
     heard_at: float = float("-inf")
     due_at: float = float("-inf")
@@ -65,24 +54,24 @@ class Member:
 
     @property
     def name(self) -> str:
-        """The name of its directory: `1`, or `1-100`."""
-        return f"{self.system}-{self.component}" if self.component else str(self.system)
+        """The name of its directory: its system id."""
+        return str(self.system)
 
     def _go_to(self, state: MemberState) -> None:
         assert state in NEXT[self.state], (self.state, state)
         self.state = state
 
     def start(self) -> None:
-        """Its mount is being started."""
+        """Note that its mount is being started."""
         self._go_to(MemberState.STARTING)
 
     def mounted(self) -> None:
-        """Its mount is up."""
+        """Note that its mount is up."""
         self._go_to(MemberState.MOUNTED)
         self.pause, self.problem = FIRST_PAUSE, ""
 
     def ended(self, code: int, problem: str, now: float) -> None:
-        """Its mount's process ended, with an exit code."""
+        """Note that its mount's process ended, with an exit code."""
         if code in (ExitCode.OK, ExitCode.UNDELIVERED):  # it was unmounted
             self._go_to(MemberState.UNMOUNTED)
             return
@@ -92,20 +81,11 @@ class Member:
         self.pause = min(self.pause * 2, LONGEST_PAUSE)
 
 
-def parse_name(name: bytes) -> tuple[int, int] | None:
-    """Return the system and component of a directory's name, None if it names none."""
-    found = _NAME.fullmatch(name)
-    if found is None:
-        return None
-    system, component = int(found[1]), int(found[2] or 0)
-    return (system, component) if system <= 255 and component <= 255 else None
-
-
-class Roster:
+class Members:
     """The vehicles of one mount."""
 
     def __init__(self) -> None:
-        self._members: dict[tuple[int, int], Member] = {}
+        self._members: dict[int, Member] = {}
 
     def __iter__(self) -> Iterator[Member]:
         return iter(list(self._members.values()))
@@ -113,30 +93,14 @@ class Roster:
     def __len__(self) -> int:
         return len(self._members)
 
-    def find(self, system: int, component: int) -> Member | None:
-        """Return the vehicle, or the part of one, with these ids."""
-        return self._members.get((system, component))
-
-    def at(self, ino: int) -> Member | None:
-        """Return the vehicle whose directory has a number."""
-        return next((member for member in self if member.ino == ino), None)
-
     def hear(self, heartbeat: Heartbeat, now: float) -> None:
-        """Note a heartbeat: an autopilot's makes its vehicle known."""
+        """Note a heartbeat. One of an autopilot makes its vehicle known, unless there are too many."""
         system = heartbeat.source.system
-        if system and heartbeat.autopilot != MAV_AUTOPILOT_INVALID:
-            self.add(system, 0)
-        for member in self:
-            if member.system == system:
-                member.heard_at = now
-
-    def add(self, system: int, component: int) -> Member | None:
-        """Return the vehicle, or the part of one, added if it was not known; None if there are too many."""
-        member = self._members.get((system, component))
-        if member is None and len(self._members) < MOST:
-            member = Member(system, component, FIRST_INO + len(self._members))
-            self._members[system, component] = member
-        return member
+        is_new = system not in self._members and heartbeat.autopilot != MAV_AUTOPILOT_INVALID
+        if system and is_new and len(self._members) < MOST:
+            self._members[system] = Member(system)
+        if system in self._members:
+            self._members[system].heard_at = now
 
     def due(self, now: float) -> list[Member]:
         """Return those whose mount is to be started now."""

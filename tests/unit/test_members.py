@@ -1,0 +1,84 @@
+"""Which vehicles a mount of all of them has."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, Heartbeat
+from mavftpfs.mount.members import HEARD_LATELY, LONGEST_PAUSE, MOST, Members, MemberState
+from mavftpfs.shared.errors import ExitCode
+
+
+def beat(system: int, component: int = 1, autopilot: int = 12) -> Heartbeat:
+    return Heartbeat(Address(system, component), 2, autopilot, False)
+
+
+def test_an_autopilots_heartbeat_makes_its_vehicle_known() -> None:
+    members = Members()
+    members.hear(beat(255, 190, MAV_AUTOPILOT_INVALID), 0.0)
+    members.hear(beat(2, 100, MAV_AUTOPILOT_INVALID), 0.0)
+    assert len(members) == 0
+    members.hear(beat(2), 1.0)
+    members.hear(beat(1), 1.0)
+    assert [member.name for member in members] == ["2", "1"]
+
+
+def due(members: Members, now: float) -> list[str]:
+    return [member.name for member in members.due(now)]
+
+
+def test_a_mount_is_started_once_and_again_after_it_failed() -> None:
+    members = Members()
+    members.hear(beat(1), 0.0)
+    (member,) = members.due(0.0)
+    member.start()
+    assert due(members, 0.0) == []
+    member.ended(2, "no vehicle", 0.0)
+    assert member.problem == "no vehicle"
+    assert due(members, 0.5) == []
+    assert due(members, 1.0) == ["1"]
+    member.start()
+    member.mounted()
+    assert member.problem == ""
+    member.ended(-9, "killed", 5.0)
+    assert due(members, 6.0) == ["1"]
+
+
+def test_failures_in_a_row_are_tried_again_less_and_less_often() -> None:
+    members = Members()
+    members.hear(beat(1), 0.0)
+    (member,) = members
+    pauses = []
+    for _ in range(8):
+        member.start()
+        member.ended(3, "no", 100.0)
+        pauses.append(member.due_at - 100.0)
+    assert pauses == sorted(pauses)
+    assert pauses[-1] == LONGEST_PAUSE
+
+
+def test_a_silent_vehicle_is_not_mounted_again_before_it_is_heard() -> None:
+    members = Members()
+    members.hear(beat(1), 0.0)
+    assert due(members, HEARD_LATELY + 1) == []
+    members.hear(beat(1), 60.0)
+    assert due(members, 60.0) == ["1"]
+
+
+@pytest.mark.parametrize("code", [ExitCode.OK, ExitCode.UNDELIVERED])
+def test_what_the_user_unmounted_stays_so(code: ExitCode) -> None:
+    members = Members()
+    members.hear(beat(1), 0.0)
+    (member,) = members
+    member.start()
+    member.mounted()
+    member.ended(code, "", 1.0)
+    assert member.state is MemberState.UNMOUNTED
+    assert due(members, 2.0) == []
+
+
+def test_forged_heartbeats_have_an_end() -> None:
+    members = Members()
+    for system in range(1, 256):
+        members.hear(beat(system), 0.0)
+    assert len(members) == MOST
