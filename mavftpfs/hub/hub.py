@@ -369,8 +369,6 @@ class Hub:
                 self._tell_reopened(side)
             for index, piece in enumerate(pieces or ()):
                 frames += inlet.feed(piece, link.sender(index))
-            if any(frame.crc_fits for _, frame in frames):
-                link.keep_peer()
             self._pass_on(frames, forwarded=side != PORT)
 
     def _tell_reopened(self, side: int) -> None:

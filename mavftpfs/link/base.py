@@ -99,11 +99,6 @@ class Link(Protocol):
         """From now on send to this address. Only a link that hears several senders has a choice."""
         ...
 
-    def keep_peer(self) -> None:
-        """Note that the peer that is served was heard just now. For some seconds no new connection takes its
-        place."""
-        ...
-
     def focus(self, system: int) -> None:
         """From now on only one system matters: a shared port leaves out frames that concern only others."""
         ...
@@ -226,9 +221,6 @@ class DescriptorLink:
 
     def answer(self, address: NetAddress) -> None:
         """Nothing to choose."""
-
-    def keep_peer(self) -> None:
-        """Nothing to do."""
 
     def focus(self, system: int) -> None:
         """Nothing to leave out."""

@@ -243,11 +243,6 @@ class SharedLink:
         if self._inner is not None:
             self._inner.answer(address)
 
-    def keep_peer(self) -> None:
-        """See link.base.Link."""
-        if self._inner is not None:
-            self._inner.keep_peer()
-
     def focus(self, system: int) -> None:
         """From now on only what concerns one system matters."""
         if system != self._system:

@@ -72,7 +72,6 @@ class StreamLink(DescriptorLink):
         self._was_open = pipe is not None
         self._reopened = False
         self._peer: NetAddress | None = None
-        self._vouched_at = trio.current_time()
         self._changed = trio.Event()
 
     @property
@@ -100,10 +99,6 @@ class StreamLink(DescriptorLink):
         """Return the peer that connected; None where we opened the stream."""
         return self._peer
 
-    def keep_peer(self) -> None:
-        """Note that the present peer is served, and was heard just now."""
-        self._vouched_at = trio.current_time()
-
     def descriptors(self) -> list[int]:
         """Return the listener's, if there is one, and the pipe's, if there is one at the moment."""
         return [end.fileno() for end in (self.listener, self._pipe) if end is not None]
@@ -116,18 +111,16 @@ class StreamLink(DescriptorLink):
         self._drop()
         self._pipe = pipe
         self._peer = peer
-        self._vouched_at = trio.current_time()
         self._reopened = self._was_open
         if self._was_open:
             self.stats.reopened += 1
         self._was_open = True
         self._notify()
 
-    async def wait_replaceable(self, patience: float) -> None:
-        """Wait until there is no pipe, or `keep_peer` was not called for `patience` seconds."""
-        while self.connected and (left := self._vouched_at + patience - trio.current_time()) > 0:
-            with trio.move_on_after(left):
-                await self._changed.wait()
+    async def wait_disconnected(self) -> None:
+        """Wait until there is no pipe."""
+        while self.connected:
+            await self._changed.wait()
 
     async def run(self) -> None:
         """Write what had to wait, and reopen what failed; runs until cancelled."""

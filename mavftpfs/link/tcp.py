@@ -1,7 +1,8 @@
 """TCP links: `tcp` connects (again and again), `tcpin` accepts one peer at a time. Layer: link.
 
-Both ends use keep-alives and a user timeout, so that a vehicle that lost power is noticed within about
-15 s although TCP alone would wait for minutes.
+A peer of `tcpin` stays until its connection ends; the next one waits. Both ends use keep-alives and a user
+timeout, so that a vehicle that lost power is noticed within about 10 s although TCP alone would wait for
+minutes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from dataclasses import replace
 
 import trio
 
-from mavftpfs.link.addresses import PATIENCE
 from mavftpfs.link.base import background, look_up
 from mavftpfs.link.stream import Pipe, StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
@@ -133,7 +133,7 @@ async def _accept_peers(listener: socket.socket, link: StreamLink) -> None:
             await trio.sleep(_PAUSE)
             continue
         try:
-            await link.wait_replaceable(PATIENCE)
+            await link.wait_disconnected()
         except BaseException:
             peer.close()
             raise
@@ -146,10 +146,10 @@ def _configure(sock: socket.socket) -> socket.socket:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (
-        ("TCP_KEEPIDLE", 5),
-        ("TCP_KEEPINTVL", 3),
+        ("TCP_KEEPIDLE", 4),
+        ("TCP_KEEPINTVL", 2),
         ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", 15_000),
+        ("TCP_USER_TIMEOUT", 10_000),
     ):
         with suppress(OSError, AttributeError):  # not on every system; a comfort only
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -116,8 +116,6 @@ class Driver:
                         self._pass_on(now)
                         self._refill(now)
             self._pass_on(now)
-            if identity.heard_at == now and identity.standing is not Standing.STRANGER:
-                self.link.keep_peer()
             for _, on_batch in list(self._under_way.values()):
                 if on_batch is not None:
                     on_batch(now)

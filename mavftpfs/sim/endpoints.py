@@ -66,7 +66,6 @@ class Endpoint:
                 pieces = await self.link.receive()
                 if not pieces:
                     self._reset()
-                self.link.keep_peer()
             if self._scope.cancelled_caught or self.cut:
                 pieces = []
             now = trio.current_time()

@@ -6,7 +6,7 @@ import logging
 import random
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 
 import pytest
 import trio
@@ -191,54 +191,6 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
             vehicle.server.change = forging(forger.send)
             for _ in range(20):
                 assert await read_file(made, b"/f") == OURS
-
-
-@pytest.mark.real_time
-@pytest.mark.holds("promise 10")
-async def test_a_stranger_does_not_keep_our_vehicle_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """tcpin has one peer at a time. Ours goes away; somebody connects who sends without a pause, then another
-    vehicle, which stays, and then ours."""
-    monkeypatch.setattr("mavftpfs.link.tcp.PATIENCE", 1.0)
-    port = free_udp_port()
-    ours, theirs = MemoryTree(), MemoryTree()
-    ours.add(b"/f", OURS)
-    theirs.add(b"/f", THEIRS)
-    source = parse_source(f"tcpin:{HOST}:{port}")
-    async with (
-        open_link(source) as link,
-        connected(link, ConnectOptions()) as made,
-        trio.open_nursery() as nursery,
-    ):
-        identity = made.vehicle.identity
-        with LyingVehicle(ours, f"tcp:{HOST}:{port}"):
-            await made.ready(30.0)
-            assert await read_file(made, b"/f") == OURS
-            await until(lambda: made.vehicle.version is not None)
-        await until(lambda: link.stats.dropped_sends > 0)
-        with socket.create_connection((HOST, port)) as noisy:
-            nursery.start_soon(make_noise, noisy)
-            with LyingVehicle(theirs, f"tcp:{HOST}:{port}", seed=2) as other:
-                await until(lambda: identity.standing is Standing.STRANGER)
-                with LyingVehicle(ours, f"tcp:{HOST}:{port}"):
-                    await until(lambda: identity.standing is Standing.TRUSTED)
-                    assert await read_file(made, b"/f") == OURS
-                assert other.server.requests.total() == 0
-            nursery.cancel_scope.cancel()
-
-
-async def make_noise(peer: socket.socket) -> None:
-    """Send heartbeats of somebody else's until cancelled."""
-    with suppress(OSError):  # it is closed when another peer gets its place
-        while True:
-            peer.send(heartbeat(source=Address(9, 1)))
-            await trio.sleep(0.05)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait for what comes soon on a machine that has time."""
-    with trio.fail_after(60.0):
-        while not condition():  # noqa: ASYNC110 (nobody tells)
-            await trio.sleep(0.05)
 
 
 def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Iterable[Payload]]:

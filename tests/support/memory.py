@@ -90,9 +90,6 @@ class MemoryLink:
     def answer(self, address: NetAddress) -> None:
         """Nothing to choose from."""
 
-    def keep_peer(self) -> None:
-        """Nobody waits."""
-
     def focus(self, system: int) -> None:
         """See link.base.Link."""
 
