@@ -228,6 +228,8 @@ def _tell_systemd(everybody: bool) -> None:
 def _hints(everybody: bool) -> Iterator[str]:
     yield "systemctl --user start mavftpfs@ttyACM0 mounts /dev/ttyACM0 on ~/drone-ttyACM0"
     yield "systemctl --user start mavftpfs-sync@udpin:0.0.0.0:14550 brings logs into ~/drone-logs"
+    yield "at boot, without a login: `enable` in place of `start`, and sudo loginctl enable-linger $USER"
+    yield "bash completes in new shells, if the package bash-completion is installed"
     if everybody:
         yield "an autopilot that is plugged in is mounted there by itself"
     else:

@@ -21,6 +21,8 @@ from tests.support.vehicles import PROJECT
 def commands(unit: str, key: str, home: Path, device: str, options: str) -> list[list[str]]:
     """Return the commands of one key, with what systemd puts in place of % and $."""
     places = {"%h": str(home), "%I": device, "%i": device.replace("/", "-"), "${MAVFTPFS_OPTIONS}": options}
+    (source,) = re.findall(r"^Environment=MAVFTPFS_SOURCE=(\S+) MAVFTPFS_OPTIONS=$", unit, re.MULTILINE)
+    places = {"${MAVFTPFS_SOURCE}": source, **places}
     found = []
     for line in re.findall(rf"^{key}=-?(.*)$", unit, re.MULTILINE):
         words = shlex.split(line)

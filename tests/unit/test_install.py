@@ -81,7 +81,7 @@ def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece],
 
 
 def test_the_unit_calls_this_program(pieces: dict[str, install.Piece]) -> None:
-    for name, words in (("mavftpfs@", "/dev/%I "), ("mavftpfs-sync@", "sync %I ")):
+    for name, words in (("mavftpfs@", "${MAVFTPFS_SOURCE} "), ("mavftpfs-sync@", "sync %I ")):
         unit = pieces[f"usr/local/lib/systemd/user/{name}.service"].text
         assert f'\nExecStart="/opt/py thon/100%%/mavftpfs" {words}' in unit
         assert "@MAVFTPFS@" not in unit
@@ -100,6 +100,26 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path, name: str) ->
         check=False,
     )
     assert (said.returncode, said.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted_by"),
+    [
+        ("mavftpfs@ttyAMA0.service", "dev-ttyAMA0.device"),
+        (r"mavftpfs@serial-by\x2did-usb\x2dx.service", r"dev-serial-by\x2did-usb\x2dx.device"),
+        ("mavftpfs-sync@udpin:0.0.0.0:14550.service", "default.target"),
+    ],
+)
+def test_units_can_be_enabled(tmp_path: Path, unit: str, wanted_by: str) -> None:
+    place = tmp_path / "etc/systemd/user"
+    place.mkdir(parents=True)
+    for name in install.UNITS:
+        (place / name).write_text(install._unit(Path("/bin/true"), name))
+    words = ["systemctl", f"--root={tmp_path}", "--global", "enable", unit]
+    subprocess.run(words, capture_output=True, timeout=60, check=True)
+    link = place / f"{wanted_by}.wants" / unit
+    assert link.is_symlink()
+    assert Path(link.readlink()).name == f"{unit.partition('@')[0]}@.service"
 
 
 RULE = re.compile(r'(\w+)(\{\w+\})?(==|!=|\+=|=)"([^"]*)"$')
