@@ -22,9 +22,27 @@ from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 
-_DESCRIPTION = "Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory."
-_SOURCES = """SOURCE: udpin:0.0.0.0:14550, udpout:host:port, tcp:host:port, tcpin:host:port, /dev/ttyACM0,
-/dev/ttyUSB0,57600, or the same as a URL; `#/remote/dir` behind it names a subtree."""
+_DESCRIPTION = "Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a directory."
+_FIRST_STEPS = """\
+mavftpfs shows the files of a drone (MAVLink FTP) as a directory:
+
+  mavftpfs scan udpin:0.0.0.0:14550             show what answers on a link
+  mavftpfs /dev/ttyACM0 ~/drone                 mount; ls, cp, rsync, vim work
+  mavftpfs status ~/drone                       show vehicle, link, transfers
+  mavftpfs umount ~/drone                       unmount, and upload what is left
+  mavftpfs sync /dev/ttyACM0 ~/logs             download the new logs
+  mavftpfs ls -lh /dev/ttyACM0 /APM/LOGS        list, without a mount
+  mavftpfs get ~/drone /APM/LOGS/7.BIN          download files, and verify them
+  mavftpfs put ~/drone hover.lua /APM/scripts/  upload files, and verify them
+  mavftpfs param ~/drone 'BATT*'                print, set, save parameters
+  mavftpfs demo                                 take a tour without a drone
+
+All commands and options: mavftpfs --help; of one command: mavftpfs sync --help.
+Man page: man mavftpfs (after mavftpfs install). Everything: docs/guide.md.
+"""
+_SOURCES = """SOURCE: udpin:0.0.0.0:14550, udpout:host:port, tcp:host:port,
+tcpin:host:port, /dev/ttyACM0, /dev/ttyUSB0,57600, or the same as a URL;
+`#/remote/dir` behind it names a subtree."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -110,7 +128,7 @@ def _run(words: list[str]) -> int:
         return run(make_parser(name).parse_intermixed_args(_without_gone_flags(name, words[1:])))
     parser = _top_parser()
     if not words:
-        parser.print_help(sys.stderr)
+        print(_FIRST_STEPS, end="", file=sys.stderr)
         return ExitCode.USAGE
     try:
         args = parser.parse_args(words)
@@ -309,10 +327,10 @@ def _add_verify(parser: Parser) -> None:
 
 
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(
-        name,
-        "Fetch files, and verify them; PATH may be a pattern, as '/log/*/*.ulg': its matches go into LOCAL "
-        "with their directories from the first * on.",
+    parser = _paths_parser(name, "Fetch files, and verify them.")
+    parser.epilog = (
+        "PATH may be a pattern, as '/log/*/*.ulg': its matches go into LOCAL with their directories from the "
+        f"first * on. {_SOURCES}"
     )
     parser.add_argument(
         "--to",
@@ -365,7 +383,7 @@ def _rmdir_parser(name: str) -> Parser:
 
 
 def _mv_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Rename a file or directory of the vehicle, or move several to a directory.")
+    parser = _paths_parser(name, "Rename files and directories of the vehicle, or move them.")
     parser.add_argument("target", metavar="NEW", help="a directory of the vehicle, or the new name")
     return parser
 
@@ -429,7 +447,7 @@ def _hub_parser(name: str) -> Parser:
 def _recover_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
-        description="List what mounts could not deliver, or put it where it belonged on the vehicle.",
+        description="List what mounts could not deliver, or put it back on the vehicle.",
         epilog=_SOURCES,
     )
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="put back to there; default: list")
@@ -447,7 +465,7 @@ def _demo_parser(name: str) -> Parser:
 def _install_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
-        description="Put man pages, completions, the systemd unit and, as root, the udev rule into place.",
+        description="Put man pages, completions, units and the udev rule into place.",
     )
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--print", action="store_true", help="show what would be written")

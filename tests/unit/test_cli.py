@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -136,9 +138,27 @@ def test_harmless_flags_of_0_2_are_ignored_and_named(
     assert len(ran) == len(cli._GONE_FLAGS)
 
 
-def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_words_show_ten_commands_that_can_be_typed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 1
-    assert "SOURCE MOUNTPOINT" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert out == ""
+    shown = re.findall(r"^  mavftpfs (.*\S)  +\S.*$", err, re.MULTILINE)
+    assert len(shown) == 10
+    for words in map(shlex.split, shown):
+        name = words[0] if words[0] in cli._COMMANDS else "mount"
+        cli._COMMANDS[name][0](name).parse_intermixed_args(words[words[0] == name :])
+    assert all(place in err for place in ("mavftpfs --help", "man mavftpfs", "docs/guide.md"))
+    assert max(map(len, err.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("command", ["", *cli._COMMANDS])
+def test_help_fits_80_columns(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main([*filter(None, [command]), "--help"])
+    assert [line for line in capsys.readouterr().out.splitlines() if len(line) > 80] == []
 
 
 UNITS_OF_0_2 = [

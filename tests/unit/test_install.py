@@ -41,7 +41,10 @@ def test_what_was_installed_is_removed_again(
     monkeypatch.setattr(install, "SYSTEMD_RUNS", tmp_path / "nowhere")
     unit = tmp_path / "systemd/user/mavftpfs@.service"
     assert cli.main(["install"]) == 0
-    assert f"wrote {unit}" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"wrote {unit}" in out
+    assert "if the package bash-completion is installed" in out
+    assert "sudo loginctl enable-linger $USER" in out
     assert unit.is_file()
     for _ in range(2):
         assert cli.main(["install", "--remove"]) == 0
