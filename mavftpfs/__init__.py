@@ -1,6 +1,6 @@
 """mavftpfs mounts a drone's files, served over MAVLink FTP, as a local directory.
 
-For Python programs: `mavftpfs.connect(SOURCE)`, and `mavftpfs.trio` for those that run trio.
+For Python programs: `mavftpfs.connect(SOURCE)`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,1 +1,1 @@
-"""A vehicle's files for Python programs: `mavftpfs.connect`, `mavftpfs.trio` and fsspec."""
+"""A vehicle's files for Python programs: `mavftpfs.connect` and fsspec."""

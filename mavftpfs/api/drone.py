@@ -1,28 +1,56 @@
-"""A vehicle's files for ordinary programs and notebooks: `mavftpfs.connect`. Layer: api.
+"""A vehicle's files for programs and notebooks: `mavftpfs.connect`. Layer: api.
 
-Every method is that of `api.vehicle.Drone`, which explains it, called in the event loop's thread.
+The calls are synchronous. Their work is async, and is done in the event loop's thread (`api.portal`).
 """
 
 from __future__ import annotations
 
+import errno
+import io
+import logging
 import os
+import stat
 import warnings
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial, wraps
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, Concatenate, ParamSpec, TypeVar
 
-from mavftpfs.api import vehicle
-from mavftpfs.api.errors import NotDelivered, UsageError
+import trio
+
+from mavftpfs.api.entry import Entry, PathLike, entry, names_directory, remote
+from mavftpfs.api.errors import NotDelivered, UsageError, os_error, translated
 from mavftpfs.api.opened import Opened
-from mavftpfs.api.params import Params
+from mavftpfs.api.params import Number, Params, get_values, set_values
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
-from mavftpfs.api.vehicle import Entry, PathLike
+from mavftpfs.client import download, names, upload
+from mavftpfs.client.choice import Choice
+from mavftpfs.client.connect import open_sinks
+from mavftpfs.client.fetch import Fetcher
+from mavftpfs.client.files import File, Files, Session, Target, walk
+from mavftpfs.client.options import options_of
+from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
+from mavftpfs.client.several import IN_PYTHON
+from mavftpfs.client.source import target_of
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
+from mavftpfs.shared.model import ROOT, EntryKind, join
 
 __all__ = ["Drone", "Entry", "NotDelivered", "UsageError", "connect"]
+
+log = logging.getLogger("mavftpfs.api")
+logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
+"""The caches' warnings are raised as errors, too: a program without logging sees them once."""
+
+ArgsT = ParamSpec("ArgsT")
+ResultT = TypeVar("ResultT")
+
+
+# -- connecting -----------------------------------------------------------------------------------
 
 
 def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
@@ -30,13 +58,94 @@ def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
 
     source: as for `mavftpfs`: a link (`udpin:0.0.0.0:14550`, `/dev/ttyACM0`), or where it is mounted. A mount
     of that vehicle that is up is used, unless `use_mount` is False. options: those of a mount, by name:
-    `target_system=2, signing_key="key", ro=True`.
+    `target_system=2, signing_key="key", ro=True`. One that is gone is a DeprecationWarning.
 
     Raises:
         TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
         opened. UsageError (a ValueError): source or an option is wrong; the text names it.
     """
-    return Drone(source, LoopThread(lambda: vehicle.connect(source, use_mount=use_mount, **options), source))
+    with translated():
+        # A mount keeps editors' swap files in memory, but a program's files are meant for the card.
+        target = target_of(source, replace(options_of(options), local=()))
+        if target.mount is not None and not use_mount:
+            raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
+    for line in target.options.gone:
+        warnings.warn(line, DeprecationWarning, stacklevel=2)
+    return Drone(source, LoopThread(partial(_connected, target, use_mount=use_mount), source))
+
+
+@dataclass(slots=True)
+class _Connected:
+    """What the event loop's thread has of a vehicle. opened: the open files. is_meant: the vehicle is known
+    to be the one that the program changes."""
+
+    session: Session
+    opened: set[Opened] = field(default_factory=set)
+    is_meant: bool = False
+
+    async def require_one_vehicle(self) -> None:
+        """Check before the first change that no other vehicle may be meant. One that comes later is not.
+
+        Raises:
+            UsageError: several vehicles are on the link, and `target_system` does not name one.
+        """
+        if not self.is_meant:
+            await self.session.require_one_vehicle(IN_PYTHON)
+            self.is_meant = True
+
+    async def close_files(self) -> None:
+        """Close the open files, take back what was written to them, and log it."""
+        for opened in list(self.opened):
+            if opened.writable:
+                log.error("%s was not closed: what was written to it is withdrawn", opened.name)
+            await opened.abandon()
+
+
+@asynccontextmanager
+async def _connected(target: Target, *, use_mount: bool) -> AsyncIterator[_Connected]:
+    """Connect for the length of the body; return after the vehicle's session is closed."""
+    with translated(), open_sinks(target.options, debug=False, tell=log.info) as sinks:
+        target = replace(target, sinks=sinks)
+        up = target.session(writing=True, list_root=True, use_mount=use_mount)
+        async with up as session, session.noting_others(log.warning, IN_PYTHON):
+            connected = _Connected(session)
+            try:
+                yield connected
+            finally:
+                with trio.CancelScope(shield=True):
+                    await connected.close_files()
+
+
+def in_loop(
+    method: Callable[Concatenate[Drone, ArgsT], Awaitable[ResultT]],
+) -> Callable[Concatenate[Drone, ArgsT], ResultT]:
+    """Make an async method one that waits for its result, and raises the errors that programs get."""
+
+    @wraps(method)
+    def call(self: Drone, /, *args: ArgsT.args, **kwargs: ArgsT.kwargs) -> ResultT:
+        async def work() -> ResultT:
+            with translated():
+                return await method(self, *args, **kwargs)
+
+        return self._loop.call(work)
+
+    return call
+
+
+def changing(
+    method: Callable[Concatenate[Drone, ArgsT], Awaitable[ResultT]],
+) -> Callable[Concatenate[Drone, ArgsT], ResultT]:
+    """As in_loop, for a method that changes something on the vehicle, which must be the one that is meant."""
+
+    @wraps(method)
+    async def checked(self: Drone, /, *args: ArgsT.args, **kwargs: ArgsT.kwargs) -> ResultT:
+        await self._connected.require_one_vehicle()
+        return await method(self, *args, **kwargs)
+
+    return in_loop(checked)
+
+
+# -- the calls ------------------------------------------------------------------------------------
 
 
 class Drone:
@@ -45,17 +154,19 @@ class Drone:
     Paths are text, bytes or path-like; relative ones begin at the root. Errors are OSErrors of the right kind
     (FileNotFoundError, PermissionError, TimeoutError ...), whose text is a sentence for people. After a fork
     every call raises RuntimeError, and after `close` ValueError.
+
+    Attributes:
+        source: as it was given. mountpoint: of the mount whose files these are; None for a connection of its
+            own.
     """
 
-    def __init__(self, source: str, loop: LoopThread[vehicle.Drone]) -> None:
+    def __init__(self, source: str, loop: LoopThread[_Connected]) -> None:
         self.source = source
         self._loop = loop
-        self._drone = loop.value
-
-    @property
-    def mountpoint(self) -> str | None:
-        """The mount whose files these are; None for a connection of its own."""
-        return self._drone.mountpoint
+        self._connected = loop.value
+        self._session = loop.value.session
+        self._files = self._session.files
+        self.mountpoint = self._session.mountpoint
 
     @property
     def closed(self) -> bool:
@@ -65,7 +176,7 @@ class Drone:
     @property
     def has_open_files(self) -> bool:
         """Whether a file of it is open."""
-        return self._drone.has_open_files
+        return bool(self._connected.opened)
 
     def close(self) -> None:
         """Close the vehicle's session. Files that were written and are still open are withdrawn, and named in
@@ -92,83 +203,166 @@ class Drone:
     def __repr__(self) -> str:
         return f"<Drone {self.source}>"
 
+    async def _existing(self, path: PathLike) -> bytes:
+        """Return a path as the client has it. If it ends in a slash, it is checked that it is no file.
+
+        Raises:
+            NotADirectory, NotFound: it ends in a slash.
+        """
+        wanted = remote(path)
+        if names_directory(path) and (await self._files.stat(wanted)).kind is EntryKind.FILE:
+            raise NotADirectory(f"{wanted!r} is not a directory")
+        return wanted
+
     # --- looking
 
-    def stat(self, path: PathLike) -> Entry:
-        """Return what a path is."""
-        return self._loop.call(self._drone.stat, path)
+    @in_loop
+    async def stat(self, path: PathLike) -> Entry:
+        """Return what a path is.
 
-    def scandir(self, path: PathLike = "/") -> Iterator[Entry]:
-        """Yield what is in a directory. An incomplete listing is an error."""
-        return iter(self._loop.call(self._drone.scandir, path))
+        Raises:
+            FileNotFoundError, NotADirectoryError.
+        """
+        wanted = await self._existing(path)
+        return entry(wanted, await self._files.stat(wanted))
+
+    @in_loop
+    async def scandir(self, path: PathLike = "/") -> Iterator[Entry]:
+        """Yield what is in a directory. An incomplete listing is an error.
+
+        Raises:
+            FileNotFoundError, NotADirectoryError.
+        """
+        wanted = remote(path)
+        return iter([entry(join(wanted, name), stat) for name, stat in await self._files.list(wanted)])
 
     def listdir(self, path: PathLike = "/") -> list[str]:
         """Return the names in a directory."""
-        return self._loop.call(self._drone.listdir, path)
+        return [found.name for found in self.scandir(path)]
 
-    def walk(self, path: PathLike = "/") -> Iterator[Entry]:
-        """Yield all that is below a directory, parents first."""
-        return iter(self._loop.call(self._drone.walk, path))
+    @in_loop
+    async def walk(self, path: PathLike = "/") -> Iterator[Entry]:
+        """Yield all that is below a directory, parents first.
+
+        Raises:
+            As scandir, of any directory below, too.
+        """
+        top = remote(path)
+        found, unlisted = await walk(self._files, top)
+        for _, error in unlisted:
+            raise error
+        return iter([entry(join(top, below), stat) for below, stat in found])
 
     def exists(self, path: PathLike) -> bool:
         """Return whether there is something of that name."""
-        return self._loop.call(self._drone.exists, path)
+        return self._kind(path) is not None
 
     def is_dir(self, path: PathLike) -> bool:
         """Return whether there is a directory of that name."""
-        return self._loop.call(self._drone.is_dir, path)
+        return self._kind(path) is EntryKind.DIRECTORY
 
     def is_file(self, path: PathLike) -> bool:
         """Return whether there is a file of that name."""
-        return self._loop.call(self._drone.is_file, path)
+        return self._kind(path) is EntryKind.FILE
 
-    def crc32(self, path: PathLike) -> int:
-        """Have the vehicle compute a file's CRC32."""
-        return self._loop.call(self._drone.crc32, path)
+    @in_loop
+    async def _kind(self, path: PathLike) -> EntryKind | None:
+        try:
+            return (await self._files.stat(await self._existing(path))).kind
+        except (NotFound, NotADirectory):
+            return None
 
-    def status(self) -> dict[str, Any]:
+    @in_loop
+    async def crc32(self, path: PathLike) -> int:
+        """Have the vehicle compute a file's CRC32: start value 0, and no final xor."""
+        return await self._files.crc32(await self._existing(path))
+
+    @in_loop
+    async def status(self) -> dict[str, Any]:
         """Return what `mavftpfs status --json` tells of vehicle, link and transfers."""
-        return self._loop.call(self._drone.status)
+        return dict(await self._session.status())
 
-    def refresh(self) -> None:
+    @in_loop
+    async def refresh(self) -> None:
         """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
-        self._loop.call(self._drone.refresh)
+        await self._files.refresh()
 
     # --- parameters
 
     @property
     def params(self) -> Params:
         """The vehicle's parameters, a mapping: `drone.params["MPC_XY_CRUISE"] = 4.5`."""
-        call, drone = self._loop.call, self._drone
-        return Params(partial(call, drone.get_params), partial(call, drone.set_params))
+        return Params(self._get_params, self._set_params)
+
+    @in_loop
+    async def _get_params(self) -> dict[str, Number]:
+        return await get_values(self._session)
+
+    @changing
+    async def _set_params(self, values: Mapping[str, Number]) -> None:
+        await set_values(self._session, values)
 
     # --- changing names
 
-    def mkdir(self, path: PathLike, *, parents: bool = False, exist_ok: bool = False) -> None:
-        """Make a directory, and with `parents` those above it."""
-        self._loop.call(partial(self._drone.mkdir, path, parents=parents, exist_ok=exist_ok))
+    @changing
+    async def mkdir(self, path: PathLike, *, parents: bool = False, exist_ok: bool = False) -> None:
+        """Make a directory, and with `parents` those above it.
 
-    def rmdir(self, path: PathLike) -> None:
+        Raises:
+            FileExistsError, FileNotFoundError.
+        """
+        wanted = remote(path)
+        if wanted == ROOT:
+            if exist_ok:
+                return
+            raise AlreadyExists("the root is there")
+        for above in names.ancestors(wanted) if parents else []:
+            await names.make_directory(self._files, above, may_exist=True)
+        await names.make_directory(self._files, wanted, may_exist=exist_ok)
+
+    @changing
+    async def rmdir(self, path: PathLike) -> None:
         """Remove an empty directory."""
-        self._loop.call(self._drone.rmdir, path)
+        await names.remove_directories(self._session, [remote(path)])
 
-    def remove(self, path: PathLike, *, recursive: bool = False) -> None:
-        """Remove a file; with `recursive` a directory with all below, too."""
-        self._loop.call(partial(self._drone.remove, path, recursive=recursive))
+    @changing
+    async def remove(self, path: PathLike, *, recursive: bool = False) -> None:
+        """Remove a file; with `recursive` a directory with all below, too.
+
+        Raises:
+            FileNotFoundError, IsADirectoryError.
+        """
+        wanted = await self._existing(path)
+        names.refuse_root([wanted])
+        if recursive:
+            await names.remove_paths(self._session, [wanted], recursive=True)
+        else:
+            await self._files.unlink(wanted)
 
     unlink = remove
 
-    def rename(self, old: PathLike, new: PathLike) -> None:
+    @changing
+    async def rename(self, old: PathLike, new: PathLike) -> None:
         """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
-        self._loop.call(self._drone.rename, old, new)
+        source, target = await self._existing(old), remote(new)
+        if names_directory(new) and (await self._files.stat(source)).kind is EntryKind.FILE:
+            raise NotADirectory(f"{source!r} is not a directory")
+        await names.move(self._files, source, target)
 
-    def copy(self, old: PathLike, new: PathLike) -> None:
+    @changing
+    async def copy(self, old: PathLike, new: PathLike) -> None:
         """Copy a file, by way of this computer."""
-        self._loop.call(self._drone.copy, old, new)
+        source = await self._existing(old)
+        if names_directory(new):
+            raise IsADirectory(f"{remote(new)!r} is a directory")
+        await names.copy(self._files, source, remote(new))
 
-    def truncate(self, path: PathLike, size: int) -> None:
+    @changing
+    async def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it by zeros."""
-        self._loop.call(self._drone.truncate, path, size)
+        if size < 0:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        await self._files.truncate(await self._existing(path), size)
 
     # --- files
 
@@ -192,7 +386,8 @@ class Drone:
         opened: list[Opened] = []
 
         async def work() -> None:
-            opened.append(await self._drone.open_raw(path, how.plain))
+            with translated():
+                opened.append(await self._open(path, how.plain))
 
         try:
             self._loop.call(work)
@@ -202,25 +397,65 @@ class Drone:
             raise
         return python_file(opened[0], self._loop, how, owner=self)
 
-    def read_bytes(self, path: PathLike) -> bytes:
-        """Return a file's content."""
-        return self._loop.call(self._drone.read_bytes, path)
+    async def _open(self, path: PathLike, mode: str) -> Opened:
+        """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""
+        if mode != "r":
+            await self._connected.require_one_vehicle()
+        wanted, files = remote(path), self._files
+        if mode[0] == "r":
+            await self._existing(path)
+        elif names_directory(path):
+            raise IsADirectory(f"{wanted!r} is a directory")
+        match mode[0]:
+            case "r":
+                file = await files.open(wanted, write="+" in mode)
+            case "w":
+                file = await names.emptied(files, wanted)
+            case "x":
+                file = await files.create(wanted, exclusive=True)
+            case _:
+                file = await _opened_or_made(files, wanted)
+        opened = Opened(
+            os.fsdecode(wanted), file, writable=mode != "r", forget=self._connected.opened.discard
+        )
+        self._connected.opened.add(opened)
+        return opened
 
-    def write_bytes(self, path: PathLike, data: bytes) -> None:
-        """Make a file or replace its content; back when it is on the card, checked."""
-        self._loop.call(self._drone.write_bytes, path, data)
+    @in_loop
+    async def read_bytes(self, path: PathLike) -> bytes:
+        """Return a file's content."""
+        opened = await self._open(path, "r")
+        try:
+            return await opened.read_to_end(0)
+        finally:
+            await opened.close()
+
+    @in_loop
+    async def write_bytes(self, path: PathLike, data: bytes) -> None:
+        """Make a file or replace its content; back when it is on the card, checked.
+
+        Raises:
+            NotDelivered: it is not; see there.
+        """
+        view = memoryview(data).cast("B")
+        opened = await self._open(path, "w")
+        try:
+            await opened.write(0, view)
+        finally:
+            await opened.close()
 
     def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
         """Return a file's content as text, each end of a line as `\\n`."""
-        return self._loop.call(self._drone.read_text, path, encoding)
+        return io.TextIOWrapper(io.BytesIO(self.read_bytes(path)), encoding).read()
 
     def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:
         """Make a file or replace its content by a text."""
-        self._loop.call(self._drone.write_text, path, text, encoding)
+        self.write_bytes(path, text.encode(encoding))
 
     # --- many files
 
-    def get(
+    @in_loop
+    async def get(
         self,
         path: PathLike,
         local: str | os.PathLike[str] = ".",
@@ -228,14 +463,27 @@ class Drone:
         recursive: bool = False,
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Fetch a file, or with `recursive` a directory, proven; return the local files."""
-        return self._loop.call(partial(self._drone.get, path, local, recursive=recursive, verify=verify))
+        """Fetch a file, or with `recursive` a directory, proven; return the local files.
 
-    def put(self, local: str | os.PathLike[str], path: PathLike, *, recursive: bool = False) -> list[str]:
-        """Put a file, or with `recursive` a directory, on the vehicle; return the paths that are there."""
-        return self._loop.call(partial(self._drone.put, local, path, recursive=recursive))
+        A file goes into `local` if that is a directory, else it gets that name. A directory goes into
+        `local`.
 
-    def sync(
+        Raises:
+            OSError: something did not come; the text says how much did.
+        """
+
+        async def work(downloads: download.Downloads) -> None:
+            wanted = await self._existing(path)
+            try:
+                await downloads.get([wanted], Path(local), into=False, recursive=recursive)
+            except IsADirectory as exc:
+                raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True") from exc
+
+        outcome = await self._download(verify, work)
+        return [*(fetched.wanted.local for fetched in outcome.fetched), *(one.local for one in outcome.here)]
+
+    @in_loop
+    async def sync(
         self,
         local: str | os.PathLike[str],
         *,
@@ -244,6 +492,58 @@ class Drone:
         since: float | None = None,
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here."""
-        call = partial(self._drone.sync, local, place=place, newest=newest, since=since, verify=verify)
-        return self._loop.call(call)
+        """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here.
+
+        place: their directory on the vehicle; None to find it. newest: at most so many; since: not older,
+        seconds since 1970 UTC.
+
+        Raises:
+            OSError: a log did not come; the text says how many did.
+        """
+        where = None if place is None else remote(place)
+        wish = download.Wish(Path(local), where, Choice(newest, since))
+        outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
+        return [fetched.wanted.local for fetched in outcome.fetched]
+
+    async def _download(
+        self, verify: Verify, work: Callable[[download.Downloads], Awaitable[None]]
+    ) -> download.Outcome:
+        outcome = download.Outcome()
+        fetcher = Fetcher(self._session, Progress(), verify)
+        await work(download.Downloads(fetcher, outcome, _ignore, _ignore))
+        for path, error in outcome.failed.items():
+            count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
+            raise os_error(error, f"{download.named(path, error)}; {count} of {of} files are here") from error
+        return outcome
+
+    @changing
+    async def put(
+        self, local: str | os.PathLike[str], path: PathLike, *, recursive: bool = False
+    ) -> list[str]:
+        """Put a file, or with `recursive` a directory, on the vehicle; return the paths that are there.
+
+        `path` is an existing directory, or the new name.
+
+        Raises:
+            FileNotFoundError, IsADirectoryError: of `local`. NotDelivered: a file is not there; see there.
+        """
+        told: list[str] = []
+        if stat.S_ISDIR(os.stat(local).st_mode) and not recursive:
+            raise IsADirectory(f"{os.fspath(local)} is a directory; put it with recursive=True")
+        found = upload.collect(Path(local), recursive=recursive)
+        batches = [(Path(local), found)]
+        tell = lambda where, size, how: told.append(os.fsdecode(where))  # noqa: E731
+        into = names_directory(path)
+        await upload.put_paths(self._session, batches, remote(path), Progress(), tell, into=into)
+        return told
+
+
+async def _opened_or_made(files: Files, path: bytes) -> File:
+    try:
+        return await files.open(path, write=True, append=True)
+    except NotFound:
+        return await files.create(path, exclusive=False)
+
+
+def _ignore(told: object) -> None:
+    """Nothing is shown of single files."""

@@ -16,9 +16,8 @@ from typing import Any
 
 from fsspec import AbstractFileSystem
 
-from mavftpfs.api.drone import Drone, UsageError, connect
+from mavftpfs.api.drone import Drone, Entry, UsageError, connect
 from mavftpfs.api.pythonfile import READ_BUFFER
-from mavftpfs.api.vehicle import Entry
 from mavftpfs.protocol.url import is_url, parse_url
 
 IDLE = 60.0

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from mavftpfs.api.errors import translated, whereabouts
 from mavftpfs.client.files import File, Writing, close_reader
-from mavftpfs.shared.errors import MavftpfsError, NotDelivered
+from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.api")
 
@@ -33,7 +33,6 @@ class Opened:
         self._forget = forget
         self._failure: BaseException | None = None
         self._closed = False
-        self._abandoned = False
         self._changed = False
 
     @property
@@ -93,12 +92,10 @@ class Opened:
         """Deliver what was written; or have nothing of it on the card, and raise NotDelivered.
 
         Raises:
-            NotDelivered. Also if the file was abandoned.
+            NotDelivered.
         """
         with translated():
             if self._closed:
-                if self._abandoned and self.writable:
-                    raise NotDelivered(f"{self.name} was given up before it was closed", there=self.there)
                 return
             self._end()
             if not self.writable:
@@ -116,7 +113,6 @@ class Opened:
         if self._closed:
             return
         self._end()
-        self._abandoned = True
         await self._writing.take_back(whole=not self._changed)
         if self.there is None:
             log.error("%s: %s", self.name, whereabouts(None))

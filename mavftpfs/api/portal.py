@@ -14,7 +14,7 @@ import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractAsyncContextManager, suppress
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import trio
 
@@ -23,40 +23,6 @@ ResultT = TypeVar("ResultT")
 
 EXIT_PATIENCE = 10.0
 """Seconds that the end of the interpreter waits for the sessions to be closed."""
-
-
-class Portal(Protocol):
-    """A way from threads into an event loop."""
-
-    def call(self, function: Callable[..., Awaitable[ResultT]], *args: Any) -> ResultT:
-        """Have an async function run in the loop; return its result, or raise its error."""
-
-    def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """Have a function run, and do not wait. For finalizers: from any thread, also the loop's, at any
-        time."""
-
-
-class TaskPortal:
-    """A Portal of a trio program, for the threads that trio starts."""
-
-    def __init__(self, nursery: trio.Nursery) -> None:
-        """`nursery`: runs what is posted."""
-        self._nursery = nursery
-        self._token = trio.lowlevel.current_trio_token()
-
-    def call(self, function: Callable[..., Awaitable[ResultT]], *args: Any) -> ResultT:
-        """See Portal. Cancelling the task that waits for the thread cancels this, too."""
-        return trio.from_thread.run(function, *args)
-
-    def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """See Portal."""
-        with suppress(trio.RunFinishedError):
-            self._token.run_sync_soon(_start, self._nursery, function, args)
-
-
-def _start(nursery: trio.Nursery, function: Callable[..., Awaitable[None]], args: tuple[Any, ...]) -> None:
-    with suppress(RuntimeError):  # it has just been closed
-        nursery.start_soon(function, *args)
 
 
 class Closed(ValueError):
@@ -90,7 +56,7 @@ class _Call(Generic[ResultT]):
 
 
 class LoopThread(Generic[T]):
-    """Runs an async context in a thread of its own, and calls from other threads in it. A Portal.
+    """Runs an async context in a thread of its own, and calls from other threads in it.
 
     | | from | waits for |
     |---|---|---|
@@ -135,7 +101,8 @@ class LoopThread(Generic[T]):
     # --- from any thread
 
     def call(self, function: Callable[..., Awaitable[ResultT]], *args: Any) -> ResultT:
-        """See Portal. Ctrl-C ends the call in order; a second one does not wait for that.
+        """Have an async function run in the loop; return its result. Ctrl-C ends the call in order; a second
+        one does not wait for that.
 
         Raises:
             RuntimeError: after a fork, or from the loop's own thread. Closed. Else what the function raises.
@@ -163,7 +130,7 @@ class LoopThread(Generic[T]):
         return call.outcome.result()
 
     def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """See Portal. Does nothing after the loop has ended."""
+        """Have a function run, and do not wait; after the loop has ended, do nothing."""
         if os.getpid() == self._pid:
             self._soon(self._spawn, _Call(function, args))
 

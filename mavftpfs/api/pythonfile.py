@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from mavftpfs.api.errors import NotDelivered, note_or_raise, whereabouts
 from mavftpfs.api.opened import Opened
-from mavftpfs.api.portal import Closed, Portal
+from mavftpfs.api.portal import Closed, LoopThread
 
 log = logging.getLogger("mavftpfs.api")
 
@@ -92,14 +92,14 @@ class RawFile(_Ending, io.RawIOBase):
         name, mode: as of io.FileIO.
     """
 
-    def __init__(self, opened: Opened, portal: Portal, mode: Mode, owner: object = None) -> None:
+    def __init__(self, opened: Opened, loop: LoopThread[Any], mode: Mode, owner: object = None) -> None:
         """`owner` lives as long as this file."""
         super().__init__()
         self._owner = owner
         self.name = opened.name
         self.mode = mode.plain + "b"
         self._opened = opened
-        self._portal = portal
+        self._loop = loop
         self._mode = mode
         self._pid = os.getpid()
         self._at = opened.size if mode.plain[0] == "a" else 0
@@ -131,7 +131,7 @@ class RawFile(_Ending, io.RawIOBase):
             further = self._at == self._read_to
             self._ahead = min(2 * self._ahead, READ_BUFFER) if further else FIRST_READ
             size = min(size, self._ahead)
-        data = self._portal.call(self._opened.read, self._at, size)
+        data = self._loop.call(self._opened.read, self._at, size)
         view[: len(data)] = data
         self._at += len(data)
         self._read_to = self._at
@@ -140,7 +140,7 @@ class RawFile(_Ending, io.RawIOBase):
     def readall(self) -> bytes:
         """Return all that follows."""
         self._require(self._mode.reads, "readable")
-        data = self._portal.call(self._opened.read_to_end, self._at)
+        data = self._loop.call(self._opened.read_to_end, self._at)
         self._at += len(data)
         return data
 
@@ -150,7 +150,7 @@ class RawFile(_Ending, io.RawIOBase):
         self._require(self._mode.writes, "writable")
         at = None if self._mode.plain[0] == "a" else self._at
         try:
-            self._at = self._portal.call(self._opened.write, at, taken)
+            self._at = self._loop.call(self._opened.write, at, taken)
         except BaseException as exc:  # it may be written already, and Python's buffer will write it again
             self._opened.fail(exc)
             raise
@@ -178,7 +178,7 @@ class RawFile(_Ending, io.RawIOBase):
         size = self._at if size is None else size
         if size < 0:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-        self._portal.call(self._opened.truncate, size)
+        self._loop.call(self._opened.truncate, size)
         return size
 
     def close(self) -> None:
@@ -191,7 +191,7 @@ class RawFile(_Ending, io.RawIOBase):
             return
         super().close()
         try:
-            self._portal.call(self._opened.close)
+            self._loop.call(self._opened.close)
         except Closed:
             if self._mode.writes:
                 raise
@@ -208,7 +208,7 @@ class RawFile(_Ending, io.RawIOBase):
         if self._opened.closed:
             return
         lost = ": what was written to it is withdrawn" if self._mode.writes else ""
-        self._portal.post(self._opened.abandon)
+        self._loop.post(self._opened.abandon)
         if lost:
             log.error("%s was not closed%s", self.name, lost)
         warnings.warn(f"{self.name} was not closed{lost}", ResourceWarning, stacklevel=2, source=self)
@@ -237,9 +237,9 @@ class _Random(_Buffer, io.BufferedRandom): ...
 class _Text(_Buffer, io.TextIOWrapper): ...
 
 
-def python_file(opened: Opened, portal: Portal, mode: Mode, *, owner: object = None) -> IO[Any]:
+def python_file(opened: Opened, loop: LoopThread[Any], mode: Mode, *, owner: object = None) -> IO[Any]:
     """Return what the builtin open() would; `owner` lives as long as it."""
-    raw: Any = RawFile(opened, portal, mode, owner)
+    raw: Any = RawFile(opened, loop, mode, owner)
     if mode.buffering == 0:
         return raw  # type: ignore[no-any-return]
     size = mode.buffering if mode.buffering > 1 else WRITE_BUFFER if mode.writes else READ_BUFFER

@@ -327,6 +327,15 @@ def test_why_there_is_no_connection(
         mavftpfs.connect(source, **options)
 
 
+def test_an_option_that_is_gone_is_a_warning_where_the_program_gives_it() -> None:
+    with (
+        pytest.warns(DeprecationWarning, match="option window is gone, and is ignored") as told,
+        pytest.raises(FileNotFoundError),
+    ):
+        mavftpfs.connect("/dev/ttyNOWHERE", window=4)
+    assert [one.filename for one in told] == [__file__]
+
+
 def test_a_port_that_is_taken() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))

@@ -11,16 +11,14 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-import trio
 
 import mavftpfs
-import mavftpfs.trio
-from mavftpfs.api.triofile import AsyncFile
 from mavftpfs.client.files import mount_status
 from mavftpfs.shared.errors import LinkClosed
 from tests.mount.conftest import Field
@@ -376,123 +374,35 @@ def test_importing_it_loads_little(tmp_path: Path) -> None:
         return set(subprocess.check_output([sys.executable, "-c", show], text=True, cwd=tmp_path).split())
 
     assert not {"trio", "pymavlink", "logging"} & loaded("import mavftpfs")
-    everything = loaded("import mavftpfs.trio; mavftpfs.connect")
+    everything = loaded("import mavftpfs; mavftpfs.connect")
     assert "mavftpfs.api.drone" in everything
     assert not {"pyfuse3", "rich", "argparse", "mavftpfs.cli", "mavftpfs.mount"} & everything
     assert not {"pyfuse3", "rich"} & loaded("import mavftpfs.cli.param")
 
 
-# -- trio -----------------------------------------------------------------------------------------
+# -- interrupted, and beside others ---------------------------------------------------------------
 
 
-async def test_the_same_for_trio(sim: SimVehicle, tmp_path: Path) -> None:
-    async with mavftpfs.trio.connect(sim.source) as drone:
-        assert [entry.name for entry in await drone.scandir("/")] == ["f"]
-        async with await drone.open("/n", "w") as file:
-            await file.write("one\ntwo\n")
-        async with await drone.open("/n") as file:
-            assert [line async for line in file] == ["one\n", "two\n"]
-        await drone.rename("/n", "/m")
-        with pytest.raises(FileNotFoundError, match="'/n' does not exist"):
-            await drone.open("/n")
-        assert await drone.get("/m", tmp_path) == [tmp_path / "m"]
-        lost = [await drone.open("/lost", "w")]
-        await lost[0].write("half")
-        with pytest.warns(ResourceWarning, match="/lost was not closed"):
-            lost.clear()
-        for _ in range(round(PATIENCE)):
-            if not await drone.exists("/lost"):
-                return
-            await trio.sleep(0.1)
-        raise AssertionError("it is not withdrawn")
-
-
-async def test_a_file_that_was_given_up_is_not_closed_as_if_it_were_there(sim: SimVehicle) -> None:
-    async with mavftpfs.trio.connect(sim.source) as drone:
-        file = await drone.open("/f", "wb", buffering=0)
-        await file.write(NEW)
-    with pytest.raises(mavftpfs.NotDelivered, match="given up before it was closed") as caught:
-        await file.aclose()
-    assert caught.value.on_vehicle is False
-    assert on_card(sim) == {"f": OLD}
-
-
-async def test_an_error_of_the_program_is_not_replaced_by_that_of_its_file(sim: SimVehicle) -> None:
-    async def write_half(drone: mavftpfs.trio.Drone) -> None:
-        async with await drone.open("/f", "w") as file:
-            await file.write("half")
+def test_an_error_of_the_program_is_not_replaced_by_that_of_its_file(sim: SimVehicle) -> None:
+    def write_half(drone: mavftpfs.Drone) -> None:
+        with drone.open("/f", "w") as file:
+            file.write("half")
             raise KeyError("of the program")
 
-    async with mavftpfs.trio.connect(sim.source, **QUICK) as drone:
-        with silent(sim), pytest.raises(KeyError) as caught:
-            await write_half(drone)
+    with mavftpfs.connect(sim.source, **QUICK) as drone, silent(sim), pytest.raises(KeyError) as caught:
+        write_half(drone)
     assert "withdrawn" in caught.value.__notes__[0]
 
 
-async def test_an_error_of_the_program_shows_its_own_place(sim: SimVehicle) -> None:
-    async def work(drone: mavftpfs.trio.Drone) -> None:
-        await drone.remove("/", recursive=True)
-
-    with pytest.raises(mavftpfs.UsageError) as caught:
-        async with mavftpfs.trio.connect(sim.source) as drone:
-            await work(drone)
-    assert "work" in [entry.name for entry in caught.traceback]
-
-
 @pytest.mark.mount
-async def test_many_files_at_once_through_a_mount(sim: SimVehicle, field: Field) -> None:
-    """Each waits in a thread for the event loop, and that needs threads of its own: there are 40."""
+def test_many_files_at_once_through_a_mount(sim: SimVehicle, field: Field) -> None:
+    """The event loop has 40 threads for calls that block."""
     mount = field.mount(sim.source)
-    came = []
-
-    async def read(file: AsyncFile) -> None:
-        came.append(await file.read())
-        await file.aclose()
-
-    with trio.fail_after(PATIENCE):
-        async with mavftpfs.trio.connect(str(mount.path)) as drone, trio.open_nursery() as nursery:
-            for file in [await drone.open("/f", "rb") for _ in range(50)]:
-                nursery.start_soon(read, file)
-    assert came == 50 * [OLD]
-
-
-async def test_trio_cancels_a_call(sim: SimVehicle) -> None:
-    async with mavftpfs.trio.connect(sim.source, op_deadline=5) as drone:
-        with silent(sim), trio.move_on_after(0.3) as scope:
-            async with await drone.open("/f", "w") as file:
-                await file.write("half")
-                await file.flush()
-                await drone.stat("/nothing")
-        assert scope.cancelled_caught
-        for _ in range(round(PATIENCE)):
-            with suppress(TimeoutError):
-                assert await drone.read_bytes("/f") == OLD
-                return
-            await trio.sleep(0.1)
-        raise AssertionError("it does not answer any more")
-
-
-@pytest.mark.mount
-async def test_a_mount_that_does_not_answer_stops_no_other_task(sim: SimVehicle, field: Field) -> None:
-    mount = field.mount(sim.source)
-    assert mount.process is not None
-    turns = 0
-
-    async def work() -> None:
-        nonlocal turns
-        while True:
-            await trio.sleep(0.01)
-            turns += 1
-
-    async with mavftpfs.trio.connect(str(mount.path)) as drone, trio.open_nursery() as nursery:
-        mount.process.popen.send_signal(signal.SIGSTOP)
-        try:
-            nursery.start_soon(work)
-            await drone.refresh()
-        finally:
-            mount.process.popen.send_signal(signal.SIGCONT)
-        nursery.cancel_scope.cancel()
-    assert turns > 0
+    with mavftpfs.connect(str(mount.path)) as drone, ThreadPoolExecutor(50) as threads:
+        files = [drone.open("/f", "rb", buffering=0) for _ in range(50)]
+        assert list(threads.map(lambda file: file.read(), files, timeout=PATIENCE)) == 50 * [OLD]
+        for file in files:
+            file.close()
 
 
 @pytest.mark.mount
@@ -518,7 +428,7 @@ async def test_a_mount_that_hangs_holds_one_thread_however_often_it_is_asked(
 
 @pytest.mark.mount
 @pytest.mark.holds("promise 2")
-async def test_through_a_mount_a_cancelled_open_empties_nothing(sim: SimVehicle, field: Field) -> None:
+def test_through_a_mount_an_interrupted_open_empties_nothing(sim: SimVehicle, field: Field) -> None:
     """The kernel's open goes on in its thread. What it opens is closed, and the old file stays."""
     mount = field.mount(sim.source, "op_deadline=5", "dir_timeout=0")
 
@@ -526,11 +436,10 @@ async def test_through_a_mount_a_cancelled_open_empties_nothing(sim: SimVehicle,
         links = [Path("/proc/self/fd", number) for number in os.listdir("/proc/self/fd")]
         return [place for place in map(os.path.realpath, links) if place.startswith(f"{mount.path}/")]
 
-    async with mavftpfs.trio.connect(str(mount.path)) as drone:
+    with mavftpfs.connect(str(mount.path)) as drone:
         for path, mode in (("/f", "wb"), ("/f", "rb"), ("/fresh", "xb")):
-            with silent(sim), trio.move_on_after(0.5) as scope:
-                await drone.open(path, mode)
-            assert scope.cancelled_caught
-            await trio.sleep(2)
+            with silent(sim), pytest.raises(KeyboardInterrupt), ctrl_c():
+                drone.open(path, mode)
+            time.sleep(2)
         assert open_here() == []
     assert on_card(sim) == {"f": OLD}
