@@ -63,8 +63,8 @@ class Choice:
             return ""
         size = readable_size(sum(log.size - log.begun for log in undated))
         return (
-            f"--since leaves out no log without a time, and the vehicle tells none for {len(undated)} of "
-            f"{len(logs)} logs ({size}); use --newest N to fetch fewer"
+            f"--since does not leave out {len(undated)} of {len(logs)} logs ({size}), because the vehicle "
+            "tells no time for them; use --newest N to fetch fewer"
         )
 
 

@@ -396,7 +396,9 @@ async def vehicles_below(mountpoint: str) -> dict[str, str]:
     """
     status = await mount_status(mountpoint, several=True)
     if "members" not in status:
-        raise errors.UsageError(f"only one vehicle is mounted on {mountpoint}")
+        raise errors.UsageError(
+            f"only one vehicle is mounted on {mountpoint}; name a FILE to compare it with"
+        )
     return {
         member["name"]: os.path.join(mountpoint, member["name"]) if member["state"] == "mounted" else ""
         for member in status["members"]
