@@ -437,7 +437,6 @@ def _status_parser(name: str) -> Parser:
 def _hub_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Show what shares a port, or stop that.", epilog=_SOURCES)
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="only this port; default: all")
-    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--stop", action="store_true", help="end it; says first what that would cut")
     parser.add_argument("--force", action="store_true", help="with --stop: also what is in use")
     parser.add_argument("--take-over", help=argparse.SUPPRESS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -33,9 +32,6 @@ def hub(args: argparse.Namespace) -> int:
     if args.stop:
         return _stop(args)
     found = statuses(args.source)
-    if args.json:
-        print(json.dumps(found, indent=2))
-        return ExitCode.OK
     for facts in found:
         for line in status_lines(facts):
             print(printable(line))
