@@ -59,16 +59,19 @@ class Storage:
         """Return the directory in readdir order; FAT has no dot entries."""
         if self.virtual.owns(path):
             return self.virtual.entries(path)
-        found = self._tree.entries(self._resolve(path))
+        folder = self._resolve(path)
+        found = self._tree.entries(folder)
         if self._fat:
-            found = [self._fat_entry(entry) for entry in found if entry.name not in (b".", b"..")]
+            below = folder.rstrip(b"/") + b"/"
+            found = [self._fat_entry(below, entry) for entry in found if entry.name not in (b".", b"..")]
         return found
 
     def stat(self, path: bytes) -> Stat:
         """Describe `path`."""
         if self.virtual.owns(path):
             return self.virtual.stat(path)
-        return self._tree.stat(self._resolve(path))
+        real = self._resolve(path)
+        return self._as_entered(real, self._tree.stat(real))
 
     def open(
         self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
@@ -78,10 +81,13 @@ class Storage:
             return self.virtual.open(path, write=write)
         if create:
             self._check_name(path)
-        real = self._tree.open(self._resolve(path), write=write, create=create, truncate=truncate)
-        if not (write and self._fat):
+        place = self._resolve(path)
+        real = self._tree.open(place, write=write, create=create, truncate=truncate)
+        if not self._fat:
             return real
-        opened = _FatFile(real, self.kind is profiles.Storage.FATFS, self._rng)
+        if not write:
+            return _Entered(real, self._as_entered(place, self._tree.stat(place)).size)
+        opened = _FatFile(place, real, self.kind is profiles.Storage.FATFS, self._rng)
         self._writing.add(opened)
         return opened
 
@@ -96,7 +102,7 @@ class Storage:
         if self.virtual.owns(path):
             content = self.virtual.content(path, block=64)
             return crc32(content), len(content)
-        opened = self._tree.open(self._resolve(path))
+        opened = self.open(path)
         try:
             checksum, offset = 0, 0
             while block := opened.read(offset, _CRC_BLOCK):
@@ -127,7 +133,7 @@ class Storage:
     def unlink(self, path: bytes) -> None:
         """Remove a file; EISDIR for a directory."""
         self._refuse_virtual(path)
-        self._tree.remove(self._resolve(path))
+        self._remove(self._resolve(path))
 
     def rmdir(self, path: bytes) -> None:
         """Remove an empty directory; ENOTDIR, ENOTEMPTY."""
@@ -160,6 +166,15 @@ class Storage:
             self._check_name(new)
             target = self._fat_target(source, target)
         self._tree.rename(source, target)
+        for opened in self._writing:
+            if opened.path == source:
+                opened.path = target
+
+    def _remove(self, path: bytes) -> None:
+        self._tree.remove(path)
+        for opened in self._writing:
+            if opened.path == path:
+                opened.path = b""
 
     def _fat_target(self, source: bytes, target: bytes) -> bytes:
         try:
@@ -175,7 +190,7 @@ class Storage:
         if there.kind is Kind.DIRECTORY:
             return target.rstrip(b"/") + b"/" + parent_and_name(source)[1]
         if source != target:
-            self._tree.remove(target)  # NuttX fs_rename: not atomic
+            self._remove(target)  # NuttX fs_rename: not atomic
         return target
 
     def _refuse_virtual(self, path: bytes) -> None:
@@ -186,8 +201,19 @@ class Storage:
         if self._fat and _FAT_FORBIDDEN.intersection(parent_and_name(path)[1]):
             raise fail(errno.EINVAL, path)
 
-    def _fat_entry(self, entry: Entry) -> Entry:
-        return Entry(entry.name, entry.stat._replace(mtime=entry.stat.mtime & ~1))
+    def _fat_entry(self, below: bytes, entry: Entry) -> Entry:
+        stat = self._as_entered(below + entry.name, entry.stat)
+        return Entry(entry.name, stat._replace(mtime=stat.mtime & ~1))
+
+    def _as_entered(self, path: bytes, stat: Stat) -> Stat:
+        """Return a stat with the size that FAT's directory entry has.
+
+        A file that is open for writing gets its size there only when it is closed.
+        """
+        for opened in self._writing:
+            if opened.path == path and opened.is_open:
+                return stat._replace(size=opened.entered)
+        return stat
 
     def _resolve(self, path: bytes) -> bytes:
         """Return the path as this filesystem has it.
@@ -245,18 +271,42 @@ def _in_page_850(name: bytes) -> str:
     return "".join(c.upper() if len(c.upper()) == 1 else c for c in name.decode("cp850"))
 
 
+class _Entered:
+    """A FAT file open for reading: it ends where the directory entry said at its opening."""
+
+    def __init__(self, real: TreeFile, size: int) -> None:
+        self._real = real
+        self._size = size
+        self.close = real.close
+
+    def read(self, offset: int, size: int) -> bytes:
+        """See OpenFile."""
+        return self._real.read(offset, max(0, min(size, self.size() - offset)))
+
+    def write(self, offset: int, data: bytes) -> int:
+        """See OpenFile."""
+        return self._real.write(offset, data)
+
+    def size(self) -> int:
+        """See OpenFile."""
+        return self._size
+
+
 class _FatFile:
     """A FAT file open for writing. Its directory entry gets the size when the file is closed. The sector that
     was written last is in memory until then, or until another one is written. On FatFs a full card is EIO,
     and so is a write of no bytes; a gap has the old bytes of the card.
+
+    path: its present name. entered: the size that its directory entry has. is_open: it was not closed yet.
     """
 
-    def __init__(self, real: TreeFile, fatfs: bool, rng: random.Random) -> None:
+    def __init__(self, path: bytes, real: TreeFile, fatfs: bool, rng: random.Random) -> None:
+        self.path = path
         self._real = real
         self._fatfs = fatfs
         self._rng = rng
-        self._durable = real.size()
-        self._open = True
+        self.entered = real.size()
+        self.is_open = True
         self._sector = -1
         self._on_card = b""
         self.read = real.read
@@ -279,17 +329,17 @@ class _FatFile:
 
     def close(self) -> None:
         """See OpenFile."""
-        self._open = False
+        self.is_open = False
         self._real.close()
 
     def lose(self) -> None:
         """The power fails: bytes appended since the file was opened are lost, and those in memory."""
-        if not self._open:
+        if not self.is_open:
             return
         if self._on_card:
             self._real.write(self._sector * _SECTOR, self._on_card)
-        if self._real.size() > self._durable:
-            self._real.resize(self._durable)
+        if self._real.size() > self.entered:
+            self._real.resize(self.entered)
 
     def _hold_sector(self, offset: int) -> None:
         """The sector of this place is about to be written in memory."""
@@ -297,4 +347,4 @@ class _FatFile:
         if sector != self._sector:
             start = sector * _SECTOR
             self._sector = sector
-            self._on_card = self._real.read(start, min(_SECTOR, max(0, self._durable - start)))
+            self._on_card = self._real.read(start, min(_SECTOR, max(0, self.entered - start)))

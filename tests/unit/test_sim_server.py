@@ -162,6 +162,29 @@ def test_a_row_is_answered_as_one_by_one(name: str, seed: int) -> None:
     assert run(by_rows=True) == run(by_rows=False)
 
 
+@pytest.mark.parametrize("name", ["px4-nuttx", "ardupilot5"])
+def test_fat_tells_the_size_of_a_file_only_once_it_is_closed(name: str) -> None:
+    storage = Storage(small_tree(), PROFILES[name], random.Random(3))
+    parent, file = A.rpartition(b"/")[0] or b"/", A.rpartition(b"/")[2]
+
+    def told() -> tuple[int, int, bytes, int]:
+        (listed,) = [entry.stat.size for entry in storage.entries(parent) if entry.name == file]
+        reader = storage.open(A)
+        return storage.stat(A).size, listed, reader.read(0, 500), storage.crc(A)[1]
+
+    opened = storage.open(A, write=True, create=True, truncate=True)
+    opened.write(0, b"x" * 300)
+    assert told() == (0, 0, b"", 0)
+    opened.close()
+    assert told() == (300, 300, b"x" * 300, 300)
+    opened = storage.open(A, write=True)
+    opened.write(300, b"y" * 100)
+    assert told() == (300, 300, b"x" * 300, 300)
+    storage.unlink(A)
+    storage.open(A, write=True, create=True).close()
+    assert told() == (0, 0, b"", 0), "the removed file is another one"
+
+
 @pytest.mark.parametrize("real", [False, True])
 @pytest.mark.parametrize("name", ["px4-nuttx", "ardupilot5"])
 def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tmp_path: Path) -> None:
