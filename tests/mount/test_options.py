@@ -71,11 +71,15 @@ def test_what_no_card_has_is_refused(plain: Mount) -> None:
 def test_options_of_look_and_of_fstab(field: Field, small_tree: Path) -> None:
     words = ("_netdev", "nofail", "noauto", "user", "x-systemd.automount", "defaults")
     look = ("ro", "uid=1234", "gid=4321", "fmask=0137", "dmask=0027")
-    mount = field.mount(field.sim(small_tree).source, *look, *words)
+    old = ("auto_unmount", "verify=size")
+    mount = field.mount(field.sim(small_tree).source, *look, *words, *old)
     line = mount_line(mount.path)
     assert "ro" in line[3].split(",")
     shown = mount.run("stat", "-c", "%u %g %a", mount.path / "README.txt", mount.path / "sizes").stdout
     assert shown.split() == ["1234", "4321", "440", "1234", "4321", "550"]
+    said = mount.alive().text()
+    assert "option auto_unmount is gone, and is ignored: " in said
+    assert "option verify is gone, and is still understood: write verify_max=0" in said
 
 
 def test_every_payload_is_printed_decoded(field: Field, small_tree: Path) -> None:

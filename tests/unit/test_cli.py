@@ -34,6 +34,9 @@ from mavftpfs.shared.errors import (
     exit_code_for,
 )
 from tests.support.vehicles import free_udp_port
+from tests.unit.test_daemon import restored_logging
+
+__all__ = ["restored_logging"]
 
 SOURCE = "udpin:127.0.0.1:0"
 
@@ -159,6 +162,12 @@ def test_help_fits_80_columns(
     with pytest.raises(SystemExit):
         cli.main([*filter(None, [command]), "--help"])
     assert [line for line in capsys.readouterr().out.splitlines() if len(line) > 80] == []
+
+
+@pytest.mark.usefixtures("restored_logging")
+def test_a_command_names_an_option_that_is_gone(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(("ls", "/dev/ttyNOWHERE", "/", "-o", "window=4"))
+    assert "option window is gone, and is ignored: " in capsys.readouterr().err
 
 
 UNITS_OF_0_2 = [
