@@ -327,7 +327,8 @@ def status(args: argparse.Namespace) -> int:
     if args.mountpoint is None:
         fetch = all_statuses
     else:
-        place = canonical(args.mountpoint)
+        inside = mountpoint.enclosing_mount(args.mountpoint)
+        place = canonical(args.mountpoint) if inside is None else inside[0]
 
         def fetch() -> list[Status]:
             return statuses_at(place)

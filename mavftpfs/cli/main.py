@@ -233,11 +233,15 @@ def _source_parser(name: str, description: str, *, short_help: bool = True) -> P
     return parser
 
 
-def _paths_parser(name: str, description: str, least: str = "+", *, short_help: bool = True) -> Parser:
+_PATH = "a path on the vehicle, or an mftp:// URL"
+_PATTERN = "a path on the vehicle, a pattern in quotes ('/log/*.ulg'), or an mftp:// URL"
+
+
+def _paths_parser(
+    name: str, description: str, meaning: str = _PATH, *, least: str = "+", short_help: bool = True
+) -> Parser:
     parser = _source_parser(name, description, short_help=short_help)
-    parser.add_argument(
-        "paths", metavar="PATH", nargs=least, default=[], help="a path on the vehicle, or an mftp:// URL"
-    )
+    parser.add_argument("paths", metavar="PATH", nargs=least, default=[], help=meaning)
     return parser
 
 
@@ -249,7 +253,7 @@ def _scan_parser(name: str) -> Parser:
 
 def _ls_parser(name: str) -> Parser:
     # -h means the same as in ls.
-    parser = _paths_parser(name, "List directories of the vehicle.", least="*", short_help=False)
+    parser = _paths_parser(name, "List directories of the vehicle.", _PATTERN, least="*", short_help=False)
     parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times (UTC)")
     parser.add_argument("-h", dest="units", action="store_true", help="with -l: sizes as 1.2 MB")
     parser.add_argument("-R", dest="recursive", action="store_true", help="directories below too")
@@ -327,7 +331,7 @@ def _add_verify(parser: Parser) -> None:
 
 
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Fetch files, and verify them.")
+    parser = _paths_parser(name, "Fetch files, and verify them.", _PATTERN, least="*")
     parser.epilog = (
         "PATH may be a pattern, as '/log/*/*.ulg': its matches go into LOCAL with their directories from the "
         f"first * on. {_SOURCES}"
@@ -345,7 +349,7 @@ def _get_parser(name: str) -> Parser:
 
 
 def _cat_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Write files of the vehicle to stdout.")
+    parser = _paths_parser(name, "Write files of the vehicle to stdout.", _PATTERN, least="*")
     _add_verify(parser)
     return parser
 
@@ -365,7 +369,7 @@ def _put_parser(name: str) -> Parser:
 
 
 def _rm_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Remove files of the vehicle.")
+    parser = _paths_parser(name, "Remove files of the vehicle.", _PATTERN)
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too, with all below")
     return parser
 
@@ -389,7 +393,7 @@ def _mv_parser(name: str) -> Parser:
 
 
 def _crc_parser(name: str) -> Parser:
-    return _paths_parser(name, "Have the vehicle compute the CRC32 of files.")
+    return _paths_parser(name, "Have the vehicle compute the CRC32 of files.", _PATTERN, least="*")
 
 
 def _param_parser(name: str) -> Parser:
@@ -427,7 +431,12 @@ def _umount_parser(name: str) -> Parser:
 
 def _status_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Show what mounts are doing.")
-    parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all that you may ask")
+    parser.add_argument(
+        "mountpoint",
+        metavar="MOUNTPOINT",
+        nargs="?",
+        help="or a path in a mount; default: all mounts that you may ask",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--watch", action="store_true", help="again each second")
     parser.add_argument("-v", "--verbose", action="store_true", help="everything the mount tells")

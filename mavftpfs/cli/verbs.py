@@ -36,7 +36,7 @@ from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
 from mavftpfs.client.several import ON_COMMAND_LINE
-from mavftpfs.client.source import target_of
+from mavftpfs.client.source import files_in_mount, target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
@@ -51,6 +51,20 @@ def _target(args: Args, component: int | None) -> Target:
     if component is not None:
         args.options.append(f"target_component={component}")
     return target_of(args.source, parse_options(args.options).client)
+
+
+def _paths_of(args: Args, default: Sequence[str] = ()) -> tuple[list[bytes], int | None]:
+    """Return the paths to read, and the component that they name. SOURCE may be the first file itself.
+
+    Raises:
+        UsageError: there is none, or it is malformed.
+    """
+    inside = files_in_mount(args.source, args.paths, lists=bool(default))
+    if inside is not None:
+        args.source, args.paths = inside
+    if not args.paths and not default:
+        raise UsageError("PATH is missing: name a file of the vehicle behind SOURCE; see --help")
+    return names.parse_paths(args.paths or default)
 
 
 def run(
@@ -191,7 +205,7 @@ def get(args: Args) -> int:
         if args.recursive:
             raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
         return cat(args)
-    wanted, component = names.parse_paths(args.paths)
+    wanted, component = _paths_of(args)
     choice = Choice(include=tuple(args.include), exclude=tuple(args.exclude))
     outcome = download.Outcome()
 
@@ -206,7 +220,7 @@ def get(args: Args) -> int:
 
 def cat(args: Args) -> int:
     """Write files to stdout."""
-    wanted, component = names.parse_paths(args.paths)
+    wanted, component = _paths_of(args)
     outcome = download.Outcome()
 
     def write(data: bytes | memoryview) -> None:
@@ -397,7 +411,11 @@ def rm(args: Args) -> int:
     """Remove files."""
     wanted, component = names.parse_paths(args.paths)
     names.refuse_root(wanted)
-    remove = partial(names.remove_paths, paths=wanted, recursive=args.recursive)
+
+    async def remove(session: Session) -> None:
+        found = await names.all_matching(session.files, wanted)
+        await names.remove_paths(session, found, recursive=args.recursive)
+
     with_session(args, remove, component, writing=True)
     return ExitCode.OK
 
@@ -490,8 +508,12 @@ def _list_recovered(found: Sequence[recovering.Recovered]) -> None:
 
 def ls(args: Args) -> int:
     """List directories."""
-    wanted, component = names.parse_paths(args.paths or ["/"])
-    work = partial(names.list_paths, paths=wanted, recursive=args.recursive)
+    wanted, component = _paths_of(args, ["/"])
+
+    async def work(session: Session) -> list[names.Listing]:
+        found = await names.all_matching(session.files, wanted)
+        return await names.list_paths(session, found, recursive=args.recursive)
+
     listings = with_session(args, work, component)
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
@@ -507,12 +529,15 @@ def ls(args: Args) -> int:
 
 def crc(args: Args) -> int:
     """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
-    wanted, component = names.parse_paths(args.paths)
+    wanted, component = _paths_of(args)
 
     def tell(path: bytes, number: int) -> None:
         print(f"{number:08x}  {_name(path)}")
 
-    with_session(args, partial(names.checksum_paths, paths=wanted, tell=tell), component)
+    async def work(session: Session) -> None:
+        await names.checksum_paths(session, await names.all_matching(session.files, wanted), tell)
+
+    with_session(args, work, component)
     return ExitCode.OK
 
 

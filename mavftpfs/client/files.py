@@ -24,7 +24,15 @@ from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TI
 from mavftpfs.client.mountpoint import OUR_TYPE, canonical, enclosing_mount, mounts
 from mavftpfs.client.options import Options
 from mavftpfs.client.several import Unnamed
-from mavftpfs.client.status import Facts, has_link, is_wanted, several_above, told_by, vehicle_below
+from mavftpfs.client.status import (
+    Facts,
+    final_name,
+    has_link,
+    is_wanted,
+    several_above,
+    told_by,
+    vehicle_below,
+)
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import HEARD_SOON, Connection
@@ -245,7 +253,8 @@ class Session:
     async def acknowledged(self, path: bytes) -> int | None:
         """Return the bytes that the vehicle has of a file that is being sent; None if it is not. Raises: as
         `lost`."""
-        name, transfers = self.on_vehicle(path).decode(errors="replace"), (await self.status())["transfers"]
+        name = final_name(self.on_vehicle(path).decode(errors="replace"))
+        transfers = (await self.status())["transfers"]
         sent = {facts["path"]: facts["done"] for facts in transfers if facts["direction"] == "write"}
         return sent.get(name)
 

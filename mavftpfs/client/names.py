@@ -14,6 +14,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.fetch import known_time
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, reading, walk, written
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     CrossDevice,
     DataUnproven,
@@ -22,9 +23,10 @@ from mavftpfs.shared.errors import (
     LocalProtocolError,
     NotADirectory,
     NotFound,
+    ReadOnly,
     UsageError,
 )
-from mavftpfs.shared.model import ROOT, EntryKind, join, normalise, split
+from mavftpfs.shared.model import ROOT, EntryKind, is_virtual, join, normalise, split
 from mavftpfs.shared.readable import name_text, printable, readable_size
 
 
@@ -81,6 +83,12 @@ async def matching(files: Files, path: bytes) -> list[bytes]:
     if not found:
         raise NotFound(f"nothing matches {name_text(path)}")
     return sorted(found)
+
+
+async def all_matching(files: Files, paths: Sequence[bytes]) -> list[bytes]:
+    """Return what several patterns match, each path once. Raises: as `matching`."""
+    found = [name for path in paths for name in await matching(files, path)]
+    return list(dict.fromkeys(found))
 
 
 async def _exists(files: Files, path: bytes) -> bool:
@@ -275,12 +283,15 @@ async def remove_paths(session: Session, paths: Sequence[bytes], *, recursive: b
     """Remove files, and with `recursive` directories with all below.
 
     Raises:
-        IsADirectory: a directory without `recursive`. Nothing is removed before all paths were looked at.
+        IsADirectory: a directory without `recursive`; ReadOnly: a path that the vehicle makes itself. Nothing
+            is removed before all paths were looked at.
     """
     found = [(path, await session.files.stat(path)) for path in paths]
     for path, stat in found:
         if stat.kind is EntryKind.DIRECTORY and not recursive:
             raise IsADirectory(f"{name_text(path)} is a directory; remove it with -r")
+        if is_virtual(session.on_vehicle(path)):
+            raise ReadOnly(readonly.virtual(path))
     for path, stat in found:
         await _remove(session.files, path, stat.kind)
 

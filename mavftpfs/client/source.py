@@ -3,12 +3,51 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
+from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.files import Target, mountpoint_of
+from mavftpfs.client.mounted import STATUS_PATIENCE
 from mavftpfs.client.options import Options, at_source
+from mavftpfs.client.status import several_at, told_by
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import ROOT
+
+
+def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[str, list[str]] | None:
+    """Return (mountpoint, paths on it), if SOURCE is what a command is to read, and not where; else None.
+
+    That is so if SOURCE lies in a mount and is no directory: `crc ~/drone/log/*`, as a shell writes it. The
+    `paths` then have to lie in the same mount. A SOURCE without paths may be a directory, too, unless the
+    command `lists` that by itself.
+
+    Raises:
+        UsageError: one of the paths lies elsewhere.
+    """
+    mount = mountpoint_of(source)
+    if mount is None or mount[1] == ROOT or several_at(mount[0]) is not None:
+        return None
+    if (paths or lists) and _may_be_directory(source, mount[0]):
+        return None
+    found = []
+    for word in (source, *paths):
+        other = mountpoint_of(word)
+        if other is None or other[0] != mount[0]:
+            raise UsageError(
+                f"{source} is a file in the mount on {mount[0]}, and {word} is not in that mount"
+            )
+        found.append(os.fsdecode(other[1]))
+    return mount[0], found
+
+
+def _may_be_directory(source: str, mountpoint: str) -> bool:
+    """Return whether a path in a mount is a directory, or the mount cannot tell."""
+    try:
+        status = told_by(mountpoint, STATUS_PATIENCE)  # a mount that was stopped would keep us for ever
+    except NobodyThere:
+        return True
+    return bool(status.get("problem")) or os.path.isdir(source)
 
 
 def target_of(source: str, options: Options) -> Target:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -29,6 +30,10 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+
+BESIDE = ".put-"
+"""Begins the name that a file which `put` sends has in a mount until it is whole."""
+_BESIDE = re.compile(re.escape(BESIDE) + "[0-9a-f]{8}-([^/]+)")
 
 Facts = Mapping[str, Any]
 
@@ -56,6 +61,13 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str
     }
 
 
+def final_name(path: str) -> str:
+    """Return the path that a file will have when it is whole."""
+    parent, _, name = path.rpartition("/")
+    match = _BESIDE.fullmatch(name)
+    return path if match is None else f"{parent}/{match[1]}"
+
+
 def is_read_only(vehicle: Facts) -> bool:
     """Return whether nothing is written to a vehicle, because it is armed."""
     return bool(vehicle["armed"]) and vehicle["when_armed"] == "ro"
@@ -77,7 +89,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
             {
                 "direction": "write",
                 "state": "sending" if sending else "waiting",
-                "path": write["path"],
+                "path": final_name(write["path"]),
                 "size": write["size"],
                 "done": max(0, write["size"] - write["bytes_left"]),
                 "rate": cache.get("write_rate") if sending else None,

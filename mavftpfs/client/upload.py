@@ -16,12 +16,14 @@ from typing import Any, BinaryIO
 
 import trio
 
+from mavftpfs.cache.reserved import MAX_NAME, fits_rename
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, written
 from mavftpfs.client.mounted import WITHDRAWAL_TIME
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import BY_CRC32, BY_SIZE
+from mavftpfs.client.status import BESIDE
 from mavftpfs.shared.errors import (
     CrossDevice,
     IsADirectory,
@@ -34,11 +36,7 @@ from mavftpfs.shared.errors import (
     UsageError,
 )
 from mavftpfs.shared.model import join, normalise, split
-from mavftpfs.shared.readable import name_text
-
-BESIDE = ".put-"
-"""Begins the name that a file has in a mount until it is whole."""
-_BESIDE = re.compile(re.escape(BESIDE) + "[0-9a-f]+")
+from mavftpfs.shared.readable import name_text, readable
 
 Tell = Callable[[bytes, int, str], None]
 """Called with the path of a file that was put, its size, and how it was verified."""
@@ -189,10 +187,7 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
         name = name_text(session.on_vehicle(remote))
-        # The temporary name beside the file means nothing to people.
-        reason = re.sub(_BESIDE, lambda _: name_text(split(remote)[1]), str(exc)).removeprefix(
-            f"{name_text(remote)}: "
-        )
+        reason = _with_final_name(str(exc), remote).removeprefix(f"{name_text(remote)}: ")
         done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
         told = f"{name} was not delivered: {reason}{done}"
         if isinstance(exc, NotFound | NotADirectory):
@@ -222,7 +217,7 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     """Write a new file beside the old one, and rename it. Else a mount would deliver half a file of an
     interrupted put. After a killed put the new file stays."""
     files = session.files
-    beside = join(split(remote)[0], f"{BESIDE}{secrets.token_hex(4)}".encode())
+    beside = _beside(session, remote)
     file = await files.create(beside, exclusive=True)
     try:
         async with watched(session, beside, progress), written(file):
@@ -240,6 +235,22 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
             raise NotDelivered(str(exc), there=None) from exc
         raise
     return size
+
+
+def _beside(session: Session, remote: bytes) -> bytes:
+    """Return a new name beside a file, which tells the file's own name where that fits."""
+    parent, name = split(remote)
+    short = join(parent, f"{BESIDE}{secrets.token_hex(4)}".encode())
+    told = short + b"-" + name
+    whole = session.on_vehicle(told)
+    return told if len(split(told)[1]) <= MAX_NAME and fits_rename(whole, whole) else short
+
+
+def _with_final_name(text: str, remote: bytes) -> str:
+    """Return a text with a file's name in place of the name beside it, which means nothing to people."""
+    name = name_text(split(remote)[1])
+    beside = re.escape(BESIDE) + f"[0-9a-f]+(-{re.escape(name)})?"
+    return re.sub(beside, lambda _: name, readable(text))
 
 
 async def _remove(files: Files, path: bytes) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -14,7 +16,7 @@ from tests.mount.conftest import Field
 from tests.support.mounts import command, mavftpfs, wait_until
 from tests.support.replies import nak
 from tests.support.trees import differing
-from tests.support.vehicles import HOST, SimVehicle, free_udp_port
+from tests.support.vehicles import HOST, Program, SimVehicle, free_udp_port
 
 
 @pytest.fixture(scope="module")
@@ -194,3 +196,111 @@ def test_a_refused_change_has_one_reason(reason: str, mounted: bool, field: Fiel
 
 EXITS = {("card", False): 2}
 """Codes of changes that are refused by the vehicle itself."""
+
+
+# -- patterns, and files inside a mount -----------------------------------------------------------
+
+
+class Place(NamedTuple):
+    """A card, and SOURCE for it."""
+
+    card: Path
+    source: str
+
+    def names(self) -> list[str]:
+        """Return what is in the card's directory of logs."""
+        return sorted(path.name for path in (self.card / "log").iterdir())
+
+
+@pytest.fixture(params=["link", "mount"])
+def place(request: pytest.FixtureRequest, field: Field) -> Place:
+    """A vehicle of its own for each test, on its link or mounted."""
+    root = field.local("card")
+    (root / "log/old").mkdir(parents=True)
+    for name in ("1.ulg", "2.ulg", "[1].ulg", "b.txt", ".hidden.ulg"):
+        (root / "log" / name).write_text(name)
+    source = field.sim(root).source
+    return Place(root, str(field.mount(source).path) if request.param == "mount" else source)
+
+
+def test_patterns(place: Place) -> None:
+    source = place.source
+    assert command("ls", source, "/log/*.ulg")[0].splitlines() == ["1.ulg", "2.ulg", "[1].ulg"]
+    assert command("ls", source, "/l*/o*", "/l*/b*")[0].splitlines() == ["b.txt", "", "/log/old:"]
+    assert command("cat", source, "/log/[12].ulg") == ("1.ulg2.ulg", "")
+    assert command("cat", source, "/log/[1].ulg") == ("[1].ulg", "")
+    sums = command("crc", source, "/log/?.ulg")[0].splitlines()
+    assert [line.split("  ")[1] for line in sums] == ["/log/1.ulg", "/log/2.ulg"]
+    for verb in ("ls", "crc", "cat", "rm"):
+        said = command(verb, source, "/log/b*", "/log/*.zip", code=1)[1]
+        assert said == "mavftpfs: nothing matches /log/*.zip\n"
+    assert "b.txt" in place.names()
+
+
+def test_rm_takes_patterns(place: Place) -> None:
+    assert "/log/old is a directory" in command("rm", place.source, "/log/*", code=1)[1]
+    assert len(place.names()) == 6
+    command("rm", place.source, "/log/[1].ulg")
+    assert "1.ulg" in place.names()
+    assert "[1].ulg" not in place.names()
+    command("rm", place.source, "/log/[12].ulg", "/log/1*")
+    assert place.names() == [".hidden.ulg", "b.txt", "old"]
+
+
+def test_a_pattern_removes_nothing_where_it_matches_what_the_vehicle_makes_itself(field: Field) -> None:
+    root = field.local("card")
+    (root / "z").write_text("")
+    source = field.sim(root, "ardupilot5").source
+    assert "can only be read" in command("rm", "-r", source, "/*", code=1)[1]
+    assert list(root.iterdir()) == [root / "z"]
+
+
+def test_a_file_inside_a_mount_is_a_source(
+    field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = field.local("card")
+    (root / "log").mkdir()
+    for name in ("a.txt", "b.txt"):
+        (root / "log" / name).write_text(name)
+    mount = field.mount(field.sim(root).source).path
+    first, second = mount / "log/a.txt", mount / "log/b.txt"
+    assert command("cat", first) == ("a.txt", "")
+    assert command("cat", first, second) == ("a.txtb.txt", "")
+    assert command("cat", mount / "log", "/a.txt") == ("a.txt", "")
+    assert command("ls", first, second)[0] == "a.txt\nb.txt\n"
+    assert command("ls", mount / "log")[0] == "a.txt\nb.txt\n"
+    assert [line.split()[1] for line in command("crc", first, second)[0].splitlines()] == [
+        "/log/a.txt",
+        "/log/b.txt",
+    ]
+    assert "verified by size and CRC32" in command("get", second, "--to", tmp_path)[0]
+    assert (tmp_path / "b.txt").read_text() == "b.txt"
+    command("get", "-r", mount / "log", "--to", f"{tmp_path}/new/")
+    assert (tmp_path / "new/log/a.txt").read_text() == "a.txt"
+    assert command("cat", mount / "log", code=1)[1] == "mavftpfs: /log is a directory\n"
+    assert "PATH is missing" in command("cat", mount, code=1)[1]
+    assert f"and {tmp_path} is not in that mount" in command("crc", first, tmp_path, code=1)[1]
+    monkeypatch.chdir(mount / "log")
+    try:
+        assert command("cat", "b.txt") == ("b.txt", "")
+        for inside in (".", "b.txt"):
+            assert command("status", inside)[0].startswith(f"{mount}: PX4 1/1")
+    finally:
+        monkeypatch.undo()
+
+
+def test_status_names_the_file_that_put_sends(field: Field, tmp_path: Path) -> None:
+    root = field.local("card")
+    (root / "log").mkdir()
+    mount = field.mount(field.sim(root).source, "bwlimit=30k").path
+    (tmp_path / "new.lua").write_bytes(bytes(60_000))
+    put = Program(
+        "put", ["mavftpfs.__main__", "put", str(mount), str(tmp_path / "new.lua"), "/log/"], tmp_path
+    )
+    try:
+        wait_until("status tells of it", lambda: "/log/new.lua: " in command("status", mount)[0])
+        assert put.wait() == 0
+    finally:
+        put.kill()
+    assert "/log/new.lua: 60.0 kB, verified by size and CRC32" in put.text()
+    assert os.listdir(root / "log") == ["new.lua"]
