@@ -461,7 +461,7 @@ class Deliverer:
         context.files.on_changed(node.path)
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:
-        """Remember the error for the next close, and hold the bytes where they outlive this process."""
+        """Remember the error for the next close, and make the bytes survive a loss of power."""
         known, node.error = node.error, error
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
@@ -470,4 +470,4 @@ class Deliverer:
         try:
             draft.content.persist(describe(node.path, draft, error, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
-            log.warning("%r is held in memory only: %s", node.path, trouble)
+            log.warning("%r may be lost when this mount ends: %s", node.path, trouble)

@@ -36,8 +36,6 @@ class CacheOptions:
     at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
     probe_time: how long listing an `@` directory may spend on finding out which entries open.
     op_deadline: a read ends when none of its bytes came for so long.
-    dirty_max: written bytes that may wait in memory, and un-ACKed before writers wait; None = about ten
-    seconds of the measured rate. spool_max: bytes that may wait on the local disk.
     rmw_max: the largest file that is sent whole for a change of a part of it; None = what can be fetched and
     sent in two minutes. link_rate: bytes per second that the link carries at most, where that is known before
     anything is measured.
@@ -60,8 +58,6 @@ class CacheOptions:
     at_stat_limit: int = 128 * KIB
     probe_time: float = 3.0
     op_deadline: float = 30.0
-    dirty_max: int | None = None
-    spool_max: int = 1024 * MIB
     rmw_max: int | None = None
     link_rate: float | None = None
     verify: str = "auto"

@@ -4,11 +4,11 @@ A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a descri
 `NNNNNN.json`:
 - `path`: its path on the vehicle; `system` and `uid`: which vehicle, `uid` null if it did not tell its id.
   Nothing more while a program writes, and no close was confirmed or refused;
-- what `describe` tells of a file that could not be delivered;
-- `needed` false: the vehicle has all of it, or no program wants it any more.
+- what `describe` tells of a file that could not be delivered.
 
-The description is written before the first byte. So the next mount can always say what it found, whenever the
-process was killed: `SpoolDirectory.rescue` moves both files to a recovery directory. A mount that ends moves
+The description is written before the first byte, and removed when the vehicle has all of the file, or no
+program wants it any more. So the next mount can always say what it found, whenever the process was killed:
+`SpoolDirectory.rescue` moves what has a description to a recovery directory. A mount that ends moves
 there what it could not deliver. From there nothing is sent to a vehicle by itself, because the file on the
 vehicle may have changed since. And it may be another vehicle with the same system id.
 """
@@ -141,10 +141,9 @@ def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
     """
     found, failed = [], []
     for data in data_in(slot):
-        facts = _read_facts(data)
         try:
-            if _is_needed(data, facts):
-                found.append(move(data, facts, recovery))
+            if _is_needed(data):
+                found.append(move(data, _read_facts(data), recovery))
             else:
                 remove(data)
         except OSError as exc:
@@ -165,7 +164,7 @@ def left_in(slot: Path) -> list[Path]:
         return []
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return [data for data in data_in(slot) if _is_needed(data, _read_facts(data))]
+        return [data for data in data_in(slot) if _is_needed(data)]
     except OSError:
         return []
     finally:
@@ -216,7 +215,7 @@ def describe(
 
 
 def _read_facts(data: Path) -> dict[str, object]:
-    """Return the description of a file; {} if there is none, or if it is damaged."""
+    """Return the description of a file; {} if it is damaged."""
     try:
         facts = json.loads(data.with_suffix(".json").read_text())
     except (OSError, ValueError, RecursionError) as exc:
@@ -225,9 +224,10 @@ def _read_facts(data: Path) -> dict[str, object]:
     return facts if isinstance(facts, dict) else {}
 
 
-def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
+def _is_needed(data: Path) -> bool:
     """Return whether the vehicle lacks a spooled file that a user may want."""
-    return facts.get("needed") is not False and ("size" in facts or data.stat().st_size > 0)
+    described = data.with_suffix(".json").exists()
+    return described and (data.stat().st_size > 0 or "size" in _read_facts(data))
 
 
 def _description(target: Path) -> Path:

@@ -1,10 +1,9 @@
 """Where bytes wait that are not proven to be on the vehicle. Layer: cache.
 
-Up to `memory_max` bytes of all files together lie in memory. Beyond that, a file's bytes move to a local file
-of its own in a 0700 directory, at the same offsets, up to `spool_max` bytes together. Bytes stay until the
-draft is told that the vehicle has them. When a file goes to disk, its name is written down beside it.
-`persist` writes down all that is known of it, with fsync. So the next mount of the vehicle finds it after a
-kill -9 (`recovery`).
+From its first byte a draft has a local file in a 0700 directory, with the same bytes at the same offsets;
+all of them together hold at most `spool_max` bytes. A description beside the file says which file of which
+vehicle it is, as long as the vehicle lacks something of it. `persist` writes down all that is known, with
+fsync. So the next mount of the vehicle finds the file after a kill -9 (`recovery`).
 
 If the local disk fails, the file whose bytes it had gets the error (SpoolFailed), never the whole mount.
 
@@ -28,6 +27,9 @@ from mavftpfs.shared.extents import ExtentSet
 
 log = logging.getLogger("mavftpfs.cache")
 
+SPOOL_MAX = 1 << 30
+"""Bytes that may wait for a vehicle."""
+
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -35,23 +37,20 @@ class Spool:
     """The budget that all drafts share, in bytes.
 
     Attributes:
-        in_memory, on_disk: bytes held. full: the disk had no room, and nothing was freed since.
+        held: bytes of all files. full: there was no room for more, and nothing was freed since.
     """
 
     def __init__(
         self,
-        *,
-        spool_max: int,
         directory: Path | None = None,
-        memory_max: Callable[[], int] = lambda: 0,
+        *,
+        spool_max: int = SPOOL_MAX,
         vehicle: Callable[[], Mapping[str, object]] = dict,
     ) -> None:
-        """`memory_max()` bytes in memory, `spool_max` on disk, in `directory` or one made when needed.
-        `vehicle`: what each description says of the vehicle, as JSON holds it."""
-        self.memory_max = memory_max
+        """`spool_max` bytes in `directory`, or in one that is made when it is needed. `vehicle`: what each
+        description says of the vehicle, as JSON holds it."""
         self.vehicle = vehicle
-        self.in_memory = 0
-        self.on_disk = 0
+        self.held = 0
         self.full = False
         self.spool_max = spool_max
         self._directory = directory
@@ -85,11 +84,10 @@ class SpoolContent:
     def __init__(self, spool: Spool, name: bytes | None = b"") -> None:
         self.name = name
         self._spool = spool
-        self._memory = bytearray()
         self._file: int | None = None
         self._path: Path | None = None
         self._stored = ExtentSet()
-        self._told: dict[str, Any] | None = None  # what is written down beside the file
+        self._told: dict[str, Any] | None = None  # the description beside the file, if there is one
         self._durable = False
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
@@ -99,19 +97,12 @@ class SpoolContent:
             NoSpace: the budget is used up, or the local disk is full. SpoolFailed: the local disk fails.
                 What was kept before is as it was.
         """
-        spool, memory = self._spool, self._memory
-        more = max(0, offset + len(data) - len(memory))
-        if self._file is None and spool.in_memory + more <= spool.memory_max():
-            if offset > len(memory):
-                memory.extend(bytes(offset - len(memory)))
-            memory[offset : offset + len(data)] = data
-            spool.in_memory += more
-            return
+        spool = self._spool
         said = spool.full  # a failed attempt resets it as it cleans up
         try:
-            self._spill()
-            self._write_down(needed=True)
-            self._put_on_disk(offset, data)
+            self._open()
+            self._write_down()
+            self._write(offset, data)
         except NoSpace as error:
             if not said:  # a program takes ENOSPC for a full card
                 log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
@@ -124,8 +115,7 @@ class SpoolContent:
         Raises:
             SpoolFailed: the local disk does not give them back.
         """
-        if self._file is None:
-            return bytes(self._memory[start:stop])
+        assert self._file is not None
         try:
             data = os.pread(self._file, stop - start, start)
         except OSError as exc:
@@ -140,27 +130,23 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        self._write_down(needed=True)
         if self._file is None:
-            before = len(self._memory)
-            del self._memory[size:]
-            self._spool.in_memory += len(self._memory) - before
             return
+        self._write_down()
         try:
             os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
         except OSError as exc:
             raise SpoolFailed(f"cannot cut {self._path}: {exc}") from exc
         before = self._stored.total
         self._stored.discard(size, max(size, self._stored.end))
-        self._spool.on_disk += self._stored.total - before
+        self._spool.held += self._stored.total - before
 
     def mark_unneeded(self) -> None:
-        """Write down that the next mount need not offer it, until more is put: the vehicle has all of it, or
-        no program wants it any more. A failure is only logged."""
-        try:
-            self._write_down(needed=False)
-        except (NoSpace, SpoolFailed) as exc:
-            log.warning("what %s is cannot be written down: %s", self._path, exc)
+        """Remove the description, until more is put: the vehicle has all of it, or no program wants it any
+        more. So the next mount does not offer it."""
+        if self._path is not None:
+            remove_description(self._path)
+            self._told, self._durable = None, False
 
     def persist(self, facts: dict[str, Any]) -> str:
         """Make bytes and `facts` (JSON) survive the end of this process. A second call does nothing, until
@@ -171,7 +157,7 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed, OSError.
         """
-        self._spill()
+        self._open()
         assert self._file is not None
         assert self._path is not None
         if os.fstat(self._file).st_size < self._stored.end:
@@ -187,9 +173,8 @@ class SpoolContent:
 
     def close(self) -> None:
         """Forget the bytes: the vehicle has them, or no program wants them. Raises nothing."""
-        self._spool.in_memory -= len(self._memory)
-        self._spool.on_disk -= self._stored.total
-        self._memory, self._stored = bytearray(), ExtentSet()
+        self._spool.held -= self._stored.total
+        self._stored = ExtentSet()
         if self._file is not None:
             try:
                 os.close(self._file)
@@ -202,24 +187,39 @@ class SpoolContent:
 
     # --- inside
 
-    def _write_down(self, *, needed: bool) -> None:
-        """Update the description beside the local file, if there is one. needed: the vehicle lacks something
-        of it.
+    def _open(self) -> None:
+        """Make the local file, with its description, if there is none yet.
+
+        Raises:
+            NoSpace: there is none.
+        """
+        if self._file is not None:
+            return
+        try:
+            self._path = self._spool.new_file()
+            self._write_down()
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except (OSError, NoSpace, SpoolFailed) as exc:
+            self.close()
+            raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
+
+    def _write_down(self) -> None:
+        """Say beside the local file what it is, if that is not said yet.
 
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        facts: dict[str, Any] = {"needed": False}
-        if self.name is not None and needed:
-            facts = {"path": self.name.decode(errors="surrogateescape"), **self._spool.vehicle()}
-        if self._path is not None and facts != self._told:
+        if self.name is None or self._path is None:
+            return
+        facts = {"path": self.name.decode(errors="surrogateescape"), **self._spool.vehicle()}
+        if facts != self._told:
             try:
                 write_facts(self._path, facts, durable=False)
             except OSError as exc:
                 raise disk_error(exc, self._path) from exc
             self._told, self._durable = facts, False
 
-    def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
+    def _write(self, offset: int, data: bytes | memoryview) -> None:
         """Write new bytes before bytes that replace others: a full disk refuses the new ones, and nothing is
         replaced."""
         assert self._file is not None
@@ -229,8 +229,8 @@ class SpoolContent:
         for a, b in old:
             more -= b - a
         spool = self._spool
-        if spool.on_disk + more > spool.spool_max:
-            raise NoSpace(f"{spool.on_disk} bytes wait for the vehicle, spool_max is {spool.spool_max}")
+        if spool.held + more > spool.spool_max:
+            raise NoSpace(f"{spool.held} bytes wait for the vehicle, at most {spool.spool_max} may")
         try:
             for a, b in [*self._stored.missing(offset, stop), *old]:
                 while a < b:
@@ -238,30 +238,7 @@ class SpoolContent:
         except OSError as exc:
             raise disk_error(exc, self._path) from exc
         self._stored.add(offset, stop)
-        spool.on_disk += more
-
-    def _spill(self) -> None:
-        """Move from memory to disk.
-
-        Raises:
-            NoSpace, SpoolFailed: all is where it was.
-        """
-        if self._file is not None:
-            return
-        memory, self._memory = self._memory, bytearray()
-        try:
-            try:
-                self._path = self._spool.new_file()
-                self._write_down(needed=True)
-                self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            except (OSError, NoSpace, SpoolFailed) as exc:
-                raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
-            self._put_on_disk(0, memory)
-        except (NoSpace, SpoolFailed):
-            self.close()
-            self._memory = memory
-            raise
-        self._spool.in_memory -= len(memory)
+        spool.held += more
 
 
 def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:
@@ -292,7 +269,17 @@ def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> No
 
 def remove(data: Path) -> None:
     """Remove a spooled file and its description; what cannot be removed is only logged."""
-    for path in (data, data.with_suffix(".json"), data.with_suffix(".new")):
+    _unlink(data)
+    remove_description(data)
+
+
+def remove_description(data: Path) -> None:
+    """Remove the description of a spooled file; what cannot be removed is only logged."""
+    _unlink(data.with_suffix(".json"), data.with_suffix(".new"))
+
+
+def _unlink(*paths: Path) -> None:
+    for path in paths:
         try:
             path.unlink(missing_ok=True)
         except OSError as exc:

@@ -1,7 +1,7 @@
 """Keeps programs from writing more than the link carries. Layer: cache.
 
 A program in close() cannot be killed, so the bytes that a close may wait for are limited: to those of about
-ten seconds at the measured rate, shared by the uploads under way, unless dirty_max is set. When a part of a
+ten seconds at the measured rate, shared by the uploads under way. When a part of a
 file is changed, the whole file is sent again. So a change is refused (EFBIG) if fetching and sending would
 take longer than two minutes.
 """
@@ -38,21 +38,17 @@ STALL = 5.0
 
 
 class WriteLimit:
-    """How many bytes may be un-ACKed over all uploads, and held in memory: those of ten seconds.
+    """How many bytes may be un-ACKed over all uploads: those of ten seconds.
 
     Attributes:
         meter: how fast bytes are ACKed.
     """
 
-    def __init__(self, fixed: int | None) -> None:
-        """`fixed`: that many bytes, whatever the rate."""
+    def __init__(self) -> None:
         self.meter = RateMeter()
-        self._fixed = fixed
 
     def bytes(self) -> int:
         """Return the limit as of now."""
-        if self._fixed is not None:
-            return self._fixed
         rate = self.meter.rate
         return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
 

@@ -7,7 +7,6 @@ the vehicle's, normalised; those below `@` never come here for a change.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -67,12 +66,11 @@ class Writeback:
     ) -> None:
         """Build on the parts for reading.
 
-        Without a spool directory, bytes beyond the memory's limit go to one that does not outlive the
-        process.
+        Without a spool directory, bytes that wait lie in one that does not outlive the process.
         """
         owner = new_owner(rng) if spool_directory is None else spool_directory.owner
         dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
-        self._limit = limit = WriteLimit(options.dirty_max)
+        self._limit = limit = WriteLimit()
         self.context = self._context = context = Context(
             store=store,
             directories=directories,
@@ -84,9 +82,7 @@ class Writeback:
             own=OwnNames(owner, rng),
             paths=files.paths,
             spool=Spool(
-                spool_max=options.spool_max,
-                directory=None if spool_directory is None else spool_directory.path,
-                memory_max=limit.bytes,
+                None if spool_directory is None else spool_directory.path,
                 vehicle=lambda: {"system": store.address()[0], "uid": store.board()},
             ),
             retry_later=self._retry_later,
@@ -238,7 +234,6 @@ class Writeback:
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
         context, kept = self._context, []
-        context.spool.spool_max = sys.maxsize  # what lies in memory goes to disk now, however much is there
         failed: OSError | NoSpace | SpoolFailed | None = None
         for node in context.nodes:
             if not node.undelivered or node.draft is None:
@@ -278,9 +273,8 @@ class Writeback:
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: readable(str(n.error)) for n in nodes if n.error is not None}
         return {
-            "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
-            "bytes_held_on_disk": self._context.spool.on_disk,
-            "dirty_max": self._limit.bytes(),
+            "bytes_held": self._context.spool.held,
+            "unacked_max": self._limit.bytes(),
             "write_rate": self._throttle.speed,
             "files_undelivered": len(self.undelivered()),
             "bytes_undelivered": sum(sizes),

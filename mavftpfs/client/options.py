@@ -43,8 +43,6 @@ class Options:
     bwlimit: int | None = None
     dir_timeout: float | None = None
     cache_size: int = 64 << 20
-    dirty_max: int | None = None
-    spool_max: int = 1 << 30
     verify_max: int = 4 << 20
     when_armed: Literal["ro", "ok"] = "ro"
     inplace: bool = False
@@ -159,8 +157,6 @@ VALUES: Values = {
     "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
     "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
     "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
-    "dirty_max": Value(size(1 << 16, _SIZE_MAX, auto=True), "memory for what is not on the card yet: auto"),
-    "spool_max": Value(size(0, _SIZE_MAX), "local disk for what is not on the card yet: 1G"),
     "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
     "read_mode": Value(Choice("window", "burst"), "window or burst"),
@@ -206,6 +202,8 @@ GONE: Mapping[str, Gone] = {
     "auto_unmount": Gone("`mavftpfs umount` clears the mountpoint of a mount that was killed"),
     "fsname": Gone("the table of mounts shows SOURCE"),
     "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
+    "dirty_max": Gone("what waits for the card lies on the local disk"),
+    "spool_max": Gone("up to 1 GB waits on the local disk for the card"),
     "cache_dir": Gone("a mount reads again; `mavftpfs sync` keeps copies of logs"),
     "attr_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
     "negative_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),

@@ -54,7 +54,7 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str
         "held": {
             "files": cache.get("files_undelivered", 0),
             "bytes": cache.get("bytes_undelivered", 0),
-            "bytes_on_disk": cache.get("bytes_held_on_disk", 0),
+            "bytes_on_disk": cache.get("bytes_held", 0),
             "errors": dict(islice(cache.get("errors", {}).items(), MOST)),
         },
         "cache": {key: value for key, value in cache.items() if key not in _TOLD},

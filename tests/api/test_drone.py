@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import resource
 import socket
 import threading
 from array import array
@@ -426,7 +427,8 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
 def test_a_mount_that_takes_a_part_of_a_write_has_not_taken_it(field: Field) -> None:
     """The kernel's write then returns how much went before the refusal, and no error."""
     card = field.local("card")
-    mount = field.mount(field.sim(card).source, "spool_max=1M", "dirty_max=64K")
+    mount = field.mount(field.sim(card).source)
+    resource.prlimit(mount.alive().popen.pid, resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
     with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="No space") as caught:
         drone.write_bytes("/f", bytes(3 << 20))
     assert caught.value.errno == errno.ENOSPC

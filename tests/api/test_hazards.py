@@ -104,7 +104,7 @@ def test_what_was_not_delivered_is_said_and_never_comes(
 
 def test_a_part_does_not_pass_for_the_whole(sim: SimVehicle) -> None:
     """A write that failed is not forgotten at the close."""
-    with mavftpfs.connect(sim.source, dirty_max="64K", **QUICK) as drone:
+    with mavftpfs.connect(sim.source, **QUICK) as drone:
         file = drone.open("/f", "wb", buffering=0)
 
         def write_all() -> None:

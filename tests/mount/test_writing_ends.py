@@ -93,7 +93,7 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
     (card / "APM").mkdir()
     (card / "APM" / "old.txt").write_text("old\n")
     vehicle = field.sim(card, "px4", ("--rate", "60000"))
-    mount = field.mount(vehicle.source, "dirty_max=64K")
+    mount = field.mount(vehicle.source)
     writer = start_writer(mount, "APM/flight.bin", 100)
     vehicle.react(signal.SIGUSR1)
     results = said(writer, mount)
@@ -224,7 +224,7 @@ def test_a_mount_that_wrote_and_a_put_that_was_refused_leave_nothing_behind(
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
     monkeypatch.setenv("TMPDIR", str(temporaries))
     assert "protected" in command("put", vehicle.source, data, "/outside-its-card", code=4)[1]
-    mount = field.mount(vehicle.source, "dirty_max=64K")
+    mount = field.mount(vehicle.source)
     file = mount.path / "fs/microsd/one.bin"
     mount.run("cp", data, file)
     mount.run("truncate", "-s", "10", file)

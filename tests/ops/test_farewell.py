@@ -79,6 +79,7 @@ def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
 def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     dead = SpoolDirectory(state / "base", random.Random(1))
     (dead.path / "000001.data").write_bytes(b"held")
+    (dead.path / "000001.json").write_text('{"path": "/f"}')
     dead.close()
     spool = SpoolDirectory(state / "base", random.Random(2))
     assert leftovers.rescue(spool, "tcp:x:1").startswith("1 file(s) of an earlier mount did not reach")

@@ -614,14 +614,14 @@ async def rate_and_limit(rate: float, size: int) -> tuple[float, object]:
     """Write a file over a link; return its rate and how much may wait then."""
     async with rig(link=LinkSettings(rate=rate, delay=0.001)) as here:
         tree = here.mount()
-        assert tree.status()["dirty_max"] == UNMEASURED
+        assert tree.status()["unacked_max"] == UNMEASURED
         file = await tree.create(b"/new", exclusive=True)
         began = trio.current_time()
         await file.write(0, content(size))
         await file.flush()
         took = trio.current_time() - began
         await file.release()
-        return size / took, tree.status()["dirty_max"]
+        return size / took, tree.status()["unacked_max"]
 
 
 @pytest.mark.holds("promise 4")
@@ -639,7 +639,7 @@ async def test_what_may_wait_is_what_ten_seconds_bring() -> None:
 async def test_what_is_still_open_when_the_mount_ends_is_not_kept(here: Rig, tmp_path: Path) -> None:
     """A kernel that lost its mount closes nothing: the next mount must not offer what was delivered."""
     spool = SpoolDirectory(tmp_path / "spool", Random(1))
-    tree = here.mount(spool=spool, dirty_max=65536)
+    tree = here.mount(spool=spool)
     file = await tree.create(FRESH, exclusive=True)
     await file.write(0, bytes(300_000))
     assert await tree.drain(100) == []

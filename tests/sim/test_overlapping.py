@@ -16,6 +16,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.throttle import UNMEASURED
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
@@ -383,12 +384,12 @@ RADIO = LinkSettings(rate=6000.0, delay=0.05)
 async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> None:
     """What was accepted is on the card then, and the program goes on; on some servers that means all anew."""
     piece = content(32768)
-    async with rig(profile, {b"/d/z": b""}, link=RADIO) as here:
-        tree = here.mount(dirty_max=65536)
+    async with rig(profile, {b"/d/z": b""}, link=LinkSettings(rate=20_000.0, delay=0.05)) as here:
+        tree = here.mount()
         file = await tree.create(FILE, exclusive=True)
 
         async def write() -> None:
-            for number in range(4):
+            for number in range(12):
                 await file.write(number * len(piece), piece)
             await file.flush()
             await file.release()
@@ -398,7 +399,7 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> Non
             await trio.sleep(10)
             await tree.rename(FILE, OTHER)
             assert len(here.data(OTHER)) >= 2 * len(piece)
-        assert here.data(OTHER) == 4 * piece
+        assert here.data(OTHER) == 12 * piece
 
 
 @pytest.mark.parametrize("profile", RENAMING)
@@ -445,9 +446,9 @@ async def test_a_removal_that_was_given_up_loses_nothing(slow: Rig, path: bytes)
 
 async def test_emptying_waits_for_no_room(slow: Rig) -> None:
     """A writer that is too fast has to wait. One that empties the file makes room, also for the other."""
-    tree = slow.mount(dirty_max=64 * 1024)
+    tree = slow.mount()
     file = await tree.create(NEW, exclusive=True)
-    await file.write(0, content(128 * 1024))
+    await file.write(0, content(2 * UNMEASURED))
     async with trio.open_nursery() as writing:
         writing.start_soon(file.write, 0, b"short")
         await trio.sleep(1.05)

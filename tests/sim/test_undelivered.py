@@ -17,6 +17,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import SpoolContent
+from mavftpfs.cache.throttle import UNMEASURED
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.writeback import PAUSES
 from mavftpfs.mount.farewell import keep_the_rest
@@ -49,8 +50,8 @@ here = card({FILE: OLD}, options=QUICK)
 
 @pytest.fixture
 async def tree(here: Rig) -> Tree:
-    """A mount that keeps little in memory, and has listed the directory."""
-    tree = here.mount(dirty_max=64 * KIB)
+    """A mount that has listed the directory."""
+    tree = here.mount()
     await tree.list(b"/d")
     return tree
 
@@ -96,7 +97,7 @@ async def test_a_checksum_is_the_vehicle_s_or_none(here: Rig, tree: Tree) -> Non
 
 
 async def test_a_lost_link_holds_writers_back_before_any_upload_began(here: Rig) -> None:
-    tree = here.mount(dirty_max=128 * KIB)
+    tree = here.mount()
     file = await tree.create(NEW, exclusive=True)
     fall_silent(here)
 
@@ -107,7 +108,7 @@ async def test_a_lost_link_holds_writers_back_before_any_upload_began(here: Rig)
     with pytest.raises(MavftpfsError):
         await fill(0, 100)
     taken = file.size
-    assert taken <= 128 * KIB + 32 * KIB
+    assert taken <= UNMEASURED + 32 * KIB
     speak(here)
     await fill(taken, 8)
     await file.release()
@@ -405,7 +406,7 @@ def failing(*_: object) -> bytes:
 
 
 async def begin(here: Rig, tree: Tree, data: bytes = BIG) -> OpenFile:
-    """Write more to a file than memory takes, while the vehicle says nothing."""
+    """Write to a file while the vehicle says nothing."""
     file = await tree.create(NEW, exclusive=True)
     fall_silent(here)
     await file.write(0, data)
@@ -417,8 +418,14 @@ async def test_a_disk_that_fails_is_the_error_of_one_file(
 ) -> None:
     file = await begin(here, tree)
     speak(here)
+    really = os.pread
+
+    def pread(descriptor: int, count: int, offset: int) -> bytes:
+        large = os.fstat(descriptor).st_size >= len(BIG)
+        return failing() if large else really(descriptor, count, offset)
+
     with monkeypatch.context() as patch:
-        patch.setattr(os, "pread", failing)
+        patch.setattr(os, "pread", pread)
         for act in (file.flush(), file.fsync(), file.release(), read_file(tree, NEW)):
             with pytest.raises(MavftpfsError) as told:
                 await act
@@ -472,7 +479,7 @@ async def test_a_disk_that_fails_does_not_hide_why_the_vehicle_lacks_a_file(
 async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
     here: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tree = here.mount(dirty_max=1)  # more memory than that is not taken
+    tree = here.mount()
     file = await begin(here, tree, BIG[:65_000])  # more than that would have the writer wait
     really = os.pwrite
 
@@ -494,8 +501,8 @@ async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
 
 
 async def killed_after(here: Rig, spool: SpoolDirectory, tmp_path: Path, what: str) -> dict[str, str]:
-    """Write more than memory takes, do something, and be killed; return what the next mount finds."""
-    tree = here.mount(spool=spool, dirty_max=64 * KIB)
+    """Write, do something, and be killed; return what the next mount finds."""
+    tree = here.mount(spool=spool)
     file = await tree.create(NEW, exclusive=True)
     await file.write(0, BIG)
     if what == "rename":

@@ -15,7 +15,7 @@ from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import AHEAD, SendBuffer
 
-SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
+SPOOL = Spool()
 
 
 def draft_over(base: bytes | None) -> Draft:

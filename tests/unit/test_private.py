@@ -56,7 +56,7 @@ def test_records_and_logs_are_private_and_follow_no_link(
 def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     state = tmp_path / "state"
     killed = SpoolDirectory(state / "spool" / "1-1", Random(1))
-    content = SpoolContent(Spool(memory_max=lambda: 65536, spool_max=65536, directory=killed.path))
+    content = SpoolContent(Spool(killed.path))
     content.put(0, b"precious")
     content.persist({"path": "/card/a", "size": 8})
     assert exposed(state) == []

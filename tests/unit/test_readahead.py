@@ -162,7 +162,7 @@ class Clock:
 
 @pytest.mark.parametrize("rate", [1_000.0, 500_000.0, 20_000_000.0])
 def test_acked_bytes_are_measured_at_any_rate(rate: float) -> None:
-    context, limit = Clock(), WriteLimit(None)
+    context, limit = Clock(), WriteLimit()
     throttle, draft = Throttle(cast(Context, context), limit), cast(Draft, LOG)
     while context.now < 4.0:
         context.now += 239 / rate

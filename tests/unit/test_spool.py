@@ -1,4 +1,4 @@
-"""Where undelivered bytes wait: memory, disk, and what the next mount finds after a kill."""
+"""Where undelivered bytes wait, and what the next mount finds after a kill."""
 
 from __future__ import annotations
 
@@ -23,24 +23,17 @@ pytestmark = pytest.mark.holds("promise 3")
 PAGE = 64 * 1024
 
 
-def spool_of(tmp_path: Path, memory: int = 4 * PAGE, disk: int = 100 * PAGE) -> Spool:
-    return Spool(memory_max=lambda: memory, spool_max=disk, directory=tmp_path)
-
-
-def test_bytes_stay_in_memory_up_to_the_limit_and_go_to_disk_beyond(tmp_path: Path) -> None:
-    spool = spool_of(tmp_path)
+def test_bytes_lie_on_disk_until_they_are_not_wanted(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
     content = SpoolContent(spool)
-    data = bytes(range(256)) * 1024  # exactly the limit
-    content.put(0, data)
-    assert (spool.in_memory, spool.on_disk) == (4 * PAGE, 0)
     assert list(tmp_path.iterdir()) == []
-    content.put(len(data), b"more")
-    assert spool.in_memory == 0
-    assert spool.on_disk >= len(data)
-    assert content.get(PAGE - 3, PAGE + 3) == data[PAGE - 3 : PAGE + 3]
-    assert content.get(len(data), len(data) + 4) == b"more"
+    content.put(0, b"some")
+    content.put(9, b"more")
+    assert spool.held == 8
+    assert (tmp_path / "000001.data").read_bytes() == b"some".ljust(9, b"\0") + b"more"
+    assert content.get(2, 4) + content.get(9, 13) == b"memore"
     content.close()
-    assert (spool.in_memory, spool.on_disk) == (0, 0)
+    assert spool.held == 0
     assert list(tmp_path.iterdir()) == []
 
 
@@ -49,8 +42,7 @@ def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) 
     slot.mkdir()
     (slot / "000001.data").write_bytes(b"of a dead mount")
     directory = SpoolDirectory(tmp_path, Random(1))
-    spool = spool_of(directory.path, memory=0)
-    content = SpoolContent(spool)
+    content = SpoolContent(Spool(directory.path))
     content.put(0, b"mine")
     content.persist({"size": 4})
     assert content.get(0, 4) == b"mine"
@@ -61,7 +53,7 @@ def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) 
 
 
 def test_a_full_spool_takes_nothing_and_loses_nothing(tmp_path: Path) -> None:
-    spool = spool_of(tmp_path, memory=0, disk=1000)
+    spool = Spool(tmp_path, spool_max=1000)
     content = SpoolContent(spool)
     content.put(0, bytes(900))
     with pytest.raises(NoSpace):
@@ -69,17 +61,16 @@ def test_a_full_spool_takes_nothing_and_loses_nothing(tmp_path: Path) -> None:
     content.put(0, b"x" * 900)
     assert content.get(0, 900) == b"x" * 900
     content.cut(100)
-    assert spool.on_disk == 100
+    assert spool.held == 100
     content.put(100, bytes(900))
 
 
-def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
+def test_a_disk_that_fills_up_on_the_way_takes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spool = spool_of(tmp_path)
+    spool = Spool(tmp_path)
     content = SpoolContent(spool)
-    data = bytes(range(256)) * 1024
-    content.put(0, data)
+    content.put(0, b"old")
     really, calls = os.pwrite, iter(range(100))
 
     def pwrite(descriptor: int, piece: bytes, offset: int) -> int:
@@ -87,17 +78,14 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
             raise OSError(errno.ENOSPC, "full")
         return really(descriptor, piece[:PAGE], offset)
 
-    monkeypatch.setattr(os, "pwrite", pwrite)
-    with pytest.raises(NoSpace):
-        content.put(len(data), b"more")
-    with pytest.raises(NoSpace):
-        content.persist({"size": len(data)})
-    assert content.get(0, len(data)) == data
-    assert (spool.in_memory, spool.on_disk) == (4 * PAGE, 0)
-    assert list(tmp_path.iterdir()) == []
-    monkeypatch.undo()
-    content.put(len(data), b"more")
-    assert content.get(0, len(data) + 4) == data + b"more"
+    data = bytes(range(256)) * 1024
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", pwrite)
+        with pytest.raises(NoSpace):
+            content.put(3, data)
+    assert spool.held == 3
+    content.put(3, data)
+    assert content.get(0, 3 + len(data)) == b"old" + data
 
 
 def test_names_in_recovery_do_not_collide_and_unknown_ones_are_kept(tmp_path: Path) -> None:
@@ -142,10 +130,10 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
 # --- a process that is killed while a program writes
 
 
-def spilled(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
-    """A file of which so much was written that it went to disk."""
+def written(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
+    """A file that was written, and not closed."""
     directory = SpoolDirectory(tmp_path / "spool", Random(1))
-    content = SpoolContent(Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path), name)
+    content = SpoolContent(Spool(directory.path), name)
     content.put(0, b"so far")
     return directory, content
 
@@ -163,7 +151,7 @@ def rescued(directory: SpoolDirectory, tmp_path: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("close", [False, True])
 def test_the_description_names_the_vehicle_whenever_it_is_written(tmp_path: Path, close: bool) -> None:
     vehicle = {"system": 1, "uid": "0123456789abcdef"}
-    spool = Spool(spool_max=1 << 20, directory=tmp_path, vehicle=lambda: vehicle)
+    spool = Spool(tmp_path, vehicle=lambda: vehicle)
     content = SpoolContent(spool, b"/card/log.bin")
     content.put(0, b"so far")
     if close:
@@ -173,7 +161,7 @@ def test_the_description_names_the_vehicle_whenever_it_is_written(tmp_path: Path
 
 
 def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:
-    directory, content = spilled(tmp_path)
+    directory, content = written(tmp_path)
     content.cut(0)
     assert rescued(directory, tmp_path) == {}
     assert not (tmp_path / "recovered").exists()
@@ -184,7 +172,7 @@ def test_what_could_not_be_written_down_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[SpoolContent], None]
 ) -> None:
     """The text still says that the vehicle has it all."""
-    directory, content = spilled(tmp_path)
+    directory, content = written(tmp_path)
     content.mark_unneeded()
 
     def full(*_: object, **__: object) -> None:
@@ -200,7 +188,7 @@ def test_what_could_not_be_written_down_is_tried_again(
 
 def test_more_than_was_written_down_says_so(tmp_path: Path) -> None:
     """What a failed close wrote down is not the whole truth once more was written."""
-    directory, content = spilled(tmp_path)
+    directory, content = written(tmp_path)
     content.persist({"path": "/card/log.bin", "size": 6})
     content.put(6, b"!")
     assert rescued(directory, tmp_path) == {"card__log.bin": b"so far!"}
@@ -239,6 +227,7 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
     slot = SpoolDirectory(tmp_path / "spool", Random(1))
     for number in (1, 2, 3):
         (slot.path / f"00000{number}.data").write_bytes(b"%d" % number)
+        (slot.path / f"00000{number}.json").write_text("{}")
     slot.close()
     really = shutil.move
 
@@ -251,8 +240,8 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
     monkeypatch.setattr(shutil, "move", move)
     again = SpoolDirectory(tmp_path / "spool", Random(2))
     assert [path.read_bytes() for path in again.rescue(tmp_path / "r")] == [b"1", b"3"]
-    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["000001.data", "000003.data"]
-    content = SpoolContent(Spool(memory_max=lambda: 0, spool_max=1000, directory=again.path))
+    assert sorted(path.name for path in (tmp_path / "r").glob("*.data")) == ["000001.data", "000003.data"]
+    content = SpoolContent(Spool(again.path))
     content.put(0, b"new")
     again.discard()
     again.close()
@@ -267,7 +256,7 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
 
 
 def test_zeros_behind_a_cut_are_zeros_on_the_disk_too(tmp_path: Path) -> None:
-    content = SpoolContent(spool_of(tmp_path))
+    content = SpoolContent(Spool(tmp_path))
     content.put(0, b"x" * (PAGE + 9))
     content.cut(PAGE + 5)
     content.cut(3)
@@ -282,7 +271,7 @@ def failing(*_: object) -> bytes:
 
 
 def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spool = spool_of(tmp_path, memory=0)
+    spool = Spool(tmp_path)
     content = SpoolContent(spool, b"/f")
     content.put(0, b"abcdef")
     acts: dict[str, Callable[[], object]] = {
@@ -306,19 +295,16 @@ def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: p
     (data,) = tmp_path.glob("*.data")
     data.unlink()
     data.with_suffix(".json").unlink()
-    assert (spool.in_memory, spool.on_disk) == (0, 0)
+    assert spool.held == 0
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spool = spool_of(tmp_path)
-    content = SpoolContent(spool, b"/f")
-    content.put(0, b"in memory")
+    content = SpoolContent(Spool(tmp_path), b"/f")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", failing)
         with pytest.raises(NoSpace):
-            content.put(9, bytes(5 * PAGE))
-    assert content.get(0, 9) == b"in memory"
+            content.put(0, b"bytes")
     assert list(tmp_path.iterdir()) == []
