@@ -65,8 +65,7 @@ def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
         opened. UsageError (a ValueError): source or an option is wrong; the text names it.
     """
     with translated():
-        # A mount keeps editors' swap files in memory, but a program's files are meant for the card.
-        target = target_of(source, replace(options_of(options), local=()))
+        target = target_of(source, options_of(options))
         if target.mount is not None and not use_mount:
             raise UsageError(f"{source} is a mount, and use_mount=False refuses it; name the vehicle's link")
     for line in target.options.gone:

@@ -1,9 +1,9 @@
 """Files whose names never reach the vehicle: swap files, locks. Layer: cache.
 
-Editors make such files beside the files they work on; the `local=` patterns know their names. They live in
-memory, within a limit, and only this mount shows them. Directories with such names cannot be made: a trash
-directory would be lost with the mount, and a file manager that finds none offers to delete instead. A rename
-between a local name and the vehicle is EXDEV, as between two disks, so programs copy.
+Editors make such files beside the files they work on; patterns know their names. They live in memory, within
+a limit, and only this mount shows them. Directories with such names cannot be made: a trash directory would
+be lost with the mount, and a file manager that finds none offers to delete instead. A rename between a local
+name and the vehicle is EXDEV, as between two disks, so programs copy.
 """
 
 from __future__ import annotations
@@ -31,6 +31,13 @@ class LocalFile:
     named: bool = True
 
 
+def matching(patterns: tuple[str, ...]) -> Callable[[bytes], bool]:
+    """Return a function that returns whether a path is local: a name in it fits one of the patterns."""
+    joined = "|".join(translate(pattern) for pattern in patterns) or r"(?!)"
+    pattern = compile_pattern(joined.encode("utf-8", "surrogateescape"))
+    return lambda path: any(map(pattern.match, path.split(b"/")))
+
+
 class LocalFiles:
     """All local names of a mount, by path.
 
@@ -40,8 +47,7 @@ class LocalFiles:
 
     def __init__(self, patterns: tuple[str, ...], limit: int, now_ns: Callable[[], int]) -> None:
         """`limit`: bytes of all content."""
-        joined = "|".join(translate(pattern) for pattern in patterns) or r"(?!)"
-        self._pattern = compile_pattern(joined.encode("utf-8", "surrogateescape"))
+        self._matches = matching(patterns)
         self._limit = limit
         self._now_ns = now_ns
         self._files: dict[bytes, LocalFile] = {}
@@ -49,7 +55,7 @@ class LocalFiles:
 
     def owns(self, path: bytes) -> bool:
         """Return whether a path is local, whether it exists or not."""
-        return any(map(self._pattern.match, path.split(b"/")))
+        return self._matches(path)
 
     def find(self, path: bytes) -> LocalFile:
         """Return the file of a path.

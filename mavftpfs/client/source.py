@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.files import Target, mountpoint_of
@@ -51,11 +52,13 @@ def _may_be_directory(source: str, mountpoint: str) -> bool:
 
 
 def target_of(source: str, options: Options) -> Target:
-    """Return what SOURCE names.
+    """Return what SOURCE names, for a command or a program.
 
     Raises:
         UsageError: it is no SOURCE, or contradicts the options.
     """
+    # A mount keeps editors' swap files in memory. What a command or a program puts is meant for the card.
+    options = replace(options, local=())
     mount = mountpoint_of(source)
     if mount is not None:
         if options.root != ROOT:

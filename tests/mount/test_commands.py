@@ -58,6 +58,24 @@ def test_a_simulated_vehicle_tells_its_own_version(
     assert told.split(", ") == [*out.split("\t")[1].split(", "), f"firmware {out.split(chr(9))[2]}"]
 
 
+@pytest.mark.holds("promise 2")
+def test_what_is_put_under_the_name_of_a_swap_file_is_on_the_card_or_an_error(
+    field: Field, tmp_path: Path
+) -> None:
+    """A mount keeps such names in its memory."""
+    card = field.local("card")
+    vehicle = field.sim(card)
+    (tmp_path / ".a.swp").write_bytes(b"swap")
+    mavftpfs("put", vehicle.source, tmp_path / ".a.swp", "/")
+    assert (card / ".a.swp").read_bytes() == b"swap"
+    (card / ".a.swp").unlink()
+    mount = field.mount(vehicle.source)
+    for target in ("/", "/.b.swp"):
+        _, said = mavftpfs("put", mount.path, tmp_path / ".a.swp", target, code=4)
+        assert "would stay in the mount's memory" in said
+    assert mount.run("ls", "-A", mount.path).stdout == ""
+
+
 @pytest.mark.holds("promise 1")
 def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) -> None:
     out, _ = mavftpfs("get", vehicle.source, "/sizes/35850.bin", "/README.txt", "--to", tmp_path)
