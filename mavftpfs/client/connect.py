@@ -33,7 +33,7 @@ from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
-from mavftpfs.session.driver import PayloadTrace
+from mavftpfs.session.driver import PayloadSink
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
@@ -94,7 +94,7 @@ class Sinks:
     """Where the traffic of the link is recorded: FTP payloads, and whole frames. tell: gets lines for people
     about what is waited for."""
 
-    payload: PayloadTrace | None = None
+    payload: PayloadSink | None = None
     frame: Callable[[bytes], None] | None = None
     tell: Callable[[str], None] = lambda line: None
 
@@ -201,7 +201,7 @@ async def attached(
     settings = connect_options(options)
     async with (
         opened(spec, options) as link,
-        connected(link, settings, trace=sinks.payload, on_frame=sinks.frame) as connection,
+        connected(link, settings, on_payload=sinks.payload, on_frame=sinks.frame) as connection,
     ):
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
         async with with_tree(

@@ -177,7 +177,9 @@ class Watch:
         while True:
             system = options.target_system or self._wanted_system
             settings = replace(connect_options(options), target_system=system)
-            async with connected(link, settings, trace=sinks.payload, on_frame=sinks.frame) as connection:
+            async with connected(
+                link, settings, on_payload=sinks.payload, on_frame=sinks.frame
+            ) as connection:
                 await self.serve(LinkContact(connection, spec, options))
 
     async def serve(self, contact: Contact) -> None:

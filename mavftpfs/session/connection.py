@@ -19,7 +19,6 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.framing import AUTOPILOT_VERSION_ID, STORAGE_INFORMATION_ID, SYSTEM_TIME_ID, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
-    MAV_TYPE_GCS,
     MAV_TYPE_ONBOARD_CONTROLLER,
     OWN_COMPONENT,
     Address,
@@ -28,7 +27,7 @@ from mavftpfs.link.peers import names_of
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import Payload
-from mavftpfs.session.driver import Driver, PayloadTrace
+from mavftpfs.session.driver import Driver, PayloadSink
 from mavftpfs.session.scheduler import ReadMode, Scheduler
 from mavftpfs.session.store import Store
 from mavftpfs.session.upload import Upload
@@ -80,13 +79,10 @@ class ConnectOptions:
     target_system: int = 0
     target_component: int = 0
     source_system: int = 254
-    source_component: int = OWN_COMPONENT
-    heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
     signing_key: bytes | None = None
     op_deadline: float = 30.0
     read_mode: ReadMode = "window"
     chunk: int | None = None
-    window: int | None = None
     when_armed: Literal["ro", "ok"] = "ro"
     bwlimit: int | None = None
 
@@ -106,7 +102,7 @@ class Connection:
         *,
         rng: random.Random,
         clock: Callable[[], float],
-        trace: PayloadTrace | None = None,
+        on_payload: PayloadSink | None = None,
         on_frame: Callable[[bytes], None] | None = None,
     ) -> None:
         self.link, self.options, self.clock = link, options, clock
@@ -114,7 +110,7 @@ class Connection:
         self.was_lost = False
         self.news: list[Callable[[str], None]] = []
         self._first_heartbeat, self._doubted = trio.Event(), trio.Event()
-        own = Address(options.source_system, options.source_component) if link.seat is None else link.seat.own
+        own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
         framer = Framer(
             own,
             stream=link.is_stream,
@@ -137,7 +133,7 @@ class Connection:
             on_doubt=self._on_doubt,
             patience=options.op_deadline,
         )
-        flow = Flow(serial=link.is_serial, limit=options.window, bwlimit=options.bwlimit)
+        flow = Flow(serial=link.is_serial, bwlimit=options.bwlimit)
         self.engine = Engine(
             rng,
             flow,
@@ -145,7 +141,7 @@ class Connection:
             on_unexplained=self._on_unexplained,
             on_late=self._on_late,
         )
-        self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, trace=trace)
+        self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, on_payload=on_payload)
         self.scheduler = Scheduler(
             self.driver,
             clock=clock,
@@ -268,7 +264,7 @@ class Connection:
         """Somebody else uses our address: replies could not be told apart, so take the next component id."""
         own = self.vehicle.own
         # More are more likely our own echo than neighbours.
-        if own.component - self.options.source_component <= 5:
+        if own.component - OWN_COMPONENT <= 5:
             self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
 
     def _on_doubt(self) -> None:
@@ -295,11 +291,9 @@ class Connection:
 
         Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
         """
-        kind, driver = self.options.heartbeat, self.driver
-        vehicle_type = MAV_TYPE_GCS if kind == "gcs" else MAV_TYPE_ONBOARD_CONTROLLER
+        driver = self.driver
         while True:
-            if kind != "none":
-                driver.send(driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID))
+            driver.send(driver.framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID))
             self.engine.flow.alone = not self.vehicle.another_client_heard(self.clock())
             await trio.sleep(HEARTBEAT_PERIOD)
             if not self.was_lost and self.vehicle.lost(self.clock()):
@@ -362,15 +356,15 @@ async def connected(
     *,
     rng: random.Random | None = None,
     clock: Callable[[], float] = trio.current_time,
-    trace: PayloadTrace | None = None,
+    on_payload: PayloadSink | None = None,
     on_frame: Callable[[bytes], None] | None = None,
 ) -> AsyncIterator[Connection]:
     """Run a connection over an open link for the length of the body; the session is terminated at its end.
 
-    trace, on_frame: told of each FTP payload, and of each whole frame, received or sent.
+    on_payload, on_frame: told of each FTP payload, and of each whole frame, received or sent.
     """
     rng = rng or random.SystemRandom()
-    connection = Connection(link, options, rng=rng, clock=clock, trace=trace, on_frame=on_frame)
+    connection = Connection(link, options, rng=rng, clock=clock, on_payload=on_payload, on_frame=on_frame)
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:
         serving = _Task(nursery, connection.scheduler.serve)

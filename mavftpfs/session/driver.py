@@ -44,7 +44,7 @@ BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
 
 
-PayloadTrace = Callable[[float, str, bytes], None]
+PayloadSink = Callable[[float, str, bytes], None]
 """Told of each FTP payload (251 bytes): the time, "request" or "reply", and the payload."""
 
 
@@ -64,7 +64,7 @@ class Driver:
         vehicle: Vehicle,
         *,
         clock: Callable[[], float],
-        trace: PayloadTrace | None = None,
+        on_payload: PayloadSink | None = None,
     ) -> None:
         self.link = link
         self.framer = framer
@@ -75,7 +75,7 @@ class Driver:
         self.last_reply_at = clock()
         self._heard_at = clock()
         self._clock = clock
-        self._trace = trace
+        self._on_payload = on_payload
         self._addresses = AddressBook()
         self._impostor_at: float | None = None
         self._scope: trio.CancelScope | None = None
@@ -245,9 +245,9 @@ class Driver:
         self.vehicle.identity.heard(now)
         if self.vehicle.identity.standing is not Standing.TRUSTED:
             return  # requests are repeated when the vehicle has told its id
-        if self._trace is not None:
+        if self._on_payload is not None:
             for wire in wires:
-                self._trace(now, "reply", wire)
+                self._on_payload(now, "reply", wire)
         malformed = self.engine.receive_run(wires, now)
         if malformed < len(wires):
             self.last_reply_at = now
@@ -294,7 +294,7 @@ class Driver:
         payloads = self.engine.outgoing(now)
         if not payloads:
             return
-        if self._trace is not None:
+        if self._on_payload is not None:
             for wire in payloads:
-                self._trace(now, "request", wire)
+                self._on_payload(now, "request", wire)
         link.send_nowait(self.framer.encode_ftp_run(target, payloads))

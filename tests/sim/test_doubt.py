@@ -15,6 +15,7 @@ import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
+from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, UNKNOWN_LATENESS, Doubt, LateCopies
@@ -217,7 +218,8 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
     behind our open both answers come at once, before the task that opened the file goes on."""
     one, two = content(1500, 1), content(1500, 2)
     here = Rig(profile, {b"/d/one": one, b"/d/two": two}, CLEAN)
-    async with here.connected(ConnectOptions(window=1)) as connection:
+    async with here.connected() as connection:
+        connection.engine.flow = Flow(limit=1)
         copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=after, nth=nth, first=True)
         assert await read_file(connection, path(profile, "one")) == one
         if after is Opcode.OPEN_FILE_RO:
