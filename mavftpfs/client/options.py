@@ -57,19 +57,7 @@ Parser = Callable[[str], Any]
 """Parses the text of a value; raises ValueError, which says what it should have been."""
 
 
-def _or_auto(parse: Parser) -> Parser:
-    """Return a parser that also takes `auto`, and says so."""
-
-    def parse_or_auto(text: str) -> Any:
-        try:
-            return None if text == "auto" else parse(text)
-        except ValueError as exc:
-            raise ValueError(f"{exc}, or auto") from None
-
-    return parse_or_auto
-
-
-def size(low: int, high: int, *, auto: bool = False) -> Parser:
+def size(low: int, high: int) -> Parser:
     """Return a parser of sizes: a number with K, M or G (powers of 1024), within [low, high]."""
 
     def parse(text: str) -> int:
@@ -79,10 +67,10 @@ def size(low: int, high: int, *, auto: bool = False) -> Parser:
             raise ValueError("must be a whole number of bytes, perhaps with K, M or G behind it")
         return _within(int(digits) * _UNITS.get(unit, 1), low, high, shown=_with_unit)
 
-    return _or_auto(parse) if auto else parse
+    return parse
 
 
-def number(low: int, high: int, *, auto: bool = False) -> Parser:
+def number(low: int, high: int) -> Parser:
     """Return a parser of whole numbers within [low, high]."""
 
     def parse(text: str) -> int:
@@ -90,7 +78,19 @@ def number(low: int, high: int, *, auto: bool = False) -> Parser:
             raise ValueError("must be a whole number")
         return _within(int(text), low, high)
 
-    return _or_auto(parse) if auto else parse
+    return parse
+
+
+def or_auto(parse: Parser) -> Parser:
+    """Return a parser that also takes `auto`, and says so."""
+
+    def parse_or_auto(text: str) -> Any:
+        try:
+            return None if text == "auto" else parse(text)
+        except ValueError as exc:
+            raise ValueError(f"{exc}, or auto") from None
+
+    return parse_or_auto
 
 
 def seconds(low: float, high: float) -> Parser:
@@ -160,7 +160,7 @@ VALUES: Values = {
     "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
     "read_mode": Value(Choice("window", "burst"), "window or burst"),
-    "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
+    "chunk": Value(or_auto(number(16, 239)), "bytes of a file in a packet, 16 to 239: auto"),
     "bwlimit": Value(size(100, _SIZE_MAX), "use about so many bytes per second of the link"),
     "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
     "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
