@@ -22,6 +22,8 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.session.scheduler import Scheduler, Turn
 from tests.support.clocks import use_virtual_time
 
+pytest_plugins = ("tests.support.privileges",)
+
 TIERS = ("unit", "property", "sim", "ops", "api", "mount")
 """Lower tiers run first, so that the first failure is the one nearest to its cause."""
 
@@ -55,8 +57,10 @@ def surroundings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", str(tmp_path_factory.mktemp("t")))
         patch.setattr(tempfile, "tempdir", None)
-        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "PYTHONDONTWRITEBYTECODE"):
+        for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
             patch.delenv(name, raising=False)
+        if TESTS.stat().st_uid == os.geteuid():  # root leaves nothing in an ordinary user's checkout
+            patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield
 
 

@@ -138,6 +138,7 @@ def test_unmounting_from_a_dead_vehicle_waits_for_no_read(field: Field, big_tree
     vehicle.resume()
 
 
+@pytest.mark.needs("root")
 def test_a_mount_that_the_kernel_aborted_is_gone(field: Field, big_tree: Path) -> None:
     """`umount -f` of one in use fails, and has cut the programs off all the same."""
     mount = field.mount(field.sim(big_tree).source)

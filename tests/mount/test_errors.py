@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.mount.conftest import Field
 from tests.support.mounts import abort_mount, mavftpfs, mounted_at, processes_in, unmount, wait_until
 from tests.support.vehicles import HOST, PROJECT, free_udp_port
@@ -23,6 +25,7 @@ def test_a_mount_is_not_put_onto_a_vehicle_and_says_what_it_hides(field: Field, 
     assert f"{full} is not empty: what is in it is hidden" in said
 
 
+@pytest.mark.needs("namespaces")
 def test_no_fuse_device_is_exit_3(tmp_path: Path) -> None:
     hide = 'mount -t tmpfs none /dev && exec "$@"'
     command = ["unshare", "--mount", "sh", "-c", hide, "sh", sys.executable, "-m", "mavftpfs"]

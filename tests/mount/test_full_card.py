@@ -39,6 +39,7 @@ def names(folder: Path) -> list[str]:
     return sorted(os.listdir(folder))
 
 
+@pytest.mark.needs("root")
 @pytest.mark.holds("fault full card")
 @pytest.mark.parametrize("kind", FULL)
 def test_what_does_not_fit_costs_nothing_that_was_there(

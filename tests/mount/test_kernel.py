@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -88,11 +87,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelServer]:
     running.end()
 
 
-def drop_caches() -> None:
-    """Have the kernel forget names and inodes that nobody uses."""
-    Path("/proc/sys/vm/drop_caches").write_text("2\n")
-
-
 def test_one_listing_answers_the_stats_that_follow(server: KernelServer) -> None:
     server.calls()
     code = "print(sum(entry.stat().st_size for entry in os.scandir(sys.argv[1])))"
@@ -146,13 +140,8 @@ def test_the_kernel_forgets_and_every_number_stays(server: KernelServer) -> None
     code = "print({entry.name: entry.inode() for entry in os.scandir(sys.argv[1])})"
     before = server.run(code, server.path / "many")
     assert server.counts()["inodes"] > 1500
-
-    def forgotten() -> bool:
-        drop_caches()
-        time.sleep(0.3)  # dropping all caches again and again is dear
-        return server.counts()["inodes"] < 10
-
-    wait_until("forgotten", forgotten)
+    server.do("forget", path="/many")  # of a directory the kernel drops all names below, too
+    wait_until("forgotten", lambda: server.counts()["inodes"] < 10)
     assert server.run(code, server.path / "many") == before
     wait_until("released", lambda: server.counts()["open_directories"] == 0)
     assert server.counts()["excess_forgets"] == 0

@@ -73,6 +73,8 @@ for place in usr/local usr/sbin etc; do
     mkdir -p "$1/up/$place" "$1/scratch/$place"
     mount -t overlay none -o "lowerdir=/$place,upperdir=$1/up/$place,workdir=$1/scratch/$place" "/$place"
 done
+find /usr/local/bin /usr/local/share /usr/local/lib/systemd /usr/sbin /etc/udev -depth -name '*mavftpfs*' \\
+    -exec rm -r {} + 2>/dev/null || true  # this computer may have one installed, or lack a directory
 written() { (cd "$1/up" && find . -type f -o -type l | sort | sed "s,^,$2 ,"); }
 """
 
@@ -109,6 +111,7 @@ def installation(tmp_path: Path) -> Installation:
 CHECK = 'mount.mavftpfs -f udpin:127.0.0.1:14550 /mnt && echo "version $(/usr/local/bin/mavftpfs --version)"'
 
 
+@pytest.mark.needs("namespaces", "root's Python")
 def test_install_remove_install_upgrade_and_uninstall(installation: Installation) -> None:
     said = installation.run(
         '"$2/mavftpfs" install >/dev/null',
@@ -138,6 +141,7 @@ def test_install_remove_install_upgrade_and_uninstall(installation: Installation
     assert "uninstalled" not in said
 
 
+@pytest.mark.needs("namespaces", "root's Python")
 def test_what_others_put_there_stays(installation: Installation) -> None:
     said = installation.run(
         'ln -s "$2/mavftpfs" /usr/local/bin/mavftpfs',  # as pipx does
@@ -149,6 +153,7 @@ def test_what_others_put_there_stays(installation: Installation) -> None:
     assert said["left"] == ["./usr/local/bin/mavftpfs"]
 
 
+@pytest.mark.needs("namespaces")
 @pytest.mark.parametrize("place", ["$2/mavftpfs", "$3"])
 def test_root_does_not_run_what_another_user_owns(installation: Installation, place: str) -> None:
     said = installation.run(

@@ -359,6 +359,7 @@ exec "$1" -m mavftpfs umount "$3/mnt"
 """
 
 
+@pytest.mark.needs("namespaces")
 def test_an_ordinary_user_mounts_all(fleet: Fleet) -> None:
     """fusermount3 works as root, and the kernel keeps root out of a user's own mounts."""
     for system in (1, 2):

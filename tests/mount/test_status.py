@@ -22,7 +22,8 @@ from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, command, w
 from tests.support.vehicles import PROJECT
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
-NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+CAT = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "cat")
+AS_NOBODY = (sys.executable, str(PROJECT / "tests/support/programs/as_nobody.py"))
 
 
 def logged(mount: Mount, text: str) -> None:
@@ -119,18 +120,6 @@ def test_a_dead_mount_is_said_to_be_dead_and_watching_it_ends_when_it_is_cleared
         assert watch.stderr.read() == f"mavftpfs: no vehicle of yours is mounted on {mount.path}\n"
 
 
-def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
-    field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As root finds that of a user: each has a home, and a directory for sockets, of his own."""
-    mount = field.prepare(field.sim(small_tree).source)
-    with monkeypatch.context() as elsewhere:
-        for name in ("HOME", "XDG_RUNTIME_DIR"):
-            elsewhere.setenv(name, str(field.local(name)))
-        mount.start()
-    assert command("status")[0].count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
-
-
 @pytest.fixture
 def open_field() -> Iterator[Field]:
     """A field in a directory that other users may enter; they may not enter those of pytest."""
@@ -141,11 +130,25 @@ def open_field() -> Iterator[Field]:
         yield field
 
 
-def by_nobody(mount: Mount, *argv: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run a command as another user."""
-    return mount.run(*NOBODY, *argv, cwd=Path("/"), code=code)
+def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
+    open_field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As root finds that of a user: each has a home, and a directory for sockets, of his own. Their paths are
+    short here, because that of a socket has to be."""
+    mount = open_field.prepare(open_field.sim(small_tree).source)
+    with monkeypatch.context() as elsewhere:
+        for name in ("HOME", "XDG_RUNTIME_DIR"):
+            elsewhere.setenv(name, str(open_field.local(name)))
+        mount.start()
+    assert command("status")[0].count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
 
 
+def by_nobody(mount: Mount, *words: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run a command of mavftpfs as another user."""
+    return mount.run(*AS_NOBODY, *words, cwd=Path("/"), code=code)
+
+
+@pytest.mark.needs("root")
 @pytest.mark.holds("promise 10")
 def test_another_user_is_told_in_a_line(
     open_field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
@@ -155,24 +158,25 @@ def test_another_user_is_told_in_a_line(
     state = mount.folder / "state"
     state.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
-    for verb, code, why in (
+    for words, code, why in (
         (("umount", mount.path), ExitCode.MOUNT_FAILED, "another user mounted it"),
         (("recover",), ExitCode.USAGE, "Permission denied"),
     ):
-        refused = by_nobody(mount, sys.executable, "-m", "mavftpfs", *verb, code=code)
+        refused = by_nobody(mount, *words, code=code)
         assert len(refused.stderr.splitlines()) == 1
         assert why in refused.stderr
-    shown = by_nobody(mount, "cat", mount.path / "README.txt").stdout
+    shown = mount.run(*CAT, mount.path / "README.txt", cwd=Path("/")).stdout
     assert shown == (small_tree / "README.txt").read_text()
-    assert str(mount.path) in by_nobody(mount, *STATUS).stdout
-    own = (sys.executable, "-m", "mavftpfs")  # he cannot join its port, and a second program cannot have it
-    said = by_nobody(mount, *own, "ls", "-o", "target_system=7", mount.source, code=2).stderr
+    assert str(mount.path) in by_nobody(mount, "status").stdout
+    # he cannot join its port, and a second program cannot have it
+    said = by_nobody(mount, "ls", "-o", "target_system=7", mount.source, code=2).stderr
     assert f"belongs to the mount on {mount.path}, of vehicle 1/1" in said
     assert "another program" not in said
-    assert f"mounted on {mount.path}" in by_nobody(mount, *own, "scan", mount.source).stdout
+    assert f"mounted on {mount.path}" in by_nobody(mount, "scan", mount.source).stdout
 
 
+@pytest.mark.needs("root")
 def test_another_user_does_not_see_what_he_may_not_read(open_field: Field, small_tree: Path) -> None:
     mount = open_field.mount(open_field.sim(small_tree).source)
-    assert str(mount.path) not in by_nobody(mount, *STATUS).stdout
-    by_nobody(mount, *STATUS, mount.path, code=ExitCode.MOUNT_FAILED)
+    assert str(mount.path) not in by_nobody(mount, "status").stdout
+    by_nobody(mount, "status", mount.path, code=ExitCode.MOUNT_FAILED)

@@ -240,6 +240,7 @@ trap 'kill $vehicle; wait $vehicle' EXIT
 """
 
 
+@pytest.mark.needs("namespaces")
 def test_a_mount_of_another_network_namespace_is_another_vehicles(field: Field) -> None:
     """Its port is spelled the same, and its files can be seen from there."""
     vehicle = field.sim(field.local("card"))

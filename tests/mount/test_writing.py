@@ -86,7 +86,7 @@ EDITS = {
     "truncate": "truncate -s 1000 big; truncate -s +5000 big; truncate -s 0 Upper; truncate -s 77 Upper;"
     "cksum big Upper",
     "sparse": "truncate -s 40000 hole; printf end >> hole; cp --sparse=always hole sparse; cmp hole sparse",
-    "chmod": "chmod 600 big; stat -c %a big; chmod 755 d; stat -c %a d; chown 0:0 big",
+    "chmod": "chmod 600 big; stat -c %a big; chmod 755 d; stat -c %a d; chown $(id -u):$(id -g) big",
     "directory times": "mkdir t u; echo x > t/x;"
     'changes() { touch -d 2020-02-02 t u; eval "$1" 2>/dev/null || true;'
     'echo "$1:" $(find t u -maxdepth 0 -newermt 2021-01-01); };'

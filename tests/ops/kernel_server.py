@@ -1,7 +1,8 @@
 """Mounts a FakeTree for the mount tests: python -m tests.ops.kernel_server MOUNTPOINT CONTROL_SOCKET.
 
 Takes one JSON object a line on stdin and answers each with one on stdout: {"do": "write", "path", "text"},
-{"do": "invalidate", "path"}, and {"do": "calls"}, which gives the calls since the last time.
+{"do": "invalidate", "path"}, {"do": "forget", "path"} for a name in the root, and {"do": "calls"}, which
+gives the calls since the last time.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pyfuse3
 import trio
 
 from mavftpfs.client.connect import Attached
@@ -60,6 +62,8 @@ class Server:
                 self.tree.files[path] = order["text"].encode()
             case "invalidate":
                 invalidate(path)
+            case "forget":
+                pyfuse3.invalidate_entry_async(pyfuse3.ROOT_INODE, path.removeprefix(b"/"))
             case "calls":
                 names = [name for name, _ in self.tree.calls]
                 self.tree.calls.clear()

@@ -400,6 +400,7 @@ def stick(place: Path, size: str) -> Iterator[None]:
         run("umount", "-l", place)
 
 
+@pytest.mark.needs("root")
 async def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
     with stick(tmp_path / "stick", "2m"):
         day = Day(tmp_path / "stick")
@@ -414,6 +415,7 @@ async def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
         assert day.logs() == {"1.ulg": content(400_000)}
 
 
+@pytest.mark.needs("root")
 async def test_a_disk_that_is_pulled_in_mid_transfer(tmp_path: Path) -> None:
     place, disk = tmp_path / "stick", tmp_path / "disk"
     disk.mkdir()

@@ -10,6 +10,7 @@ import errno
 import io
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -86,8 +87,9 @@ def install_programs(folder: Path, library: Path = PROJECT) -> Path:
     """Make the two programs of an installation; return the first. library: where their package is."""
     for name, function in (("mount.mavftpfs", "mount_helper"), ("mavftpfs", "main")):
         program = folder / name
-        program.write_text(
-            f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(library)!r})\n"
+        program.write_text(  # as pip does it: #! takes no path with a blank
+            f"#!/bin/sh\n'''exec' {shlex.quote(sys.executable)} \"$0\" \"$@\"\n' '''\n"
+            f"import sys\nsys.path.insert(0, {str(library)!r})\n"
             f"from mavftpfs.cli import main\nsys.exit(main.{function}())\n"
         )
         program.chmod(0o755)

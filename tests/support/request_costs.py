@@ -5,6 +5,7 @@ Each starts with its directory's parent listed. Terminate and verification are i
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,13 +20,14 @@ SMALL = 300
 """Bytes of a small file: two ReadFiles, two WriteFiles."""
 
 BIG = 1_000_000
+PYTHON = shlex.quote(sys.executable)
 STAT_STORM = (
-    f"{sys.executable} -c 'import os, sys\n"
+    f"{PYTHON} -c 'import os, sys\n"
     "for number in range(1000):\n"
     "    os.path.exists(sys.argv[1] + str(number % int(sys.argv[2])))'"
 )
 THUMBNAIL = (
-    f"{sys.executable} -c 'import os\n"
+    f"{PYTHON} -c 'import os\n"
     'file = os.open("big", os.O_RDONLY)\n'
     "for offset in (0, 999000, 500000):\n"
     "    os.pread(file, 1000, offset)'"

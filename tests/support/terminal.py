@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import signal
 import struct
 import subprocess
@@ -18,7 +19,7 @@ from pathlib import Path
 
 from tests.support.vehicles import PROJECT
 
-NANO = f"{sys.executable} {Path(__file__).parent / 'programs' / 'nano_save.py'}"
+NANO = shlex.join([sys.executable, str(Path(__file__).parent / "programs" / "nano_save.py")])
 """Edits a file in nano, as a shell command: FILE [LINE,COLUMN WORD]."""
 
 _ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")

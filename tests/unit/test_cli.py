@@ -278,7 +278,7 @@ def test_a_reader_that_leaves_ends_a_command_as_sigpipe_would(tmp_path: Path) ->
 
 def test_streams_that_the_caller_closed_are_no_error(tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path)}
-    command = f"{sys.executable} -m mavftpfs status <&- >&-"
+    command = f"{shlex.quote(sys.executable)} -m mavftpfs status <&- >&-"
     done = subprocess.run(
         ["sh", "-c", command], env=environment, stderr=subprocess.PIPE, text=True, timeout=90, check=False
     )

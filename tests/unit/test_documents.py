@@ -22,7 +22,7 @@ HEADING = re.compile(r"^#{1,4} (.+)$", re.MULTILINE)
 def texts() -> dict[Path, str]:
     """Return every text file of the repository but this one."""
     listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        ["git", "-c", "safe.directory=*", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=PROJECT,
         capture_output=True,
         text=True,
