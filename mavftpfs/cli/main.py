@@ -448,7 +448,7 @@ def _hub_parser(name: str) -> Parser:
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="only this port; default: all")
     parser.add_argument("--stop", action="store_true", help="end it; says first what that would cut")
     parser.add_argument("--force", action="store_true", help="with --stop: also what is in use")
-    parser.add_argument("--take-over", help=argparse.SUPPRESS)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     return parser
 
 

@@ -6,13 +6,11 @@ import argparse
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from mavftpfs.client.status import said_of_double
 from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
-from mavftpfs.link.rendezvous import Busy, hubs, knock_at
-from mavftpfs.link.samelink import port_name
+from mavftpfs.link.ports import connect, names_in_use, port_name
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount import daemon
 from mavftpfs.shared.errors import ExitCode, UsageError
@@ -26,8 +24,8 @@ Status = Mapping[str, Any]
 
 
 def hub(args: argparse.Namespace) -> int:
-    """Show the hubs, or stop them; with --take-over be one."""
-    if args.take_over is not None:
+    """Show the hubs, or stop them; with --serve be one."""
+    if args.serve:
         return daemon.in_background(lambda report: _serve(args, report))
     if args.stop:
         return _stop(args)
@@ -49,8 +47,8 @@ def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
     from mavftpfs.hub.process import serve
 
     daemon.log_in_background(own_directories()[-1] / "mavftpfs.log", logging.INFO)
-    inherited = [int(number) for number in args.take_over.split(",")]
-    serve(args.source, inherited, lambda: report(0, ""))
+    report(ExitCode.OK, "")
+    serve(args.source)
     return ExitCode.OK
 
 
@@ -63,8 +61,8 @@ def _stop(args: argparse.Namespace) -> int:
             print(printable(line))
     if cut and not args.force:
         raise UsageError("that would be cut (mounts open the port again); --force does it")
-    for path, _ in found:
-        _ask(path, {"stop": True})
+    for name, _ in found:
+        _ask(name, {"stop": True})
     if not found:
         print(NOTHING)
     return ExitCode.OK
@@ -95,24 +93,19 @@ def status_lines(facts: Status) -> Iterator[str]:
         yield f"  {said_of_double(double['system'], double['address'])}"
 
 
-def _hubs(source: str | None, request: Facts) -> Iterator[tuple[Path, Status]]:
-    """Yield each hub's door and what it replies; those of one SOURCE, or all."""
-    name = None if source is None else port_name(parse_source(source))
-    for path in hubs():
-        if name in (None, path.stem):
-            reply = _ask(path, request)
-            if reply is not None:
-                yield path, reply
+def _hubs(source: str | None, request: Facts) -> Iterator[tuple[str, Status]]:
+    """Yield the name of each port that a hub has, and what the hub replies; that of one SOURCE, or all."""
+    for name in names_in_use() if source is None else [port_name(parse_source(source))]:
+        reply = _ask(name, request)
+        if reply is not None:
+            yield name, reply
 
 
-def _ask(path: Path, request: Facts) -> Status | None:
-    """Return the reply of the hub behind a door; None if there is no hub, but perhaps a program alone."""
-    with suppress(OSError, Busy):
-        sock = knock_at(path)
-        if sock is not None:
-            with sock:
-                sock.settimeout(PATIENCE)
-                sock.send(pack_facts({"protocol": PROTOCOL, **request}))
-                reply = unpack_facts(sock.recv(1 << 16))
-            return reply if reply is not None and "refused" not in reply else None
+def _ask(name: str, request: Facts) -> Status | None:
+    """Return the reply of the hub that has a port; None if there is none, but perhaps a program alone."""
+    with suppress(OSError), connect(name) as sock:
+        sock.settimeout(PATIENCE)
+        sock.send(pack_facts({"protocol": PROTOCOL, **request}))
+        reply = unpack_facts(sock.recv(1 << 16))
+        return reply if reply is not None and "refused" not in reply else None
     return None

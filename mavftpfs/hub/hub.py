@@ -1,8 +1,8 @@
 """The hub: sockets around the router. Layer: hub.
 
-It begins with one client, the program that started it: until that one is let in, port and door are its own.
-It ends with its last client. But it stays while a vehicle is armed and an endpoint is heard: the link of a
-ground station outlives the mount.
+The hub calls the program that has the port, which closes the port and becomes the first client. The hub ends
+with its last client. But while a vehicle is armed and an endpoint is heard the hub stays, because the link of
+a ground station outlives the mount.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import logging
 import os
 import socket
-from collections.abc import Callable, Sequence
-from contextlib import AsyncExitStack
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,16 +28,18 @@ from mavftpfs.link.hublink import (
     PROTOCOL,
     Facts,
     as_address,
+    hear,
     make_tag,
     pack_facts,
     pack_frames,
     set_buffers,
+    tell,
     unpack_facts,
     unpack_frames,
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Door
+from mavftpfs.link.ports import call, is_ours, may_share, next_caller, port_name, source_port, take_name
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError
@@ -49,7 +51,7 @@ QUIET = 0.1
 ACTIVE = 10.0
 """Seconds for which an endpoint that was heard keeps the hub up, while a vehicle is armed."""
 HELLO_PATIENCE = 10.0
-"""Seconds for a connection to say what it wants."""
+"""Seconds for the other end of a connection to say what it wants."""
 
 _DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or frames that a router sends back"
 _POLL = 0.003
@@ -62,6 +64,7 @@ _COMPONENTS = 249
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
 _USB = "/dev/ttyACM"
+_OTHERS = "{} is shared by programs of another user, who alone can stop that or forward frames"
 
 
 @dataclass(slots=True)
@@ -110,19 +113,11 @@ class _Endpoint:
 
 
 class Hub:
-    """Owns a port.
+    """Owns the port that a SOURCE names."""
 
-    Args:
-        spec: the port.
-        inherited: its open descriptors; without any it is opened.
-        door: where clients knock.
-    """
-
-    def __init__(self, spec: LinkSpec, inherited: Sequence[int], door: Door) -> None:
+    def __init__(self, spec: LinkSpec) -> None:
         self.spec = spec
         self.router = Router()
-        self._inherited = inherited
-        self._door = door
         self._port: Link | None = None
         self._clients: dict[int, _Client] = {}
         self._endpoints: dict[str, _Endpoint] = {}
@@ -137,77 +132,81 @@ class Hub:
         self._outbox = Outbox(max(_LEAST_OUTBOX, spec.baud // 10) if serial else _OUTBOX)
         self._said_doubles: set[Address] = set()
 
-    async def run(self, first: socket.socket, on_ready: Callable[[], None]) -> None:
-        """Serve until the hub is not needed any more. first: the connection of the program that started
-        it."""
-        async with AsyncExitStack() as stack:
-            # Patient: what was handed over may have no connection at the moment.
-            opening = open_link(self.spec, self._inherited, patient=True)
-            port = self._port = await stack.enter_async_context(opening)
-            self.router.add(PORT, Kind.PORT, fixed=self.spec.kind is not LinkKind.UDP_IN)
-            async with trio.open_nursery() as nursery:
-                on_ready()
-                client = await self._let_in(first, nursery)
+    async def run(self) -> None:
+        """Take the port over from the program that has it, and serve until the hub is not needed any more.
+
+        Raises:
+            LinkClosed: the port cannot be opened. The program that had it is told, too.
+        """
+        name = port_name(self.spec)
+        first = call(name, self.spec)
+        if first is None:
+            return  # the program that started us ended
+        with first:
+            set_buffers(first)
+            tell(first, {"protocol": PROTOCOL, "hub": os.getpid()})
+            hello = await hear(first, HELLO_PATIENCE)  # with it, port and name are free
+            listening = take_name(name) if hello else None
+            if hello and listening is not None:
+                with listening:
+                    await self._serve_all(listening, first, hello)
+
+    async def _serve_all(self, name: socket.socket, first: socket.socket, hello: Facts) -> None:
+        try:
+            # Patient: a device or a peer may be away just now.
+            opening = open_link(self.spec, patient=True, source_port=source_port(self.spec))
+            async with opening as port, trio.open_nursery() as nursery:
+                self._port = port
+                self.router.add(PORT, Kind.PORT, fixed=self.spec.kind is not LinkKind.UDP_IN)
+                client = await self._join(first, hello, nursery)
                 if client is not None:
-                    stack.callback(self._door.remove)
-                    self._door.is_hubs()
                     nursery.start_soon(self._serve, client)
-                    nursery.start_soon(self._accept, nursery)
+                    nursery.start_soon(self._accept, name, nursery)
                     nursery.start_soon(self._read, PORT, port)
                     nursery.start_soon(self._write)
                     nursery.start_soon(self._watch)
                     await self._ended.wait()
                 nursery.cancel_scope.cancel()
+        except LinkClosed as exc:
+            tell(first, {"refused": str(exc)})
+            raise
 
     # -- clients
 
-    async def _accept(self, nursery: trio.Nursery) -> None:
+    async def _accept(self, name: socket.socket, nursery: trio.Nursery) -> None:
         while True:
-            nursery.start_soon(self._receive, await self._door.accept(), nursery)
+            nursery.start_soon(self._receive, await next_caller(name), nursery)
 
     async def _receive(self, sock: socket.socket, nursery: trio.Nursery) -> None:
-        client = await self._let_in(sock, nursery)
-        if client is not None:
-            await self._serve(client)
-
-    async def _let_in(self, sock: socket.socket, nursery: trio.Nursery) -> _Client | None:
-        """Reply to the first message of a connection. Return the client if it is let in; else the connection
-        is closed."""
-        set_buffers(sock)
-        client: _Client | None = None
-        try:
-            hello: Facts = {}
-            with trio.move_on_after(HELLO_PATIENCE):
-                await trio.lowlevel.wait_readable(sock)
-                hello = unpack_facts(sock.recv(_LARGEST)) or {}
-            if "join" in hello:
-                client = await self._joined(sock, hello, nursery)
-            elif "status" in hello or "stop" in hello:
-                sock.send(pack_facts(self.status()))
-                if "stop" in hello:
+        """Serve one connection: of a client, or of a program that asks for the status or the end."""
+        with sock:
+            set_buffers(sock)
+            request = await hear(sock, HELLO_PATIENCE) or {}
+            if "join" in request:
+                client = await self._join(sock, request, nursery)
+                if client is not None:
+                    await self._serve(client)
+            elif "stop" in request and not is_ours(sock):
+                tell(sock, {"refused": _OTHERS.format(self.spec.description)})
+            elif "status" in request or "stop" in request:
+                tell(sock, self.status())
+                if "stop" in request:
                     self._ended.set()
-        except OSError:
-            pass  # it is gone
-        finally:
-            if client is None:
-                trio.lowlevel.notify_closing(sock)
-                sock.close()
-        return client
 
-    async def _joined(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
+    async def _join(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
         """Let a program in, or tell it why not."""
         try:
             async with self._one_by_one:  # an endpoint that two want is opened once, or each is told
                 client = self._admitted(sock, hello)
                 try:
                     await self._open_endpoints(client.forward, nursery, patient=bool(hello.get("again")))
-                    sock.send(pack_facts({"own": client.own, "number": client.number}))
                 except BaseException:
                     self._forget(client)
                     raise
         except (MavftpfsError, KeyError, TypeError, ValueError) as exc:
-            sock.send(pack_facts({"refused": str(exc)}))
+            tell(sock, {"refused": str(exc)})
             return None
+        tell(sock, {"own": client.own, "number": client.number})
         client.is_in = True
         self.router.add(client.side, Kind.CLIENT, fixed=True)
         if hello.get("beats"):
@@ -231,6 +230,8 @@ class Hub:
             raise LinkClosed(
                 f"{self.spec.description} is shared already, so {spec.description} cannot be opened"
             )
+        if not may_share(sock, spec) or (hello.get("forward") and not is_ours(sock)):
+            raise LinkClosed(_OTHERS.format(spec.description))
         own, number = self._granted(Address(*map(int, hello["own"])), hello.get("number"))
         self._sides += 1
         forward = tuple(map(str, hello.get("forward", ())))
@@ -265,12 +266,9 @@ class Hub:
     async def _serve(self, client: _Client) -> None:
         """Pass on what comes from a client until it leaves."""
         try:
-            await self._read_client(client)
-        except OSError:
-            pass  # it was killed
+            with suppress(OSError):  # it was killed
+                await self._read_client(client)
         finally:
-            trio.lowlevel.notify_closing(client.sock)
-            client.sock.close()
             self._forget(client)
             log.info("%s left", client.name or "a client")
 
@@ -293,7 +291,7 @@ class Hub:
                     self._on_wish(client, facts)
                 else:
                     frames += inlet.feed(unpack_frames(message)[1], None)
-            self._pass_on(frames, forwarded=False)
+            self._pass_on(frames)
             if ended:
                 return
 
@@ -330,11 +328,12 @@ class Hub:
         task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED,
     ) -> None:
         """Open an endpoint, and pass on what comes from it. patient: if it cannot be opened, try again."""
+        may_come_later = endpoint.spec.kind is LinkKind.TCP_OUT
         try:
             with endpoint.scope:
                 while True:
                     try:
-                        async with open_link(endpoint.spec, patient=True) as link:
+                        async with open_link(endpoint.spec, patient=may_come_later) as link:
                             endpoint.link, endpoint.problem = link, ""
                             task_status.started()
                             await self._read(endpoint.side, link)
@@ -369,14 +368,14 @@ class Hub:
                 self._tell_reopened(side)
             for index, piece in enumerate(pieces or ()):
                 frames += inlet.feed(piece, link.sender(index))
-            self._pass_on(frames, forwarded=side != PORT)
+            self._pass_on(frames)
 
     def _tell_reopened(self, side: int) -> None:
         if side == PORT:
             for client in self._clients.values():
                 client.send([pack_facts({"reopened": True})])
 
-    def _pass_on(self, frames: Sequence[tuple[Place, Frame]], *, forwarded: bool) -> None:
+    def _pass_on(self, frames: Sequence[tuple[Place, Frame]]) -> None:
         """Route frames that came together, and send each destination its share at once."""
         now = trio.current_time()
         shares: dict[tuple[Place, NetAddress | None], list[bytes]] = {}
@@ -384,7 +383,7 @@ class Hub:
         for place, frame in frames:
             for target in route(frame, place, now):
                 if target.side == PORT:
-                    push(place.side, Waiting(target, frame.data), forwarded=forwarded)
+                    push(place.side, Waiting(target, frame.data))
                     waiting = True
                     continue
                 origin = place.address if place.side == PORT else None

@@ -1,13 +1,13 @@
 """What waits to go out over the port, and which frame is next. Layer: hub; pure.
 
-Forwarded frames and frames of our own programs go out alternately, and so do the sides among each. So a
-forwarded frame waits for at most one frame of ours, whatever is queued. On a serial port no more is handed to
-the kernel than the line carries in 50 ms, since nothing overtakes what the kernel has.
+Each side has a queue, and the sides take turns: a frame of a ground station waits for one frame of each other
+side, whatever is queued there. On a serial port no more is handed to the kernel than the line carries in
+50 ms, since nothing overtakes what the kernel has.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from typing import NamedTuple
 
 from mavftpfs.hub.senders import Place
@@ -34,37 +34,30 @@ class Outbox:
     def __init__(self, limit: int) -> None:
         self.dropped = 0
         self._limit = limit
-        self._sizes: dict[int, int] = {}
-        self._queues: dict[bool, OrderedDict[int, deque[Waiting]]] = {
-            True: OrderedDict(),
-            False: OrderedDict(),
-        }
-        self._forwarded_next = True
+        self._sizes: Counter[int] = Counter()
+        self._queues: OrderedDict[int, deque[Waiting]] = OrderedDict()
 
     def __bool__(self) -> bool:
-        return any(self._queues.values())
+        return bool(self._queues)
 
-    def push(self, side: int, waiting: Waiting, *, forwarded: bool) -> None:
+    def push(self, side: int, waiting: Waiting) -> None:
         """Append a frame that came from a side."""
-        size = self._sizes.get(side, 0)
-        if size + len(waiting.frame) > self._limit:
+        size = self._sizes[side] + len(waiting.frame)
+        if size > self._limit:
             self.dropped += 1
             return
-        self._sizes[side] = size + len(waiting.frame)
-        self._queues[forwarded].setdefault(side, deque()).append(waiting)
+        self._sizes[side] = size
+        self._queues.setdefault(side, deque()).append(waiting)
 
     def pop(self) -> Waiting:
         """Take the next frame. There must be one."""
-        first = self._forwarded_next
-        queues = self._queues[first] or self._queues[not first]
-        self._forwarded_next = queues is not self._queues[True]
-        side, queue = next(iter(queues.items()))
+        side, queue = next(iter(self._queues.items()))
         waiting = queue.popleft()
         self._sizes[side] -= len(waiting.frame)
         if queue:
-            queues.move_to_end(side)
+            self._queues.move_to_end(side)
         else:
-            del queues[side], self._sizes[side]
+            del self._queues[side], self._sizes[side]
         return waiting
 
 

@@ -103,10 +103,6 @@ class Link(Protocol):
         """From now on only one system matters: a shared port leaves out frames that concern only others."""
         ...
 
-    def descriptors(self) -> list[int]:
-        """Return the open descriptors with which another process can go on (`opening.open_link`)."""
-        ...
-
     async def aclose(self) -> None:
         """Flush what can be flushed at once and close."""
         ...

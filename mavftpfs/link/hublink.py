@@ -1,8 +1,8 @@
 """The link of a program to the hub that has the port. Layer: link.
 
-A Unix socket of whole messages (SOCK_SEQPACKET). The first of each side is a JSON object: a request to join,
-and the hub's reply. So are the few later ones that begin with `{`. All others are frames: `F`, the length of
-a tag, the tag, and whole MAVLink frames. The tag is the network address that they came from, as JSON, or
+A Unix socket of whole messages (SOCK_SEQPACKET). Those that begin with `{` are JSON objects: the request to
+join, the hub's reply, and the few that change something later. All others are frames: `F`, the length of a
+tag, the tag, and whole MAVLink frames. The tag is the network address that they came from, as JSON, or
 nothing where the port has only one.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,16 +21,16 @@ import trio
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import Seat, SocketLink
 from mavftpfs.link.messages import Address
-from mavftpfs.link.rendezvous import SILENT, Busy
+from mavftpfs.link.ports import Busy, peer_of
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Counts up when the messages change: a hub of another version may be running."""
 MAX_MESSAGE = 32 * 1024
 """Bytes of frames in a message."""
 SOCKET_BUFFER = 1 << 20
-WELCOME_PATIENCE = 20.0
+WELCOME_PATIENCE = 30.0
 """Seconds for the hub, which may have to be started first, to answer."""
 
 _MAX_MESSAGES = 64
@@ -161,10 +162,6 @@ class HubLink(SocketLink):
         """Have the hub leave out what concerns only other systems."""
         self.tell({"focus": system})
 
-    def descriptors(self) -> list[int]:
-        """Return none: the hub has them."""
-        return []
-
     def tell(self, facts: Facts) -> None:
         """Send a request that needs no answer."""
         message = pack_facts(facts)
@@ -237,13 +234,14 @@ class Refused(LinkClosed):
 async def join(
     sock: socket.socket, spec: LinkSpec, wish: Wish, seat: Seat | None, *, again: bool = False
 ) -> HubLink:
-    """Ask the hub at the other end of a socket to be let in, and return the link.
+    """Ask the program at the other end of a socket to be let in, and return the link once that is a hub.
 
-    seat: what we had until now. again: our last hub is gone, so the endpoints may take their time.
+    seat: what we had until now. again: we had the port before, so the endpoints may take their time.
 
     Raises:
         Refused: and why.
-        Busy: no answer.
+        Busy: it ended, or is about to start the hub: call again.
+        LinkClosed: it does not answer.
     """
     hello = {
         "protocol": PROTOCOL,
@@ -256,32 +254,36 @@ async def join(
         "again": again,
     }
     try:
-        reply = await ask(sock, hello)
+        set_buffers(sock)
+        tell(sock, hello)
+        reply = await hear(sock, WELCOME_PATIENCE)
+        if reply is None:
+            raise LinkClosed(
+                f"{spec.description}: process {peer_of(sock).pid} has this port and does not answer"
+            )
+        if "refused" in reply:
+            raise Refused(str(reply["refused"]))
+        if "own" not in reply:
+            raise Busy(f"{spec.description}: the program that had this port ended")
         return HubLink(sock, spec, reply)
     except BaseException:
         sock.close()
         raise
 
 
-async def ask(sock: socket.socket, request: Facts) -> Facts:
-    """Send a request to a hub and return what it says.
+def tell(sock: socket.socket, facts: Facts) -> None:
+    """Send facts, if the other end is still there."""
+    with suppress(OSError):
+        sock.send(pack_facts(facts))
 
-    Raises:
-        Refused: the hub says no.
-        Busy: no answer.
-    """
-    set_buffers(sock)
-    message = b""
-    try:
-        sock.send(pack_facts(request))
-        with trio.move_on_after(WELCOME_PATIENCE):
-            await trio.lowlevel.wait_readable(sock)
-            message = sock.recv(_RECEIVE_SIZE)
-    except OSError:
-        message = b""
-    reply = unpack_facts(message)
-    if reply is None:
-        raise Busy(SILENT)
-    if "refused" in reply:
-        raise Refused(str(reply["refused"]))
-    return reply
+
+async def hear(sock: socket.socket, patience: float) -> Facts | None:
+    """Return the facts that the other end sends next: none if it ended or sends nonsense, None if it says
+    nothing for so many seconds."""
+    with trio.move_on_after(patience):
+        await trio.lowlevel.wait_readable(sock)
+        try:
+            return unpack_facts(sock.recv(_RECEIVE_SIZE)) or {}
+        except OSError:
+            return {}
+    return None

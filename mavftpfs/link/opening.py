@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 
 from mavftpfs.link.base import Link
@@ -13,22 +12,22 @@ from mavftpfs.link.uri import LinkKind, LinkSpec
 
 
 def open_link(
-    spec: LinkSpec, inherited: Sequence[int] = (), *, patient: bool = False
+    spec: LinkSpec, *, patient: bool = False, source_port: int = 0
 ) -> AbstractAsyncContextManager[Link]:
     """Return an async context manager that opens the link, runs its helper task and closes it.
 
-    inherited: descriptors of a link that another process had open (`Link.descriptors`); it goes on with them.
-    patient: a TCP peer may come later.
+    patient: a TCP peer or a serial port may come later. source_port: the one from which `udpout` sends, if it
+    is free.
 
     Entering it raises:
         LinkClosed: it cannot be opened; the text is one line that says what to do.
     """
     match spec.kind:
         case LinkKind.UDP_IN | LinkKind.UDP_OUT:
-            return open_udp(spec, inherited)
+            return open_udp(spec, source_port)
         case LinkKind.TCP_OUT:
-            return open_tcp(spec, inherited, patient=patient)
+            return open_tcp(spec, patient=patient)
         case LinkKind.TCP_IN:
-            return open_tcp_server(spec, inherited)
+            return open_tcp_server(spec)
         case LinkKind.SERIAL:
-            return open_serial(spec, inherited)
+            return open_serial(spec, patient=patient)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import ipaddress
 import os
 import socket
@@ -11,17 +10,6 @@ from mavftpfs.link.uri import LOOPBACK, LinkKind, LinkSpec
 
 _ANYWHERE = {"0.0.0.0", "::"}
 _LISTENING = {LinkKind.UDP_OUT: LinkKind.UDP_IN, LinkKind.TCP_OUT: LinkKind.TCP_IN}
-_NETWORK = "/proc/self/ns/net"
-
-
-def port_name(spec: LinkSpec) -> str:
-    """Return the name of a port's door, without its end; the same for two SOURCEs that exclude each other."""
-    if spec.kind is LinkKind.SERIAL:
-        text = f"serial {os.path.realpath(spec.device)}"
-    else:
-        host = "" if spec.kind.listens else spec.host
-        text = f"{os.stat(_NETWORK).st_ino} {spec.kind.value} {host} {spec.port}"
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
 def same_link(one: LinkSpec, other: LinkSpec) -> bool:

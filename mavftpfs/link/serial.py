@@ -7,9 +7,8 @@ vanishes (unplugged, vehicle rebooted) is opened again when it returns, under th
 from __future__ import annotations
 
 import termios
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from io import FileIO
 
 import serial
 import trio
@@ -22,10 +21,10 @@ _LEAST_OUTBOX = 4096
 
 
 @asynccontextmanager
-async def open_serial(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[StreamLink]:
+async def open_serial(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[StreamLink]:
     """Open a serial port, and again whenever it vanishes.
 
-    inherited: what `descriptors` of another process's link gave; then the first time nothing is opened.
+    patient: return at once, and open the port when it can be opened.
 
     Raises:
         LinkClosed: no such port, no permission, or in use.
@@ -35,7 +34,7 @@ async def open_serial(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIte
         return await trio.to_thread.run_sync(_open_port, spec)
 
     try:
-        pipe = FileIO(inherited[0], "r+") if inherited else await reopen()
+        pipe = None if patient else await reopen()
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     # About a second of the line: what waits longer than that is answered too late anyway.

@@ -1,18 +1,8 @@
-"""A port that we open ourselves, or share with other programs of ours through a hub. Layer: link.
+"""The link of every program: a port of its own, or one shared through the hub. Layer: link.
 
-`SharedLink.run` is in one of three states:
-
-| state | what happens | then |
-|---|---|---|
-| SEEKING: we have no port | a program of ours has it: we join its hub | JOINED |
-| | no program of ours has it, and it opens: we make a door beside it | ALONE |
-| | neither | SEEKING; at the first start an error, after 2 s if it may pass |
-| ALONE: we have the port | another program knocks, or we need a hub: we start one, and join it | JOINED |
-| | the hub does not start | ALONE, and the others are told why; SEEKING if we need it |
-| JOINED: a hub has the port | the hub is gone | SEEKING |
-
-The port goes from one process to the other as an open descriptor, and so does the door: no datagram is lost,
-no serial line falls, and no third program takes the port.
+A program that finds no other one holds the port's name and has the port itself. If a second program calls, it
+starts the hub. The hub calls, too; then the program closes the port, and the hub opens it. From then on each
+program's link leads to the hub. All that is a link that was lost and comes back, as when the hub is killed.
 """
 
 from __future__ import annotations
@@ -24,29 +14,34 @@ import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 
 import trio
 
+from mavftpfs.link import ports
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import Link, LinkStats, Seat, background
-from mavftpfs.link.hublink import HubLink, Wish, join, pack_facts
+from mavftpfs.link.hublink import Facts, Wish, hear, join, tell
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import Busy, Door, knock, only_one, open_door
-from mavftpfs.link.samelink import port_name
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
 log = logging.getLogger("mavftpfs.link")
 
-GRACE = 2.0
-"""Seconds to wait for a port that is taken, because a hub may be just closing it."""
+PATIENCE = 20.0
+"""Seconds for programs of ours that have the port to end, or to share it."""
+GRACE = 0.5
+"""Seconds for a program that was killed to let go of its port."""
+HELLO_PATIENCE = 1.0
+"""Seconds for a program that calls to say what it wants."""
+START_PATIENCE, COMING = 25.0, 5.0
+"""Seconds for the hub to start, and then to call."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
 _NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a port"
-_PAUSE = 0.1
-_LONG_PAUSE = 1.0
-_START_PATIENCE = 60.0
+_PAUSE, _LONGEST_PAUSE = 0.02, 1.0
+_SHARED = "%s is shared with another program from now on: a hub opens it, and all programs use the hub%s"
+_LINE = {LinkKind.SERIAL: "; DTR of the line falls for a moment"}
 _NAME = "mavftpfs: "
 _PACKAGES = str(Path(__file__).parents[2])
 """Where this program was imported from: the hub is to be the same program, whatever its working directory."""
@@ -63,126 +58,123 @@ class SharedLink:
         self.description = spec.description
         self._spec = spec
         self._wish = wish
-        self._name = port_name(spec)
+        self._name = ports.port_name(spec)
         self._inner: Link | None = None
         self._heard_by: Link | None = None
         self._address: NetAddress | None = None
         self._system = 0
+        self._lost_at = trio.current_time()
+        self._said = ""
         self._was_open = False
         self._reopened = False
         self._changed = trio.Event()
         self._closed = False
         self._task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED
 
-    # -- the states
+    # -- opening, again and again
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Keep the port open, one way or the other, until cancelled. It has started once the port is open.
+        """Keep the link open until cancelled. This task has started once the link is open.
 
         Raises:
-            LinkClosed: it cannot be opened at all.
+            LinkClosed: the link cannot be opened the first time.
         """
         self._task_status = task_status
-        try:
-            while True:
-                hub = await self._sought()
-                async with background(hub.run_writer, hub.aclose):
-                    await hub.gone.wait()
-                self._inner = None
-                self._reopened = True
-                self.stats.reopened += 1
-                log.warning("the hub of %s is gone; opening the port again", self.description)
-        finally:
-            if self._inner is not None:
-                with trio.CancelScope(shield=True):
-                    await self._inner.aclose()
-
-    async def _sought(self) -> HubLink:
-        """SEEKING, and ALONE as long as that lasts. Return our link when a hub has the port."""
-        began, pause, said = trio.current_time(), _PAUSE, ""
         while True:
             try:
-                return await self._joined()
+                await self._use_until_lost()
             except LinkClosed as exc:
-                may_pass = isinstance(exc, Busy) and trio.current_time() - began < GRACE
-                if not may_pass and not self._was_open:
-                    raise
-                if not may_pass and str(exc) != said:
-                    said = str(exc)
-                    log.warning("%s; trying again", said)
-            await trio.sleep(pause)
-            pause = min(2 * pause, _LONG_PAUSE)
+                await trio.sleep(self._pause_after(exc))
 
-    async def _joined(self) -> HubLink:
-        """Join the hub of the port. If there is none, have the port until a hub takes it over.
+    def _pause_after(self, problem: LinkClosed) -> float:
+        """Return the seconds after which a link that could not be opened is tried again.
 
         Raises:
-            Busy: another program has the port, and may be just opening or closing it.
-            LinkClosed: it cannot be opened, or the hub refuses us, or does not start and we need it.
+            LinkClosed: this was the first time, and the problem does not pass by itself.
         """
-        async with AsyncExitStack() as stack:
-            async with only_one(self._name):
-                sock = knock(self._name)
-                if sock is None:
-                    link = await self._opened_port(stack)
-                    door = self._opened_door(stack)
-            if sock is not None:
-                hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
-                self._use(hub)
-                return hub
-            if door is None:
+        waited = trio.current_time() - self._lost_at
+        if isinstance(problem, ports.Busy):
+            may_pass = waited < PATIENCE
+        else:
+            may_pass = waited < GRACE and getattr(problem.__cause__, "errno", None) in _TAKEN
+        if not may_pass and not self._was_open:
+            raise problem
+        if not may_pass and str(problem) != self._said:
+            self._said = str(problem)
+            log.warning("%s; trying again", problem)
+        return min(max(waited / 4, _PAUSE), _LONGEST_PAUSE)
+
+    async def _use_until_lost(self) -> None:
+        """Open the link and use it until it is lost.
+
+        Raises:
+            LinkClosed: it cannot be opened.
+        """
+        sock = ports.call(self._name, self._spec)
+        if sock is None:
+            sock = await self._hold_port()
+        hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
+        async with background(hub.run_writer, hub.aclose):
+            self._use(hub)
+            await hub.gone.wait()
+            self._lose()
+        log.warning("the hub of %s is gone; opening the port again", self.description)
+
+    async def _hold_port(self) -> socket.socket:
+        """Have the port until a hub comes for it. Return the hub's connection, with port and name closed.
+
+        Raises:
+            Busy: another program has just taken the name.
+            LinkClosed: the port cannot be opened, or we need a hub and it does not start.
+        """
+        name = ports.take_name(self._name)
+        if name is None:
+            raise ports.Busy(f"{self.description}: another program is just opening this port")
+        with name:
+            async with open_link(self._spec, source_port=ports.source_port(self._spec)) as link:
+                if self._wish.needs_hub:
+                    return await self._started_hub(name)
                 self._use(link)
-                await trio.sleep_forever()
-            if self._wish.needs_hub:
-                return await self._handed_over(link, door)
-            return await self._alone(link, door)
+                hub = await self._hub_that_comes(name)
+                self._lose()
+            log.info(_SHARED, self.description, _LINE.get(self._spec.kind, ""))
+            return hub
 
-    async def _opened_port(self, stack: AsyncExitStack) -> Link:
-        try:
-            return await stack.enter_async_context(open_link(self._spec))
-        except LinkClosed as exc:
-            if getattr(exc.__cause__, "errno", None) in _TAKEN:
-                raise Busy(str(exc)) from exc.__cause__
-            raise
-
-    def _opened_door(self, stack: AsyncExitStack) -> Door | None:
-        """Return the door of our port. A program that does not need a hub goes on without one."""
-        try:
-            door = open_door(self._name)
-        except LinkClosed as exc:
-            if self._wish.needs_hub:
-                raise
-            log.info("%s cannot be shared: %s", self.description, exc)
-            return None
-        stack.callback(door.remove)
-        return door
-
-    async def _alone(self, link: Link, door: Door) -> HubLink:
-        """ALONE: use the port until another program wants it too, and a hub has taken it over."""
-        self._use(link)
+    async def _hub_that_comes(self, name: socket.socket) -> socket.socket:
+        """Return the connection of the hub that comes for our port; start it when another program calls."""
         while True:
-            await door.knocked()
-            try:
-                return await self._handed_over(link, door)
-            except LinkClosed as exc:
-                problem = f"{self.description} cannot be shared: {exc}"
-            log.warning("%s", problem)
-            door.turn_away(pack_facts({"refused": problem}))
-            await trio.sleep(_LONG_PAUSE)
+            caller, request = await _next_call(name)
+            if _is_hub(caller, request):
+                return caller
+            with caller:
+                if "join" not in request:
+                    continue
+                problem = f"{self.description} belongs to another user"
+                if ports.may_share(caller, self._spec):
+                    try:
+                        return await self._started_hub(name)
+                    except LinkClosed as exc:
+                        problem = f"{self.description} cannot be shared: {exc}"
+                        log.warning("%s", problem)
+                tell(caller, {"refused": problem})
 
-    async def _handed_over(self, link: Link, door: Door) -> HubLink:
-        """Start a hub that takes over port and door, and use it.
+    async def _started_hub(self, name: socket.socket) -> socket.socket:
+        """Start a hub, and return its connection. Programs that call meanwhile are left to it.
 
         Raises:
-            LinkClosed: it does not start; both are still ours.
+            LinkClosed: and why there is no hub.
         """
-        hub = await start_hub(link, door, self._spec, self._wish, self.seat, again=self._was_open)
-        self._use(hub)  # before ours is closed: what is sent meanwhile is not lost
-        door.leave()
-        return hub
+        await start_hub(self._spec)
+        with ExitStack() as others, trio.move_on_after(COMING):
+            while True:
+                caller, request = await _next_call(name)
+                if _is_hub(caller, request):
+                    return caller
+                others.enter_context(caller)
+        raise LinkClosed("the hub ended at once")
 
     def _use(self, link: Link) -> None:
-        """Go on with another link. What is known of the vehicle stays, and so does our seat."""
+        """Go on with a link that was opened. What is known of the vehicle stays, and so does our seat."""
         link.stats = self.stats
         self.seat = link.seat or self.seat
         if self._address is not None:
@@ -190,10 +182,20 @@ class SharedLink:
         if self._system:
             link.focus(self._system)
         self._inner = link
+        self._said = ""
         if not self._was_open:
             self._was_open = True
             self.description = link.description
             self._task_status.started()
+        self._notify()
+
+    def _lose(self) -> None:
+        self._inner = None
+        self._lost_at = trio.current_time()
+        self._reopened = True
+        self.stats.reopened += 1
+
+    def _notify(self) -> None:
         self._changed.set()
         self._changed = trio.Event()
 
@@ -250,15 +252,27 @@ class SharedLink:
             if self._inner is not None:
                 self._inner.focus(system)
 
-    def descriptors(self) -> list[int]:
-        """See link.base.Link."""
-        return [] if self._inner is None else self._inner.descriptors()
-
     async def aclose(self) -> None:
         """No more is sent or received; `run` closes what is open when it is cancelled."""
         self._closed = True
-        self._changed.set()
+        self._notify()
         await trio.lowlevel.checkpoint()
+
+
+async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:
+    """Return the next connection to our port's name, and what it wants."""
+    caller = await ports.next_caller(name)
+    try:
+        caller.setblocking(False)
+        return caller, await hear(caller, HELLO_PATIENCE) or {}
+    except BaseException:
+        caller.close()
+        raise
+
+
+def _is_hub(caller: socket.socket, request: Facts) -> bool:
+    """Return whether the hub calls: one of this user, since it gets our port."""
+    return "hub" in request and ports.peer_of(caller).uid == os.getuid()
 
 
 @asynccontextmanager
@@ -303,40 +317,18 @@ def own_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-async def start_hub(
-    link: Link, door: Door, spec: LinkSpec, wish: Wish, seat: Seat | None, *, again: bool = False
-) -> HubLink:
-    """Start a hub that goes on with an open port and its door, and return our link to it. again: as for join.
+async def start_hub(spec: LinkSpec) -> None:
+    """Start a hub, which then calls the program that has the port: us. Return when it runs.
 
     Raises:
-        LinkClosed: it did not start; we still have the port.
+        LinkClosed: and why it does not.
     """
+    command = [sys.executable, "-m", "mavftpfs", "hub", "--serve", spec.description]
+    problem = f"it is not ready within {START_PATIENCE:g} s"
     try:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    except OSError as exc:
-        raise LinkClosed(f"the hub cannot be started: {exc.strerror}") from exc
-    with theirs:
-        inherited = [theirs.fileno(), door.sock.fileno(), *link.descriptors()]
-        words = ["-m", "mavftpfs", "hub", "--take-over", ",".join(map(str, inherited)), spec.description]
-        try:
-            await _run_until_ready([sys.executable, *words], inherited)
-        except BaseException:
-            ours.close()
-            raise
-    return await join(ours, spec, wish, seat, again=again)
-
-
-async def _run_until_ready(command: list[str], inherited: list[int]) -> None:
-    """Run the command that starts a hub; it ends when the hub is ready.
-
-    Raises:
-        LinkClosed: and why it is not.
-    """
-    try:
-        with trio.fail_after(_START_PATIENCE):
+        with trio.fail_after(START_PATIENCE):
             done = await trio.run_process(
                 command,
-                pass_fds=inherited,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 capture_stderr=True,
@@ -345,9 +337,7 @@ async def _run_until_ready(command: list[str], inherited: list[int]) -> None:
                 check=False,
             )
     except (OSError, trio.TooSlowError) as exc:
-        problem = (
-            exc.strerror if isinstance(exc, OSError) else f"it is not ready within {_START_PATIENCE:g} s"
-        )
+        problem = exc.strerror or problem if isinstance(exc, OSError) else problem
         raise LinkClosed(f"the hub cannot be started: {problem}") from exc
     if done.returncode != 0:
         said = done.stderr.decode(errors="replace").splitlines()

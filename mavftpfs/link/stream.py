@@ -8,7 +8,6 @@ gets one, with growing pauses. After that `receive` returns an empty list once: 
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
@@ -48,9 +47,6 @@ class StreamLink(DescriptorLink):
     Args:
         pipe: the first one, where it is already open.
         outbox_limit: bytes to hold for a slow peer.
-
-    Attributes:
-        listener: where peers connect, if they do.
     """
 
     is_stream = True
@@ -65,7 +61,6 @@ class StreamLink(DescriptorLink):
         outbox_limit: int,
     ) -> None:
         super().__init__(description, outbox_limit)
-        self.listener: socket.socket | None = None
         self.is_serial = is_serial
         self._opener = opener
         self._pipe = pipe
@@ -98,10 +93,6 @@ class StreamLink(DescriptorLink):
     def sender(self, index: int) -> NetAddress | None:
         """Return the peer that connected; None where we opened the stream."""
         return self._peer
-
-    def descriptors(self) -> list[int]:
-        """Return the listener's, if there is one, and the pipe's, if there is one at the moment."""
-        return [end.fileno() for end in (self.listener, self._pipe) if end is not None]
 
     def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
         """Go on with another pipe (a new connection). peer: the address that opened it, if it was not us."""

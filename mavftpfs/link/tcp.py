@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import errno
 import socket
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 
@@ -28,12 +28,9 @@ _PAUSE = 0.2
 
 
 @asynccontextmanager
-async def open_tcp(
-    spec: LinkSpec, inherited: Sequence[int] = (), *, patient: bool = False
-) -> AsyncIterator[StreamLink]:
+async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[StreamLink]:
     """Connect to a listening vehicle or bridge, and again whenever the connection is lost.
 
-    inherited: what `descriptors` of another process's link gave: a connection that is used first.
     patient: return at once, and connect as soon as a peer listens.
 
     Raises:
@@ -44,9 +41,7 @@ async def open_tcp(
         return await _connect(spec)
 
     try:
-        pipe: Pipe | None = socket.socket(fileno=inherited[0]) if inherited else None
-        if pipe is None and not patient:
-            pipe = await connect()
+        pipe = None if patient else await connect()
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     link = StreamLink(spec.description, connect, pipe, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
@@ -55,28 +50,19 @@ async def open_tcp(
 
 
 @asynccontextmanager
-async def open_tcp_server(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[StreamLink]:
+async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
     """Listen. The link is usable at once, and drops what is sent before a peer connects.
-
-    inherited: what `descriptors` of another process's link gave: where it listens, and its connection.
 
     Raises:
         LinkClosed: the port is taken or the address is not ours.
     """
     try:
-        listener = socket.socket(fileno=inherited[0]) if inherited else await _listen(spec)
+        listener = await _listen(spec)
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     with listener:
         bound = replace(spec, port=listener.getsockname()[1])
         link = StreamLink(bound.description, None, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
-        link.listener = listener
-        for descriptor in inherited[1:]:
-            peer = socket.socket(fileno=descriptor)
-            try:
-                link.replace(peer, peer.getpeername()[:1])
-            except OSError:  # it was reset just now
-                peer.close()
 
         async def serve() -> None:
             async with trio.open_nursery() as nursery:

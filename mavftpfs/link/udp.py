@@ -1,8 +1,8 @@
 """UDP links. Layer: link.
 
 `udpin` binds a port and answers the last sender, until `answer` names the vehicle's address. `udpout`
-speaks first, to one host. It keeps its source port for the life of the process: PX4 answers only the first
-address it heard (servers.md 5). The socket is never connected, so that the ICMP message "port unreachable" of
+speaks first, to one host. The socket keeps its source port: PX4 answers only the first address it heard
+(servers.md 5). The socket is never connected, so that the ICMP message "port unreachable" of
 a vehicle that reboots is not an error.
 """
 
@@ -61,10 +61,6 @@ class UdpLink(SocketLink):
             self._peer = address
             self._pinned = True
 
-    def descriptors(self) -> list[int]:
-        """Return the socket's."""
-        return [self._sock.fileno()]
-
     def _drain(self) -> list[bytes] | None:
         """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
         receive, buffer = self._sock.recvfrom_into, self._buffer
@@ -105,21 +101,22 @@ class UdpLink(SocketLink):
 
 
 @asynccontextmanager
-async def open_udp(spec: LinkSpec, inherited: Sequence[int] = ()) -> AsyncIterator[UdpLink]:
+async def open_udp(spec: LinkSpec, source_port: int = 0) -> AsyncIterator[UdpLink]:
     """Open udpin or udpout and run its writer for the length of the `async with`.
 
-    inherited: what `descriptors` of another process's link gave; then nothing is opened.
+    source_port: the one from which udpout sends, if it is free.
 
     Raises:
         LinkClosed: unknown host, or the port is taken.
     """
     family, address = await _resolve(spec)
-    sock = socket.socket(fileno=inherited[0]) if inherited else socket.socket(family, socket.SOCK_DGRAM)
+    sock = socket.socket(family, socket.SOCK_DGRAM)
     try:
         _configure(sock)
-        if not inherited:
-            anywhere = ("::" if family == socket.AF_INET6 else "0.0.0.0", 0)
-            _bind(sock, spec, address if spec.kind.listens else anywhere)
+        if spec.kind.listens:
+            _bind(sock, spec, address)
+        else:
+            _bind_somewhere(sock, source_port)
     except BaseException:
         sock.close()
         raise
@@ -153,3 +150,12 @@ def _bind(sock: socket.socket, spec: LinkSpec, address: NetAddress) -> None:
         sock.bind(address)
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
+
+
+def _bind_somewhere(sock: socket.socket, port: int) -> None:
+    """Bind a port if it is free, else one that the kernel chooses."""
+    anywhere = "::" if sock.family == socket.AF_INET6 else "0.0.0.0"
+    try:
+        sock.bind((anywhere, port))
+    except OSError:
+        sock.bind((anywhere, 0))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import socket
-import struct
 import tracemalloc
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,20 +17,20 @@ from mavftpfs.hub.hub import Hub
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import (
     PROTOCOL,
+    Facts,
     HubLink,
     Refused,
     Wish,
-    ask,
+    hear,
     join,
     make_tag,
     pack_facts,
     pack_frames,
     set_buffers,
-    unpack_facts,
+    tell,
 )
 from mavftpfs.link.messages import Address
-from mavftpfs.link.opening import open_link
-from mavftpfs.link.rendezvous import ALONE, Door
+from mavftpfs.link.ports import connect, next_caller, port_name, take_name
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
@@ -54,54 +51,51 @@ def autojump_clock() -> trio.testing.MockClock:
 class Running:
     """A hub that runs, with one client."""
 
-    def __init__(self, path: Path, source: str, ended: trio.Event) -> None:
+    def __init__(self, source: str, ended: trio.Event) -> None:
         self.source = source
         self.ended = ended
-        self._path = path
+        self._name = port_name(parse_source(source))
 
-    def knock(self) -> socket.socket:
+    def call(self) -> socket.socket:
         """Return a new connection to the hub."""
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        (door,) = self._path.parent.glob("port.*")
-        sock.connect(str(door))
-        return sock
+        return connect(self._name)
 
     async def joined(self, *forward: str, source: str = "") -> HubLink:
         """Return another client."""
-        return await join(self.knock(), parse_source(source or self.source), Wish(US, forward), None)
+        return await join(self.call(), parse_source(source or self.source), Wish(US, forward), None)
 
-    async def status(self) -> dict[str, Any]:
-        with self.knock() as sock:
-            return await ask(sock, {"protocol": PROTOCOL, "status": True})
+    async def asked(self, request: Facts) -> Facts:
+        """Return what the hub replies to a request."""
+        with self.call() as sock:
+            tell(sock, request)
+            return await hear(sock, 60) or {}
+
+    async def status(self) -> Facts:
+        return await self.asked({"protocol": PROTOCOL, "status": True})
 
 
 @asynccontextmanager
-async def running(
-    place: Path, *forward: str, again: bool = False, source: str = ""
-) -> AsyncIterator[Running]:
-    """Run a hub of a port, with one client that asks for these endpoints."""
+async def running(*forward: str, source: str = "", again: bool = False) -> AsyncIterator[Running]:
+    """Run a hub of a port, with one client that had the port and asks for these endpoints."""
     source = source or f"udpin:{HOST}:{free_udp_port()}"
-    path = place / f"port{ALONE}"
-    listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    listening.setblocking(False)
-    listening.bind(str(path))
-    listening.listen(8)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    hub = Hub(parse_source(source), (), Door(listening, path))
-    with listening, theirs:
-        async with plain_nursery() as nursery:
-            ready = trio.Event()
-            ended = trio.Event()
+    spec = parse_source(source)
+    ended = trio.Event()
 
-            async def run() -> None:
-                await hub.run(theirs, ready.set)
-                ended.set()
+    async def run() -> None:
+        await Hub(spec).run()
+        ended.set()
 
+    async with plain_nursery() as nursery:
+        name = take_name(port_name(spec))
+        assert name is not None
+        with name:
             nursery.start_soon(run)
-            await ready.wait()
-            first = await join(ours, parse_source(source), Wish(US, forward), None, again=again)
-            yield Running(path, source, ended)
-            await first.aclose()
+            sock = await next_caller(name)
+            sock.setblocking(False)
+            assert "hub" in (await hear(sock, 60) or {})
+        first = await join(sock, spec, Wish(US, forward), None, again=again)
+        yield Running(source, ended)
+        await first.aclose()
 
 
 class SlowNames(trio.abc.HostnameResolver):
@@ -121,10 +115,10 @@ class SlowNames(trio.abc.HostnameResolver):
 
 
 async def test_endpoints_stay_while_the_client_that_wants_them_waits_for_another_one(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
     trio.socket.set_custom_hostname_resolver(SlowNames())
-    async with running(tmp_path) as here:
+    async with running() as here:
         places = f"udpout:{HOST}:{free_udp_port()}", f"udpout:slow.example:{free_udp_port()}"
         client = await here.joined(*places)
         assert {facts["endpoint"] for facts in (await here.status())["endpoints"]} == set(places)
@@ -134,7 +128,7 @@ async def test_endpoints_stay_while_the_client_that_wants_them_waits_for_another
 
 
 async def test_of_two_programs_that_want_an_endpoint_that_cannot_be_both_are_told(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
     trio.socket.set_custom_hostname_resolver(SlowNames())
 
@@ -143,40 +137,27 @@ async def test_of_two_programs_that_want_an_endpoint_that_cannot_be_both_are_tol
             await here.joined(endpoint)
 
     endpoint = f"udpout:nowhere.example:{free_udp_port()}"
-    async with running(tmp_path) as here:
+    async with running() as here:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(is_refused)
             nursery.start_soon(is_refused)
         assert (await here.status())["endpoints"] == []
 
 
-async def test_a_hub_that_does_not_take_over_leaves_the_door_to_its_program(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
-) -> None:
-    with pytest.raises(Refused):
-        async with running(tmp_path, "nonsense"):
-            pass
-    assert (tmp_path / f"port{ALONE}").is_socket()
-
-
 async def test_a_hub_may_be_asked_and_stopped_by_another_version_but_not_joined(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
-    async with running(tmp_path) as here:
+    async with running() as here:
         for request, reply in ({"join": here.source}, "refused"), ({"status": True}, "clients"):
-            with here.knock() as sock:
-                sock.send(pack_facts({"protocol": PROTOCOL + 1, **request}))
-                await trio.lowlevel.wait_readable(sock)
-                assert reply in (unpack_facts(sock.recv(65536)) or {})
-        with here.knock() as sock:
-            await ask(sock, {"protocol": PROTOCOL + 1, "stop": True})
+            assert reply in await here.asked({"protocol": PROTOCOL + 1, **request})
+        await here.asked({"protocol": PROTOCOL + 1, "stop": True})
         await here.ended.wait()
 
 
 async def test_no_more_programs_are_let_in_than_there_are_addresses(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
-    async with running(tmp_path) as here, AsyncExitStack() as stack:
+    async with running() as here, AsyncExitStack() as stack:
         for _ in range(248):
             stack.push_async_callback((await here.joined()).aclose)
         with pytest.raises(Refused, match="249 programs"):
@@ -199,11 +180,11 @@ NONSENSE: list[Any] = ["x", -1, True, [], 5, {}, None, "host", [5, 5], ["x", 70_
 
 
 async def test_a_program_that_talks_nonsense_disturbs_nobody(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
-    async with running(tmp_path) as here:
+    async with running() as here:
         for message in GARBAGE:
-            with here.knock() as sock:
+            with here.call() as sock:
                 sock.send(message)
                 await trio.sleep(0.1)
         client = await here.joined()
@@ -216,23 +197,23 @@ async def test_a_program_that_talks_nonsense_disturbs_nobody(
 
 
 async def test_a_port_is_shared_while_its_vehicle_restarts(
-    tmp_path: Path, autojump_clock: trio.testing.MockClock
+    autojump_clock: trio.testing.MockClock,
 ) -> None:
     with socket.create_server((HOST, 0)) as server:
         source = f"tcp:{HOST}:{server.getsockname()[1]}"
-    async with running(tmp_path, source=source) as here:
+    async with running(source=source) as here:
         assert len((await here.status())["clients"]) == 1
 
 
-async def test_only_the_same_port_is_shared(tmp_path: Path, autojump_clock: trio.testing.MockClock) -> None:
-    async with running(tmp_path) as here:
+async def test_only_the_same_port_is_shared(autojump_clock: trio.testing.MockClock) -> None:
+    async with running() as here:
         anywhere, elsewhere = (here.source.replace(HOST, host) for host in ("0.0.0.0", "127.0.0.2"))
         await (await here.joined(source=anywhere)).aclose()
         with pytest.raises(Refused, match="is shared already"):
             await here.joined(source=elsewhere)
 
 
-# -- clients and doors ----------------------------------------------------------------------------
+# -- clients ----------------------------------------------------------------------------
 
 
 async def test_frames_from_made_up_addresses_take_no_memory() -> None:
@@ -271,16 +252,3 @@ async def test_a_port_without_a_number_cannot_be_shared() -> None:
     with pytest.raises(LinkClosed, match="name a port"):
         async with open_shared(parse_source(f"udpin:{HOST}:0"), wish):
             pass
-
-
-async def test_a_connection_that_is_reset_while_it_is_handed_over_is_no_error() -> None:
-    with socket.create_server((HOST, 0)) as listener:
-        other = socket.create_connection(listener.getsockname())
-        peer, _ = listener.accept()
-        other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        other.close()
-        spec = parse_source(f"tcpin:{HOST}:{listener.getsockname()[1]}")
-        async with open_link(spec, [os.dup(listener.fileno()), peer.detach()]) as link:
-            with socket.create_connection(listener.getsockname()) as again, trio.fail_after(60):
-                again.send(b"frame")
-                assert await link.receive() == [b"frame"]

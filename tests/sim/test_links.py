@@ -105,16 +105,10 @@ async def test_answers_the_latest_sender_until_told_whom() -> None:
             assert vehicle.recv(100) == b"still"
 
 
-def local_port(link: Link) -> int:
-    (descriptor,) = link.descriptors()
-    with socket.socket(fileno=os.dup(descriptor)) as sock:
-        return int(sock.getsockname()[1])
-
-
 @pytest.mark.holds("rule 14.37")
 async def test_udpout_keeps_one_port_and_does_not_mind_a_closed_one() -> None:
-    port = free_udp_port()
-    async with opened(f"udpout:{HOST}:{port}") as link:
+    port, ours = free_udp_port(), free_udp_port()
+    async with open_link(parse_source(f"udpout:{HOST}:{port}"), source_port=ours) as link:
         for _ in range(3):  # each is answered by ICMP "port unreachable"
             link.send_nowait([b"anybody?"])
             with trio.move_on_after(0.05):
@@ -123,7 +117,7 @@ async def test_udpout_keeps_one_port_and_does_not_mind_a_closed_one() -> None:
         with udp_socket(port=port) as vehicle:
             link.send_nowait([b"hello"])
             data, sender = vehicle.recvfrom(100)
-            assert (data, sender[1]) == (b"hello", local_port(link))
+            assert (data, sender[1]) == (b"hello", ours)
             vehicle.sendto(b"welcome", sender)
             assert await link.receive() == [b"welcome"]
         assert link.stats.dropped_sends == 0

@@ -1,4 +1,4 @@
-"""A port that goes from a program alone to a hub and back: link.sharing, with real hubs."""
+"""A port that a program has alone, shares through a hub and has alone again: link.sharing, with real hubs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import resource
 import signal
 import socket
 import sys
-import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
-from pathlib import Path
+from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -19,12 +17,12 @@ import trio
 
 from mavftpfs.cli import ports
 from mavftpfs.client.connect import plain_nursery
+from mavftpfs.link import hublink, sharing
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import Wish
 from mavftpfs.link.messages import Address
-from mavftpfs.link.rendezvous import ALONE, knock, open_door
-from mavftpfs.link.samelink import port_name
+from mavftpfs.link.ports import connect, next_caller, port_name, take_name
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
@@ -34,15 +32,6 @@ from tests.support.vehicles import HOST, free_udp_port
 pytestmark = pytest.mark.real_time
 US = Address(254, 191)
 VEHICLE = Address(1, 1)
-
-
-@pytest.fixture(autouse=True)
-def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where the doors of this test are: a path that is short enough for a socket."""
-    with tempfile.TemporaryDirectory(prefix="mavftpfs") as folder:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
-        monkeypatch.setenv("HOME", folder)
-        yield Path(folder)
 
 
 class Port:
@@ -204,16 +193,23 @@ async def test_programs_that_begin_at_once_all_share_the_port(port: Port) -> Non
 # -- what cannot be -------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("program", "why"), [("/bin/false", "the hub did not start"), ("/bin/true", "the hub ended at once")]
+)
 async def test_why_a_port_cannot_be_shared_is_told_to_the_program_that_wants_it(
-    port: Port, monkeypatch: pytest.MonkeyPatch
+    port: Port, monkeypatch: pytest.MonkeyPatch, program: str, why: str
 ) -> None:
+    monkeypatch.setattr(sharing, "COMING", 0.2)
     async with port.shared() as one:
-        monkeypatch.setattr(sys, "executable", "/bin/false")
-        with pytest.raises(LinkClosed, match="cannot be shared: the hub did not start"):
+        await port.hears(one)
+        monkeypatch.setattr(sys, "executable", program)
+        with pytest.raises(LinkClosed, match=f"cannot be shared: {why}"):
             async with port.shared():
                 pass
+        assert one.stats.reopened == 0
         monkeypatch.undo()
-        await port.hears(one)
+        async with port.shared() as two:
+            await port.hears(one, two)
 
 
 @contextmanager
@@ -232,64 +228,75 @@ def no_descriptors_left() -> Iterator[None]:
             os.close(descriptor)
 
 
-async def test_a_program_without_descriptors_left_keeps_its_port(
-    port: Port, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_program_without_descriptors_left_keeps_its_port_and_shares_it_later(port: Port) -> None:
     async with port.shared() as one:
-        sock = knock(port_name(port.spec))
-        assert sock is not None
-        with sock, no_descriptors_left():
-            await until(lambda: "cannot be shared: the hub cannot be started" in caplog.text)
-        await port.hears(one)
+        with connect(port_name(port.spec)), no_descriptors_left():
+            await port.hears(one)
+        async with port.shared() as two:
+            await port.hears(one, two)
 
 
-async def test_a_program_that_does_not_answer_keeps_its_door_and_its_port() -> None:
-    """It was stopped, and as many wait there as can. Two sockets would speak to one vehicle."""
-    spec = parse_source(f"udpout:{HOST}:{free_udp_port()}")
-    door = open_door(port_name(spec))
-    place = door.sock.getsockname()
-    inode = os.lstat(place).st_ino
-    with ExitStack() as stack:
-        stack.callback(door.remove)
-        fill_queue(place, stack)
-        with pytest.raises(LinkClosed, match="does not answer"):
-            async with open_shared(spec, Wish(US)):
-                pass
-        assert os.lstat(place).st_ino == inode
-
-
-def fill_queue(place: str, stack: ExitStack) -> None:
-    """Have as many connections wait behind a door as can."""
-    for _ in range(1000):
-        sock = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-        sock.setblocking(False)
-        try:
-            sock.connect(place)
-        except BlockingIOError:
-            return
-    raise AssertionError("the queue has no end")
-
-
-# -- doors ----------------------------------------------------------------------------------------
-
-
-async def test_where_the_first_directory_has_no_room_the_door_is_in_the_next_one(
-    port: Port, runtime: Path
+async def test_a_program_that_does_not_answer_keeps_its_port(
+    port: Port, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    obstacle = runtime / "mavftpfs" / (port_name(port.spec) + ALONE)
-    (obstacle / "file").mkdir(parents=True)
-    obstacle.parent.chmod(0o700)
-    async with port.shared(), port.shared() as two:
-        await port.hears(two)
+    """It was stopped: two sockets would speak to one vehicle."""
+    monkeypatch.setattr(hublink, "WELCOME_PATIENCE", 0.2)
+    taken = take_name(port_name(port.spec))
+    assert taken is not None
+    with taken, pytest.raises(LinkClosed, match=f"process {os.getpid()} has this port and does not answer"):
+        async with port.shared():
+            pass
 
 
-async def test_a_stale_door_of_a_killed_program_is_in_nobodys_way(port: Port, runtime: Path) -> None:
-    folder = runtime / "mavftpfs"
-    folder.mkdir(mode=0o700)
-    for end in (".port", ".hub"):
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
-            left.bind(str(folder / (port_name(port.spec) + end)))
-            left.listen(1)
-    async with port.shared(), port.shared() as two:
-        await port.hears(two)
-    await until(lambda: not os.listdir(folder))
+async def test_a_program_that_ends_while_it_is_asked_is_waited_for(port: Port) -> None:
+    """It may be killed between being asked and starting the hub."""
+
+    async def end(name: socket.socket) -> None:
+        for _ in range(2):
+            (await next_caller(name)).close()
+        name.close()
+        await trio.sleep(0.2)
+        old.close()
+
+    name = take_name(port_name(port.spec))
+    assert name is not None
+    with name, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as old:
+        old.bind((HOST, port.spec.port))
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(end, name)
+            async with port.shared() as link:
+                await port.hears(link)
+
+
+async def test_the_hub_sends_from_the_port_from_which_the_first_program_sent() -> None:
+    """PX4 answers only the first address that it heard."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind((HOST, 0))
+        vehicle.setblocking(False)
+        spec = parse_source(f"udpout:{HOST}:{vehicle.getsockname()[1]}")
+        senders: list[Any] = []
+
+        async def speak(link: Link, own: Address) -> None:
+            beat = Framer(own, stream=False).encode_heartbeat(18)
+            with trio.fail_after(60):
+                while not senders or senders[-1][0] != beat:
+                    link.send_nowait([beat])
+                    await trio.sleep(0.02)
+                    with suppress(BlockingIOError):
+                        senders.append(vehicle.recvfrom(2048))
+
+        async with open_shared(spec, Wish(US)) as one:
+            await speak(one, US)
+            async with open_shared(spec, Wish(US)) as two:
+                assert two.seat is not None
+                await speak(two, two.seat.own)
+                await speak(one, US)
+        assert len({address for _, address in senders}) == 1
+
+
+async def test_a_port_that_another_kind_of_program_has_is_said_soon(port: Port) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HOST, port.spec.port))
+        with trio.fail_after(60), pytest.raises(LinkClosed, match="in use by another program"):
+            async with port.shared():
+                pass

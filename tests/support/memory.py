@@ -93,10 +93,6 @@ class MemoryLink:
     def focus(self, system: int) -> None:
         """See link.base.Link."""
 
-    def descriptors(self) -> list[int]:
-        """See link.base.Link."""
-        return []
-
     async def aclose(self) -> None:
         """See link.base.Link."""
         self._closed = True

@@ -1,0 +1,181 @@
+"""The names of ports: who has a port, and who may share it. Layer: link.
+
+A program that opens a port holds the port's *name* as long as it has the port: an abstract Unix socket, of
+which there is one in a network namespace, and which ends with its process. Other programs call there.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+import socket
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import trio
+
+from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.shared.errors import LinkClosed
+
+_PREFIX = "mavftpfs-port-"
+_NAMES = Path("/proc/net/unix")
+_QUEUE = 64
+_PAUSE = 0.05
+_SO_PEERGROUPS = 59
+_GROUPS = 1024
+_READ_WRITE = 0o6
+_ACL = "system.posix_acl_access"
+_ACL_USER = 2
+_PRIVILEGED = 1024
+_FIRST_SOURCE_PORT, _SOURCE_PORTS = 24_000, 8_000
+"""Below those that Linux chooses itself."""
+
+
+class Busy(LinkClosed):
+    """Another program has the port. In a moment it may be free, or shared."""
+
+
+class Peer(NamedTuple):
+    """The process at the other end of a Unix socket: when it connected, or began to listen."""
+
+    pid: int
+    uid: int
+    gid: int
+
+
+def port_name(spec: LinkSpec) -> str:
+    """Return the name of a port, the same for two SOURCEs that exclude each other. What connects to somewhere
+    excludes nobody, but a server may have a single client: so all programs of a user share it."""
+    if spec.kind is LinkKind.SERIAL:
+        text = f"serial {os.path.realpath(spec.device)}"
+    elif spec.kind.listens:
+        text = f"{spec.kind.value} {spec.port}"
+    else:
+        text = f"{os.getuid()} {spec.kind.value} {spec.host} {spec.port}"
+    return "\0" + _PREFIX + hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def source_port(spec: LinkSpec) -> int:
+    """Return the port from which all our programs send to one address: PX4 answers only the first that it
+    heard (servers.md 5)."""
+    return _FIRST_SOURCE_PORT + int(port_name(spec).removeprefix("\0" + _PREFIX), 16) % _SOURCE_PORTS
+
+
+def take_name(name: str) -> socket.socket | None:
+    """Take the name of a port; return the socket where others call, None if another program has the name."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.setblocking(False)
+        sock.bind(name)
+        sock.listen(_QUEUE)
+    except OSError as exc:
+        sock.close()
+        if exc.errno == errno.EADDRINUSE:
+            return None
+        raise
+    return sock
+
+
+def connect(name: str) -> socket.socket:
+    """Return a connection to the program that has the name of a port.
+
+    Raises:
+        BlockingIOError: as many programs wait there as can.
+        OSError: no program has that name.
+    """
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.setblocking(False)  # so that a full queue is an error
+        sock.connect(name)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def call(name: str, spec: LinkSpec) -> socket.socket | None:
+    """Return a connection to the program that has a port and its name, None if no program has.
+
+    Raises:
+        Busy: as many programs wait there as can.
+        LinkClosed: it is another user's, who may not have that port.
+    """
+    try:
+        sock = connect(name)
+    except BlockingIOError as exc:
+        raise Busy(f"{spec.description}: too many programs wait for this port") from exc
+    except OSError:
+        return None
+    if may_share(sock, spec):
+        return sock
+    pid = peer_of(sock).pid
+    sock.close()
+    raise LinkClosed(f"{spec.description} is claimed by process {pid} of another user; end that")
+
+
+async def next_caller(sock: socket.socket) -> socket.socket:
+    """Return the next connection to a name that we have."""
+    while True:
+        await trio.lowlevel.wait_readable(sock)
+        try:
+            return sock.accept()[0]
+        except OSError:  # it left again, or no descriptors are left
+            await trio.sleep(_PAUSE)
+
+
+def names_in_use() -> list[str]:
+    """Return the names of all ports of this network namespace that programs of ours have."""
+    return sorted({"\0" + found for found in re.findall(rf"@({_PREFIX}\w+)", _NAMES.read_text())})
+
+
+# -- trust ----------------------------------------------------------------------------------------
+
+
+def peer_of(sock: socket.socket) -> Peer:
+    """Return the process at the other end of a Unix socket."""
+    layout = struct.Struct("3i")
+    return Peer(*layout.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size)))
+
+
+def is_ours(sock: socket.socket) -> bool:
+    """Return whether the other end is of this user, or of root."""
+    return peer_of(sock).uid in (0, os.getuid())
+
+
+def may_share(sock: socket.socket, spec: LinkSpec) -> bool:
+    """Return whether the other end could open a port itself, so that it may have the port's name, or share
+    the port. Any user may listen on a network port; a device has permissions."""
+    if is_ours(sock):
+        return True
+    if spec.kind is LinkKind.SERIAL:
+        return _may_open(sock, spec.device)
+    return spec.kind.listens and spec.port >= _PRIVILEGED
+
+
+def _may_open(sock: socket.socket, device: str) -> bool:
+    """Return whether the user at the other end may read and write a device: by its mode, or by the ACL that
+    logind gives to the user who sits at the computer."""
+    peer = peer_of(sock)
+    try:
+        groups = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _GROUPS)
+        facts = os.stat(device)
+    except OSError:  # the user is in very many groups, or the device is away
+        return False
+    shift = 6 if peer.uid == facts.st_uid else 0
+    if shift == 0 and facts.st_gid in (peer.gid, *(one for (one,) in struct.iter_unpack("I", groups))):
+        shift = 3
+    return (facts.st_mode >> shift) & _READ_WRITE == _READ_WRITE or _acl_lets_in(peer.uid, device)
+
+
+def _acl_lets_in(uid: int, device: str) -> bool:
+    try:
+        acl = os.getxattr(device, _ACL)
+    except OSError:  # it has none
+        return False
+    entries = struct.iter_unpack("<HHI", acl[4:])
+    return any(
+        tag == _ACL_USER and mode & _READ_WRITE == _READ_WRITE and who == uid for tag, mode, who in entries
+    )
