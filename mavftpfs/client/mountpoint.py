@@ -15,13 +15,14 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from mavftpfs.shared.errors import MountFailed
 
 FUSE_DEVICE = "/dev/fuse"
+FUSE_SETTINGS = Path("/proc/sys/fs/fuse")
 _CONTAINER = "a container needs --device /dev/fuse --cap-add SYS_ADMIN"
 SUBTYPE = "mavftpfs"
 """The mount's type is fuse.mavftpfs: the same word that fstab has."""
@@ -104,6 +105,27 @@ def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
         raise MountFailed(f"{device} may not be opened; run: sudo chmod 666 {device} ({_CONTAINER})")
     if (os.getuid() if uid is None else uid) != 0 and shutil.which("fusermount3") is None:
         raise MountFailed("fusermount3 is missing, which mounts for users; run: sudo apt install fuse3")
+
+
+def request_timeout(settings: Path = FUSE_SETTINGS) -> int | None:
+    """Return the seconds after which this kernel ends a mount that does not answer; None if never."""
+    limits = []
+    for name in ("default_request_timeout", "max_request_timeout"):
+        with suppress(OSError, ValueError):  # kernels before 6.15 have neither
+            limits.append(int((settings / name).read_text()))
+    return min(filter(None, limits), default=None)
+
+
+def timeout_note() -> str:
+    """Return what a person is told about the kernel's limit, or ""."""
+    limit = request_timeout()
+    if limit is None:
+        return ""
+    return (
+        f"this kernel ends a mount that takes more than {limit} s for one request, as close() of a large "
+        "file does on a slow link; unmount, and before you mount again run: "
+        "sudo sysctl fs.fuse.default_request_timeout=0 fs.fuse.max_request_timeout=0"
+    )
 
 
 def why_not_mounted(path: str, said: str) -> str:

@@ -372,6 +372,23 @@ def holder_of(spec: LinkSpec) -> Status | None:
     return next((status for status in all_statuses() if has_link(status, spec)), None)
 
 
+def also_mounted(spec: LinkSpec, vehicle: Facts) -> str:
+    """Return a line about the mounts of a vehicle on a link, or "". vehicle: the facts of its status."""
+
+    def is_same(status: Status) -> bool:
+        same = all(status["vehicle"][key] == vehicle[key] for key in ("system", "component"))
+        return same and has_link(status, spec)
+
+    known = [status for status in all_statuses() if not status.get("problem") and "vehicle" in status]
+    places = [status["mountpoint"] for status in known if is_same(status)]
+    if not places:
+        return ""
+    return (
+        f"this vehicle is mounted on {' and '.join(places)}, too; a change through one mount may show in the "
+        f"other one 20 s later; to have only one, run: mavftpfs umount {places[0]}"
+    )
+
+
 def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
     """Return whether a mount is of the vehicle that the options ask for, and that vehicle still answers
     there."""

@@ -19,16 +19,25 @@ from mavftpfs.client.mountpoint import SUBTYPE
 from mavftpfs.client.options import Flag, Flags, Options, Value, Values, collected, number, take_gone
 from mavftpfs.shared.errors import UsageError
 
-KERNEL_WORDS = frozenset(
-    {"dev", "nodev", "suid", "nosuid", "exec", "noexec", "atime", "noatime", "sync", "async", "dirsync"}
-)
+KERNEL_WORDS = frozenset({"dev", "nodev", "suid", "nosuid", "exec", "noexec", "sync", "async", "dirsync"})
 """VFS words that libfuse takes."""
 
 _NO_MEANING = {
-    *("defaults", "diratime", "nodiratime", "relatime", "norelatime", "strictatime", "nostrictatime"),
+    *(
+        "defaults",
+        "atime",
+        "noatime",
+        "diratime",
+        "nodiratime",
+        "relatime",
+        "norelatime",
+        "strictatime",
+        "nostrictatime",
+    ),
     *("lazytime", "nolazytime", "nodirsync"),
 }
-"""VFS words for access times, which are not kept; libfuse does not know them."""
+"""VFS words that change nothing: most are for access times, which no vehicle keeps. libfuse knows only some
+of them, and fewer with each version (3.15 refuses `atime`)."""
 
 _FOR_OTHERS = {
     *("auto", "noauto", "user", "nouser", "users", "nousers", "owner", "noowner", "group", "nogroup"),

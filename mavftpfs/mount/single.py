@@ -19,8 +19,8 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.control import Reply
 from mavftpfs.client.controlserver import Command
-from mavftpfs.client.mountpoint import is_dead, unmount
-from mavftpfs.client.status import network_namespace
+from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
+from mavftpfs.client.status import also_mounted, network_namespace
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.farewell import say_goodbye
 from mavftpfs.mount.handles import InodeTable
@@ -30,6 +30,9 @@ from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import fuse_words
 from mavftpfs.shared.errors import ExitCode
+
+ASKING_TIME = 2.0
+"""Seconds for other mounts to tell which vehicle they have."""
 
 FORGETTING_TIME = 2.0
 """Seconds for the kernel to forget what it cached, for a command that waits for that."""
@@ -79,12 +82,21 @@ class SingleMount(Life):
             )
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
             words = fuse_words(self.request.options, self.request.source)
+            notes = await self._notes(vehicle)
             if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
                 unmount(self.request.mountpoint, lazy=True)
             with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
                 self.enter(State.MOUNTED)
                 await self.start_control(_commands(vehicle, operations, invalidator), nursery)
-                await self._answer(invalidator, vehicle.notice)
+                await self._answer(invalidator, lambda: _together(vehicle.notice(), *notes))
+
+    async def _notes(self, vehicle: Attached) -> list[str]:
+        """Return what a user should know of this computer's kernel and mounts."""
+        notes = [timeout_note()]
+        ask = partial(also_mounted, self.request.spec, vehicle.status()["vehicle"])
+        with trio.move_on_after(ASKING_TIME):  # a mount may have been stopped
+            notes.append(await trio.to_thread.run_sync(ask, abandon_on_cancel=True))
+        return notes
 
     @asynccontextmanager
     async def _goodbye(self, tree: Tree) -> AsyncIterator[None]:
@@ -132,6 +144,11 @@ class SingleMount(Life):
             "read_only": client.read_only,
             **self._status(),
         }
+
+
+def _together(*lines: str) -> str:
+    """Return what a user should know in one line."""
+    return "; ".join(filter(None, lines))
 
 
 def _commands(vehicle: Attached, operations: Operations, invalidator: Invalidator) -> dict[str, Command]:

@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs.client import control
 from mavftpfs.client.connect import connect_options, opened, plain_nursery
-from mavftpfs.client.mountpoint import is_dead, is_ours
+from mavftpfs.client.mountpoint import is_dead, is_ours, timeout_note
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
@@ -82,7 +82,7 @@ class Supervisor(Life):
     async def _tell_when_up(self) -> None:
         with trio.move_on_after(self.request.options.client.connect_timeout):
             await self._first.wait()
-            self.tell_mounted("")
+            self.tell_mounted(timeout_note())
             return
         self.tell_mounted(
             f"no vehicle is heard on {self.request.spec.description} yet; each appears as it comes"

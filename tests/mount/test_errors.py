@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import abort_mount, mavftpfs, mounted_at, processes_in, unmount, wait_until
-from tests.support.vehicles import HOST, PROJECT, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, Process, free_udp_port
 
 
 def test_a_mount_is_not_put_onto_a_vehicle_and_says_what_it_hides(field: Field, small_tree: Path) -> None:
@@ -51,3 +52,41 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
         wait_until("the daemon ended", lambda: not processes_in(mount.path))
     finally:
         abort_mount(mount.path)
+
+
+def test_a_second_mount_of_a_vehicle_names_the_first(field: Field, small_tree: Path) -> None:
+    source = field.sim(small_tree).source
+    first, second = field.mount(source), field.prepare(source)
+    _, said = mavftpfs(source, second.path)
+    try:
+        assert f"this vehicle is mounted on {first.path}, too; " in said
+        assert said.endswith(f"to have only one, run: mavftpfs umount {first.path}\n")
+        assert mounted_at(second.path)
+    finally:
+        mavftpfs("umount", second.path)
+    first.unmount()
+    assert mavftpfs(source, second.path)[1] == ""
+    mavftpfs("umount", second.path)
+
+
+LIMITED = """
+mkdir -p /proc/sys/fs/fuse 2>/dev/null
+mount --bind "$1" /proc/sys/fs/fuse && shift && exec "$@"
+"""
+
+
+def test_a_kernel_that_ends_slow_mounts_is_named(field: Field, small_tree: Path, tmp_path: Path) -> None:
+    (tmp_path / "default_request_timeout").write_text("40\n")
+    (tmp_path / "max_request_timeout").write_text("0\n")
+    mount = field.prepare(field.sim(small_tree).source)
+    argv = [sys.executable, "-m", "mavftpfs", mount.source, str(mount.path), "-f"]
+    words = ["unshare", "--mount", "sh", "-c", LIMITED, "sh", str(tmp_path), *argv]
+    process = Process("limited", words, field.local("output"))
+    try:
+        wait_until(
+            "it says so", lambda: "this kernel ends a mount that takes more than 40 s" in process.text()
+        )
+        assert "sudo sysctl fs.fuse.default_request_timeout=0 fs.fuse.max_request_timeout=0" in process.text()
+        assert process.stop(signal.SIGINT) == 0
+    finally:
+        process.kill()

@@ -24,14 +24,14 @@ def plain(module_field: Field) -> Mount:
     """A mount of a card with one file, with flags of the kernel's."""
     card = module_field.local("card")
     (card / "file").write_text("content\n")
-    return module_field.mount(module_field.sim(card).source, "noatime", "nosuid", "nodev")
+    return module_field.mount(module_field.sim(card).source, "noatime", "nosuid", "nodev", "noexec")
 
 
 def test_kernel_shows_source_and_type(plain: Mount) -> None:
     words = mount_line(plain.path)
     assert words[0] == plain.source
     assert words[2] == "fuse.mavftpfs"
-    assert {"noatime", "nosuid", "nodev", "default_permissions"} <= set(words[3].split(","))
+    assert {"noexec", "nosuid", "nodev", "default_permissions"} <= set(words[3].split(","))
 
 
 def test_extended_attributes(plain: Mount) -> None:
@@ -101,7 +101,7 @@ MOUNT_8 = """
 for place in /usr/local/bin /usr/sbin; do
     mount -t overlay none -o "lowerdir=$1:$place" "$place" || exit 90
 done
-mount -t fuse.mavftpfs "$2" "$3" -o "ro,noatime,allow_other,uid=1000,nofail,_netdev" || exit
+mount -t fuse.mavftpfs "$2" "$3" -o "ro,noatime,noexec,allow_other,uid=1000,nofail,_netdev" || exit
 grep " $3 " /proc/self/mounts
 stat -c "uid %u" "$3/README.txt" &&
 diff -r "$4/sizes" "$3/sizes" &&
@@ -123,6 +123,6 @@ def test_mount_8_by_both_types_and_umount_8(field: Field, small_tree: Path, tmp_
     assert done.returncode == 0, done.stderr
     line, *others = done.stdout.splitlines()
     assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftpfs"]
-    assert {"ro", "noatime"} <= set(line.split()[3].split(","))
+    assert {"ro", "noexec"} <= set(line.split()[3].split(","))
     assert others == ["uid 1000", str(mount.path), str(mount.path), "1"]
     wait_until("the daemons ended", lambda: not processes_in(mount.path))

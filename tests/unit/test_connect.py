@@ -29,7 +29,7 @@ OTHER: dict[str, Any] = {
     "when_armed": "ok",
     "local": (),
     "inplace": True,
-    "kernel_words": ("noatime",),
+    "kernel_words": ("noexec",),
 }
 """Values that are no default; numbers are made below."""
 

@@ -15,6 +15,7 @@ from mavftpfs.client.mountpoint import (
     check_mountpoint,
     is_ours,
     mounts,
+    request_timeout,
     unmount,
     why_not_mounted,
 )
@@ -128,3 +129,22 @@ def test_what_is_busy_for_a_moment_is_unmounted(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     unmount("/x")
     assert (tmp_path / "tries").read_text() == "x\n" * 3
+
+
+@pytest.mark.parametrize(
+    ("default", "most", "limit"),
+    [
+        (None, None, None),
+        ("0\n", "0\n", None),
+        ("30\n", "0\n", 30),
+        ("0\n", "60\n", 60),
+        ("90\n", "60\n", 60),
+    ],
+)
+def test_the_kernels_limit_for_a_request(
+    tmp_path: Path, default: str | None, most: str | None, limit: int | None
+) -> None:
+    for name, text in (("default_request_timeout", default), ("max_request_timeout", most)):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+    assert request_timeout(tmp_path) == limit

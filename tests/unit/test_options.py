@@ -301,3 +301,8 @@ def test_endpoints_are_collected() -> None:
     assert options_of({"forward": wanted[0]}).forward == wanted[:1]
     with pytest.raises(UsageError, match="forward=nowhere"):
         parse_options(["forward=nowhere"])
+
+
+def test_words_for_access_times_reach_neither_libfuse_nor_the_user() -> None:
+    words = "atime,noatime,diratime,nodiratime,relatime,norelatime,strictatime,nostrictatime,lazytime"
+    assert parse_options([words]).kernel_words == ()
