@@ -524,7 +524,7 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "status": (_status_parser, commands.status),
     "param": (_param_parser, _later("cli.param", "param")),
     "sync": (_sync_parser, _later("cli.verbs", "sync")),
-    "scan": (_scan_parser, _later("cli.verbs", "scan")),
+    "scan": (_scan_parser, _later("cli.scanning", "scan")),
     "ls": (_ls_parser, _later("cli.verbs", "ls")),
     "get": (_get_parser, _later("cli.verbs", "get")),
     "cat": (_cat_parser, _later("cli.verbs", "cat")),

@@ -28,7 +28,6 @@ from mavftpfs.cli.report import count_files
 from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
-from mavftpfs.client import scan as scanning
 from mavftpfs.client.choice import Choice
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
@@ -539,30 +538,3 @@ def crc(args: Args) -> int:
 
     with_session(args, work, component)
     return ExitCode.OK
-
-
-def scan(args: Args) -> int:
-    """Show what answers on a link."""
-    found = run(args, scanning.scan)
-    if args.json:
-        print(json.dumps(found, indent=2, default=str))
-    else:
-        for line in scan_lines(found, tabs=not sys.stdout.isatty()):
-            print(line)
-    return ExitCode.OK
-
-
-def scan_lines(found: Sequence[scanning.Entry], *, tabs: bool) -> Iterator[str]:
-    """Yield a line for each component; in a pipe its parts stand between tabs, `-` for what is not known."""
-    for peer in found:
-        address = f"{peer['system']}/{peer['component']}"
-        ftp = ", ".join([peer["ftp"], *peer["seen"]])
-        facts = (address, peer["what"], peer["firmware"], peer["uid"], ftp)
-        if tabs:
-            yield "\t".join("-" if fact is None else printable(fact) for fact in facts)
-            continue
-        about = [printable(peer["what"])]
-        about += [f"firmware {peer['firmware']}"] if peer["firmware"] else []
-        about += [f"id {peer['uid']}"] if peer["uid"] else []
-        yield f"{address:<8} {', '.join(about)}"
-        yield f"{'':<8} FTP: {printable(ftp)}"

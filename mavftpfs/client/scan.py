@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -16,7 +16,7 @@ from mavftpfs.client.options import Options
 from mavftpfs.client.status import second_vehicle, with_vehicles
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
-from mavftpfs.link.peers import describe_peer
+from mavftpfs.link.peers import describe_peer, names_of
 from mavftpfs.session.connection import HEARD_SOON, connected
 from mavftpfs.shared.errors import FtpNak, LinkClosed, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import readable_time
@@ -30,60 +30,85 @@ PROBE_TIME = 6.0
 _TICK = 0.1
 
 
-async def scan(target: Target) -> list[Entry]:
+async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     """Return the components that send heartbeats on a link, and which of them answer MAVLink FTP.
 
-    A component that does not answer takes PROBE_TIME, or connect_timeout if that is less.
+    show: called with each as soon as it is known. A component that does not answer takes PROBE_TIME, or
+    connect_timeout if that is less.
 
     Raises:
         VehicleLost: no heartbeat at all within connect_timeout.
     """
     if target.mount is not None:
-        status = await mount_status(target.mount[0], several=True)
-        if "members" in status:
-            _, *below = await trio.to_thread.run_sync(with_vehicles, status)
-            return [_own_entry(vehicle) for vehicle in below if not vehicle.get("problem")]
-        return _of_mount(status)
+        return _shown(await _by_mount(target.mount[0]), show)
     assert target.spec is not None
-    statuses = await mounts_on(target.spec)
-    found = [_own_entry(status) for status in statuses]
+    found = _shown([_own_entry(status) for status in await mounts_on(target.spec)], show)
     try:
-        async with opened(target.spec, target.options) as link:
-            found += await _ask_others(
-                link, target, {Address(one["system"], one["component"]) for one in found}
-            )
+        async with opened(target.spec, target.options, tell=target.sinks.tell) as link:
+            async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
+                found += _shown([entry], show)
     except LinkClosed:  # the mount is another user's, and does not share the port
         holder = await mount_with(target.spec)
         if holder is None:
             raise
-        return _of_mount(holder)
+        return _shown(_of_mount(holder), show)
     return sorted(found, key=itemgetter("system", "component"))
 
 
-async def _ask_others(link: Link, target: Target, mounted: set[Address]) -> list[Entry]:
-    """Return the other components that are heard, and which of them answer MAVLink FTP."""
+def _shown(entries: list[Entry], show: Callable[[Entry], None]) -> list[Entry]:
+    for entry in entries:
+        show(entry)
+    return entries
+
+
+async def _by_mount(mountpoint: str) -> list[Entry]:
+    """Return what a mount, or the mounts of several vehicles, tell."""
+    status = await mount_status(mountpoint, several=True)
+    if "members" in status:
+        _, *below = await trio.to_thread.run_sync(with_vehicles, status)
+        return [_own_entry(vehicle) for vehicle in below if not vehicle.get("problem")]
+    return _of_mount(status)
+
+
+async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]) -> AsyncIterator[Entry]:
+    """Yield the other components that are heard, and which of them answer MAVLink FTP."""
     assert target.spec is not None
-    options = target.options
+    options, tell = target.options, target.sinks.tell
+    tell(f"listening on {target.spec.description} for {LISTEN_TIME:g} s")
     patience = min(PROBE_TIME, options.connect_timeout)
-    heard = await _listen(link, options, partial(target.sinks.tell, waiting(target.spec, options)))
-    others = sorted(heard.keys() - mounted)
-    return [await _probe(link, options, heard[address], patience) for address in others]
+
+    def on_heard(heartbeat: Heartbeat) -> None:
+        tell(f"heard {names_of([heartbeat])}")
+
+    heard = await _listen(link, options, partial(tell, waiting(target.spec, options)), on_heard)
+    for address in sorted(heard.keys() - known):
+        yield await _probe(link, options, heard[address], patience)
 
 
-async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
+async def _listen(
+    link: Link, options: Options, on_wait: Callable[[], None], on_heard: Callable[[Heartbeat], None]
+) -> dict[Address, Heartbeat]:
     """Return the heartbeats that are heard within LISTEN_TIME of the first one."""
     anybody = replace(connect_options(options), target_system=0, target_component=0)
+    listened = min(LISTEN_TIME, options.connect_timeout / 2)
+    found: dict[Address, Heartbeat] = {}
     async with connected(link, anybody) as connection:
-        for tick in range(round(options.connect_timeout / _TICK)):
-            if connection.vehicle.heard:
-                break
-            if tick == round(HEARD_SOON / _TICK):
+        began = trio.current_time()
+        soon, end = began + HEARD_SOON, began + options.connect_timeout
+        while (now := trio.current_time()) < end:
+            for address, heartbeat in connection.vehicle.heard.items():
+                if not found:
+                    end = now + listened
+                if address not in found:
+                    on_heard(heartbeat)
+                found[address] = heartbeat
+            if not found and now >= soon:
+                soon = end
                 on_wait()
             await trio.sleep(_TICK)
-        else:
+        if not found:
             raise connection.nobody(options.connect_timeout)
-        await trio.sleep(min(LISTEN_TIME, options.connect_timeout / 2))
-        return dict(connection.vehicle.heard)
+        return found
 
 
 def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,7 +56,31 @@ def test_a_simulated_vehicle_tells_its_own_version(
     field: Field, small_tree: Path, profile: str, told: str
 ) -> None:
     out, _ = mavftpfs("scan", field.sim(small_tree, profile).source)
-    assert told.split(", ") == [*out.split("\t")[1].split(", "), f"firmware {out.split(chr(9))[2]}"]
+    facts = out.splitlines()[1].split("\t")
+    assert told.split(", ") == [*facts[1].split(", "), f"firmware {facts[2]}"]
+
+
+def test_scan_tells_each_vehicle_as_it_comes(two: tuple[SimVehicle, SimVehicle]) -> None:
+    source = two[0].source
+    out, said = command("scan", source)
+    first, *heard = said.splitlines()
+    assert first == f"mavftpfs: listening on {source} for 3 s"
+    assert sorted(heard) == [f"mavftpfs: heard {n}/1 (PX4 quadrotor, disarmed)" for n in (1, 2)]
+    header, *rows = out.splitlines()
+    assert header == "SYSTEM/COMPONENT\tWHAT\tFIRMWARE\tUNIQUE ID\tFTP"
+    assert [row.split("\t")[0] for row in rows] == ["1/1", "2/1"]
+
+
+def test_a_port_in_use_is_said_to_be_while_it_is_waited_for() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HOST, free_udp_port()))
+        source = f"udpin:{HOST}:{other.getsockname()[1]}"
+        for verb in ("scan", "ls"):
+            first, last = command(verb, source, code=2)[1].splitlines()
+            assert first.startswith(
+                f"mavftpfs: opening {source}: it takes long, perhaps because another program"
+            )
+            assert "is in use by another program" in last
 
 
 @pytest.mark.holds("promise 2")

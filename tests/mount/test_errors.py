@@ -75,6 +75,7 @@ mount --bind "$1" /proc/sys/fs/fuse && shift && exec "$@"
 """
 
 
+@pytest.mark.needs("namespaces")
 def test_a_kernel_that_ends_slow_mounts_is_named(field: Field, small_tree: Path, tmp_path: Path) -> None:
     (tmp_path / "default_request_timeout").write_text("40\n")
     (tmp_path / "max_request_timeout").write_text("0\n")

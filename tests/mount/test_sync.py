@@ -379,7 +379,7 @@ def test_scan_of_a_camera_and_a_ground_station_ends_in_its_time() -> None:
     port = free_udp_port()
     with Beating(port, (Address(1, 100), 30, MAV_AUTOPILOT_INVALID), STATION):
         out, _ = run("scan", "-o", "connect_timeout=3000", f"udpin:{HOST}:{port}")
-    camera, station = (line.split("\t") for line in out.splitlines())
+    camera, station = (line.split("\t") for line in out.splitlines()[1:])
     assert camera[:4] == ["1/100", "camera", "-", "-"]
     assert camera[4].startswith("no answer")
     assert station == ["255/190", "ground station", "-", "-", "not asked (a ground station)"]
@@ -394,7 +394,7 @@ def test_scan_beside_a_mount_shows_who_else_is_there(field: Field) -> None:
             "the mount hears the ground station", lambda: len(mount.status()["connection"]["heard"]) > 1
         )
         for source in (vehicle.source, mount.path):
-            own, station = (line.split("\t") for line in run("scan", source)[0].splitlines())
+            own, station = (line.split("\t") for line in run("scan", source)[0].splitlines()[1:])
             assert own[0] == "1/1"
             assert own[4] == f"mounted on {mount.path}"
             assert station[:2] == ["255/190", "ground station"]
@@ -405,6 +405,7 @@ def test_who_waits_for_a_vehicle_is_told_so(command: str, tmp_path: Path) -> Non
     source = f"udpin:{HOST}:{free_udp_port()}"
     local = [] if command == "scan" else [tmp_path]
     said = mavftpfs(command, "-o", "connect_timeout=2", source, *local, code=2)[1]
-    first, last = said.splitlines()
+    *before, first, last = said.splitlines()
+    assert before == [f"mavftpfs: listening on {source} for 3 s"] * (command == "scan")
     assert first == f"mavftpfs: waiting for a heartbeat on {source} (2 s)"
     assert last.startswith(f"mavftpfs: no vehicle on {source} within 2 s")
