@@ -2,7 +2,8 @@
 
 Takes one JSON object a line on stdin and answers each with one on stdout: {"do": "write", "path", "text"},
 {"do": "invalidate", "path"}, {"do": "forget", "path"} for a name in the root, and {"do": "calls"}, which
-gives the calls since the last time.
+gives the calls since the last time. Those for the root are left out: any program that looks at all mounts
+makes them.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class Server:
             case "forget":
                 pyfuse3.invalidate_entry_async(pyfuse3.ROOT_INODE, path.removeprefix(b"/"))
             case "calls":
-                names = [name for name, _ in self.tree.calls]
+                names = [name for name, path in self.tree.calls if path != b"/"]
                 self.tree.calls.clear()
                 return {"calls": names}
         return {}
