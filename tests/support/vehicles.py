@@ -67,6 +67,16 @@ def _is_free(port: int) -> bool:
     return True
 
 
+def has_ipv6() -> bool:
+    """Return whether this computer has IPv6: not every kernel and container has."""
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            probe.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
 def peak_memory(pid: int) -> int:
     """Return the largest resident size of a process so far, in bytes."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
