@@ -84,7 +84,7 @@ class Directory:
     """A remembered listing.
 
     entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
-    after that it proves nothing. complete: the vehicle listed it to its end.
+    after that it proves nothing. complete: the vehicle listed it to its end. end: see ListDirectory.
     sizes: what replies to opens told since; they beat the listing. growing: when a file was last seen to be
     larger than before, though we did not write it.
     """
@@ -94,6 +94,7 @@ class Directory:
     ended_at: float
     fresh_until: float
     complete: bool
+    end: int | None = None
     sizes: dict[bytes, int] = field(default_factory=dict)
     growing: dict[bytes, float] = field(default_factory=dict)
 
@@ -417,7 +418,10 @@ class Directories:
             self.sweeps += 1
             tries += 1
             try:
-                listing = await self._store.list_directory(path)
+                known = self._known.get(path)
+                listing = await self._store.list_directory(
+                    path, known_end=None if known is None else known.end
+                )
                 if not self._dot_refused and omits_files(path, listing.entries):
                     listing = await self._with_dot(listing)
             except FtpNak:  # perhaps the directory is gone: its parent is listed again
@@ -449,6 +453,7 @@ class Directories:
             listing.took + dot.took,
             listing.complete and dot.complete,
             listing.unshown + dot.unshown,
+            listing.end,
         )
 
     def begin(self, path: bytes) -> Sweep:
@@ -480,7 +485,7 @@ class Directories:
             life = max(DIR_TIMEOUT, COST_FACTOR * listing.took)
         if sweep.changes or sweep.void:
             life = 0.0
-        new = Directory(entries, sweep.began, now, now + life, listing.complete)
+        new = Directory(entries, sweep.began, now, now + life, listing.complete, listing.end)
         if old is not None:
             _see_growth(old, new, sweep)
         if not sweep.void:

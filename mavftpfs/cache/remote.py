@@ -85,8 +85,8 @@ class RemoteStore(Protocol):
         """Return whether another FTP client was heard lately."""
         ...
 
-    async def list_directory(self, path: bytes) -> Listing:
-        """Sweep a directory that is known to be one.
+    async def list_directory(self, path: bytes, *, known_end: int | None = None) -> Listing:
+        """Sweep a directory that is known to be one. known_end: the `end` of its last listing.
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, PathTooLong.

@@ -156,18 +156,29 @@ class ListDirectory(Operation):
 
     Only for paths known to be directories: listing a file kills a MAVSDK server.
 
+    ArduPilot and MAVSDK answer EOF at the offset of a name that fits no reply, too. So behind an EOF the next
+    offset is asked for, once. If it has names, the listing goes on there, and is not complete.
+
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
-        complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
+        complete: False when a cap, empty pages or a name that fits no reply hid something: absence of a name
+            then proves nothing.
+        end: the offset at which the server said EOF, and behind which it has nothing; None if not known.
         unshown: names that cannot be shown (with a slash, a tab, or unparsable).
         strings: how many strings were received so far, which is where the next page begins.
         on_page: called for each page, where it is not None.
 
+    known_end: the directory's `end` when it was listed before; there the next offset is not asked for.
     patience: as for Simple.
     """
 
-    def __init__(self, path: bytes, with_time: bool = False, patience: float = inf) -> None:
+    def __init__(
+        self, path: bytes, with_time: bool = False, patience: float = inf, *, known_end: int | None = None
+    ) -> None:
         self.patience = patience
+        self.end: int | None = None
+        self._known_end = known_end
+        self._beyond = False  # the offset behind an EOF was asked for
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
         self.entries: list[DirEntry] = []
@@ -199,8 +210,8 @@ class ListDirectory(Operation):
         if reply.opcode == Opcode.NAK:
             nak = nak_of(request, reply)
             # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
-            if nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages > 0):
-                self.finish()
+            if self._beyond or nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages):
+                self._on_eof()
             else:
                 self.fail(nak)
             return
@@ -209,6 +220,11 @@ class ListDirectory(Operation):
         if self.on_page is not None:
             self.on_page()
         page = parse_page(reply.data, with_time=self._with_time)
+        if self._beyond:
+            if not any(entry.name not in self._names for entry in page.entries):
+                self._on_eof()
+                return
+            self._beyond = self.complete = False
         if page.strings == 0:
             self._on_empty_page()
             return
@@ -236,6 +252,15 @@ class ListDirectory(Operation):
         ):
             self.complete = False
             self.finish()
+
+    def _on_eof(self) -> None:
+        """There is nothing at the offset: look behind it, or end."""
+        if not self._beyond and self.strings != self._known_end:
+            self.strings += 1
+            self._beyond, self._asked = True, False
+            return
+        self.end = self.strings - self._beyond if self.complete else None
+        self.finish()
 
     def _on_first_page_again(self) -> None:
         """The server seems to ignore the offset, so what is behind its first page is not known.

@@ -138,7 +138,7 @@ class Store:
 
     # --- reading
 
-    async def list_directory(self, path: bytes) -> Listing:
+    async def list_directory(self, path: bytes, *, known_end: int | None = None) -> Listing:
         """Sweep a directory (see RemoteStore). Opcode 16 is tried first; that it is refused, or not answered,
         counts only if opcode 3 then is."""
         wire, started, traits = wire_path(path), self._clock(), self.traits
@@ -148,7 +148,9 @@ class Store:
         if traits.lists_times is not False:
             with trio.move_on_after(inf if traits.lists_times else TIME_PROBE_LIMIT) as scope:
                 try:
-                    operation = await self._server.ask(partial(_asking_times, wire, traits, scope, tried))
+                    operation = await self._server.ask(
+                        partial(_asking_times, wire, known_end, traits, scope, tried)
+                    )
                     traits.lists_times = True
                 except FtpNak as nak:
                     if traits.lists_times or nak.code not in _NO_TIMES:
@@ -159,13 +161,16 @@ class Store:
                         raise
         if operation is None:
             left = max(1.0, self._op_deadline - (self._clock() - started)) if tried else inf
-            operation = await self._server.ask(partial(ListDirectory, wire, patience=left))
+            operation = await self._server.ask(
+                partial(ListDirectory, wire, patience=left, known_end=known_end)
+            )
             if tried and tried[-1].error is None:
                 traits.time_silences += tried[-1].sent  # it may have had to wait for its turn all the time
             if refused or traits.time_silences >= TIME_SILENCES:
                 traits.lists_times = False
         entries = tuple(operation.entries)
-        return Listing(entries, self._clock() - started, operation.complete, operation.unshown)
+        took = self._clock() - started
+        return Listing(entries, took, operation.complete, operation.unshown, operation.end)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
@@ -486,7 +491,7 @@ class Store:
 
 
 def _asking_times(
-    wire: bytes, traits: Traits, scope: trio.CancelScope, tried: list[ListDirectory]
+    wire: bytes, known_end: int | None, traits: Traits, scope: trio.CancelScope, tried: list[ListDirectory]
 ) -> ListDirectory:
     """Make a listing that ends the scope's deadline once it is answered, and remember it as tried."""
 
@@ -494,7 +499,7 @@ def _asking_times(
         traits.lists_times = True
         scope.deadline = inf
 
-    operation = ListDirectory(wire, with_time=True)
+    operation = ListDirectory(wire, with_time=True, known_end=known_end)
     operation.on_page = on_page
     tried.append(operation)
     return operation

@@ -45,14 +45,15 @@ class DirEntry:
 class Listing:
     """A whole directory, duplicates and unusable names removed.
 
-    took: seconds the sweep needed. complete: False when a cap ended it (absence then proves nothing).
-    unshown: how many names could not be shown.
+    took: seconds the sweep needed. complete: False when the vehicle did not show all (absence then proves
+    nothing). unshown: how many names could not be shown. end: see ListDirectory.
     """
 
     entries: tuple[DirEntry, ...]
     took: float
     complete: bool = True
     unshown: int = 0
+    end: int | None = None
 
 
 DOT = b"."

@@ -69,6 +69,49 @@ async def test_a_server_that_repeats_its_first_page_is_not_believed(
     assert "/d" in lines[0].getMessage()
 
 
+@pytest.mark.parametrize("profile", ["ardupilot", "littlefs", "mavsdk"])
+async def test_a_name_that_fits_no_reply_does_not_hide_those_behind_it(
+    profile: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Servers answer EOF at its offset; rsync --delete would remove the copies of what comes behind it."""
+    files = {b"/d/a": b"1", b"/d/b" + b"n" * 240: b"2"} | {b"/d/%c" % letter: b"3" for letter in b"cdef"}
+    async with rig(profile, files) as here:
+        tree = here.mount()
+        for _ in range(2):
+            with pytest.raises(ListingIncomplete) as error:
+                await tree.list(b"/d")
+            assert {b"a", b"e", b"f"} <= dict(error.value.entries).keys()
+            await trio.sleep(60.0)
+        assert (await tree.stat(b"/d/f")).size == 1
+        here.card.remove(here.root + b"/d/b" + b"n" * 240)
+        await trio.sleep(60.0)
+        assert set(dict(await tree.list(b"/d"))) == {b"a", b"c", b"d", b"e", b"f"}
+    assert len([line for line in caplog.messages if "not listed to its end" in line]) == 1
+
+
+@pytest.mark.parametrize("profile", KINDS)
+async def test_behind_the_end_of_a_directory_is_looked_once_and_again_when_its_entries_changed(
+    profile: str,
+) -> None:
+    asked: list[int] = []
+
+    def note(request: Payload) -> None:
+        if request.opcode in LISTS and request.data.startswith(b"/d\0"):
+            asked.append(request.offset)
+
+    async with rig(profile, {b"/d/a": b"1", b"/d/b": b"2"}) as here:
+        here.server.answer = note
+        tree = here.mount(dir_timeout=1.0)
+        for expected in ([0, 2, 3], [0, 2], [0, 2], [0, 3, 4], [0, 3]):
+            if expected == [0, 3, 4]:
+                here.put(b"/d/c", b"3")
+            asked.clear()
+            await tree.list(b"/d")
+            dots = asked[1] - expected[1]  # `.` and `..` count, too
+            assert asked == [0, *(offset + dots for offset in expected[1:])]
+            await trio.sleep(5.0)
+
+
 async def test_a_name_that_an_incomplete_listing_lacks_is_an_error_and_not_absent() -> None:
     async with rig(files=SIXTY) as here:
         FirstPageAgain(here, 60)

@@ -58,7 +58,7 @@ class Copy:
         self.rig = Rig(profile, link=link, serial=serial)
         self.keeps = not PROFILES[profile].write_only_truncates
         self.root = ROOTS.get(profile, b"") + b"/d"
-        self.size = int((samples * 1.35 + BEFORE) * link.rate)
+        self.size = int((samples * 1.7 + BEFORE) * link.rate)
         self.data = content(self.size, 2)  # zeros would not be sent
         self.rig.card.add(self.root + b"/big", self.data)
         for number in range(samples):
@@ -136,7 +136,7 @@ LINKS = {
 ROUND_TRIPS = {"download": 3, "upload": 4}
 """Round trips of the bound, by the way that the copy goes."""
 
-FRAMES = {"ls": 2, "read": 3}
+FRAMES = {"ls": 3, "read": 3}
 """What somebody does beside the copy, and how many full frames it takes."""
 
 DOWNLOADS = [

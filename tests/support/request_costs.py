@@ -114,14 +114,15 @@ TWICE = f"{GIT} status --short; {GIT} status --short"
 
 CASES = (
     FIRST,
-    # What changes nothing. The second request of each directory tells that there is no more.
-    Case("ls -l cold", "ls -l ten", "list 4", prepare=ten),
+    # What changes nothing. The second request of each directory tells that there is no more, the third that
+    # nothing is hidden behind a name that fits no reply: at first, and when the number of names changed.
+    Case("ls -l cold", "ls -l ten", "list 6", prepare=ten),
     Case("ls -l cached", "ls -l ten", "0", "ls -l ten", ten),
     Case("cat cold", "cat f > /dev/null", "open 1, read 2, close 1; 300 B", "ls -l", small),
     Case("cat warm", "cat f > /dev/null", "0", "cat f > /dev/null", small),
     Case("stat known names", f"{STAT_STORM} ten/ 10", "0", "ls -l ten", ten),
     Case("stat unknown names", f"{STAT_STORM} ten/no 1000", "0", "ls -l ten", ten),
-    Case("find cold", "find tree > /dev/null", "list 14", prepare=tree),
+    Case("find cold", "find tree > /dev/null", "list 21", prepare=tree),
     Case("find cached", "find tree > /dev/null", "0", "find tree > /dev/null", tree),
     Case("cp 10 files from it", 'cp ten/* "$1"/', "open 10, read 20, close 10; 3000 B", "ls -l ten", ten),
     Case("df", "df . > /dev/null", "0", prepare=small),
@@ -137,7 +138,7 @@ CASES = (
     Case("mkdir", "mkdir d", "mkdir 1", "ls -l"),
     Case("mv", "mv f g", "rename 1", "ls -l", small),
     Case("rm", "rm f", "remove 1", "ls -l", small),
-    Case("rm -r", "rm -r ten", "list 2, remove 10, rmdir 1", "ls -l ten", ten),
+    Case("rm -r", "rm -r ten", "list 3, remove 10, rmdir 1", "ls -l ten", ten),
     Case("vim save", VIM, f"{REWRITE}, crc 1, rename 1; 603 B", "ls -l", small),
     Case("cp 10 files to it", "cp ten/* .", TEN, "cat ten/* > /dev/null; ls -l", ten, aged=True),
     # Programs that look at everything.
@@ -145,15 +146,16 @@ CASES = (
     # It makes a lock, and removes it.
     Case("git status again", f"{GIT} status --short", LOCK, TWICE, repository, aged=True),
 )
-COSTS = {case.name: case.cost for case in CASES} | {MOUNT: "list 3, open 1"}
+COSTS = {case.name: case.cost for case in CASES} | {MOUNT: "list 4, open 1"}
 # One listing tries opcode 16, the open whether there are parameters.
 REPLACED = "rename 2, remove 1"  # FAT does not rename over a file, and NuttX removes it first
-TIMED = f"list 2, {REWRITE}, crc 1"
-"""Where listings tell times, one of them compares the old file."""
+TIMED = f"list 3, {REWRITE}, crc 1"
+"""Where listings tell times, one of them compares the old file. It shows the new one beside it, so it is also
+asked what is behind its end."""
 
 FAT = {
     "echo > old": f"create 1, write 1, close 1, crc 1, {REPLACED}; 2 B",
-    "rm -r": "list 1, remove 10, rmdir 1",
+    "rm -r": "list 2, remove 10, rmdir 1",
     "vim save": f"{REWRITE}, crc 1, {REPLACED}; 603 B",
 }
 ELSEWHERE = {
@@ -162,19 +164,19 @@ ELSEWHERE = {
         "first append": f"{REWRITE}, crc 3, {REPLACED}; 602 B",
         "echo >>": f"{REWRITE}, crc 2, {REPLACED}; 602 B",
     },
-    "ardupilot": {MOUNT: "list 5"},  # "/" shows no files, so "." is listed too
+    "ardupilot": {MOUNT: "list 7"},  # "/" shows no files, so "." is listed too
     "ardupilot5": {
         **FAT,
-        MOUNT: "list 4",
+        MOUNT: "list 6",
         # That it does not rename over a file is learnt, and the names are looked at after the refusal.
-        "first append": f"list 4, {REWRITE}, crc 2, rename 3, remove 1; 602 B",
+        "first append": f"list 6, {REWRITE}, crc 2, rename 3, remove 1; 602 B",
         "echo >>": f"{TIMED}, {REPLACED}; 602 B",
     },
     "mavsdk": {
-        MOUNT: "list 2, open 1",
-        "first append": f"list 2, {REWRITE}, crc 2, rename 1; 602 B",
+        MOUNT: "list 3, open 1",
+        "first append": f"list 3, {REWRITE}, crc 2, rename 1; 602 B",
         "echo >>": f"{TIMED}, rename 1; 602 B",
-        "rm -r": "list 1, remove 10, rmdir 1",
+        "rm -r": "list 2, remove 10, rmdir 1",
     },
 }
 """Where a server needs something else."""

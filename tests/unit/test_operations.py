@@ -160,8 +160,8 @@ def test_unusable_names_are_hidden_and_counted(text: bytes) -> None:
 class Lister:
     """Answers the pages of one sweep."""
 
-    def __init__(self) -> None:
-        self.op = ListDirectory(b"/d")
+    def __init__(self, known_end: int | None = None) -> None:
+        self.op = ListDirectory(b"/d", known_end=known_end)
         self.engine = Engine(random.Random(1), Flow())
         self.engine.start(self.op, 0.0)
         self.offsets: list[int] = []
@@ -189,7 +189,9 @@ def test_pages_are_counted_by_their_non_empty_strings() -> None:
     lister.page(b"S\0S\0Fa\t1\0\0Db\0\0")
     lister.page(b"Fc\t3", offset=0)
     lister.end(NakCode.EOF)
-    assert lister.offsets == [0, 4, 5]
+    lister.end(NakCode.EOF)
+    assert lister.offsets == [0, 4, 5, 6]
+    assert lister.op.end == 5
     assert lister.op.entries == [
         DirEntry(b"a", EntryKind.FILE, 1),
         DirEntry(b"b", EntryKind.DIRECTORY),
@@ -206,9 +208,10 @@ def test_repeats_are_dropped_and_bad_names_counted() -> None:
     lister.page(b"Fa\t1\0Fa\t1\0Fx/y\t1\0D.\0")
     lister.page(b"Fa\t1\0Fb\t1\0")
     lister.end(NakCode.EOF)
+    lister.end(NakCode.EOF)
     assert lister.names == [b"a", b"b"]
     assert lister.op.unshown == 1
-    assert lister.offsets == [0, 4, 6]
+    assert lister.offsets == [0, 4, 6, 7]
 
 
 @pytest.mark.holds("rule 14.29")
@@ -216,6 +219,8 @@ def test_eight_ends_a_sweep_only_behind_a_page() -> None:
     lister = Lister()
     lister.page(b"Fa\t1\0")
     lister.end(NakCode.FILE_EXISTS)
+    lister.end(NakCode.FILE_EXISTS)
+    assert lister.op.done
     assert lister.op.error is None
     lister = Lister()
     lister.end(NakCode.FILE_EXISTS)
@@ -235,6 +240,47 @@ def test_an_entry_that_fits_no_page_is_stepped_over_and_several_prove_no_end() -
     assert lister.names == [b"a", b"b"]
     assert lister.op.done
     assert not lister.op.complete
+
+
+@pytest.mark.holds("fault odd listing", "promise 10")
+def test_names_behind_an_early_eof_are_shown_and_prove_that_the_listing_is_not_complete() -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.EOF)  # a name is here that fits no reply
+    lister.page(b"Fb\t1\0Fc\t1\0")
+    lister.end(NakCode.EOF)  # another one
+    lister.page(b"Fd\t1\0")
+    for _ in range(2):
+        lister.end(NakCode.EOF)
+    assert lister.offsets == [0, 1, 2, 4, 5, 6, 7]
+    assert lister.names == [b"a", b"b", b"c", b"d"]
+    assert lister.op.done
+    assert not lister.op.complete
+    assert lister.op.end is None
+
+
+@pytest.mark.holds("fault odd listing")
+@pytest.mark.parametrize("again", [b"", b"Fa\t1\0", b"S\0"])
+def test_an_old_name_or_none_behind_the_end_proves_nothing(again: bytes) -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.EOF)
+    lister.page(again)
+    assert lister.op.done
+    assert lister.op.complete
+    assert lister.op.end == 1
+
+
+def test_behind_a_known_end_nothing_is_asked_for() -> None:
+    lister = Lister(known_end=1)
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.EOF)
+    assert lister.offsets == [0, 1]
+    assert (lister.op.done, lister.op.complete, lister.op.end) == (True, True, 1)
+    lister = Lister(known_end=2)
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.EOF)
+    assert not lister.op.done, "the number of its names changed"
 
 
 @pytest.mark.holds("rule 14.29")
