@@ -8,6 +8,7 @@ parsers.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import shlex
@@ -62,6 +63,11 @@ UNITS = ("mavftpfs@.service", "mavftpfs-sync@.service")
 SYSTEMD_RUNS = Path("/run/systemd/system")
 
 
+FOR_ALL = "sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
+"""Makes a copy of the program that is root's, and that all can run."""
+NOBODY = 65534
+"""A user id without any rights of its own."""
+
 MARK = "# Made by mavftpfs install."
 """In our programs, which tells them from those of others with the same name."""
 
@@ -113,7 +119,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
     Raises:
         UsageError: a file cannot be written or removed, or other users than root could change the program
-            that all run.
+            that all run, or could not run it.
     """
     program = own_program()
     everybody = os.geteuid() == 0
@@ -123,6 +129,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
         return ExitCode.OK
     if everybody and not args.remove:
         check_program(program)
+        check_others(program)
     for piece in pieces:
         if piece.is_others() or (args.remove and not piece.is_there()):
             continue
@@ -161,8 +168,61 @@ def check_program(program: Path) -> None:
             if facts.st_uid != 0 or open_to_all:
                 raise UsageError(
                     f"{path} can be changed by others than root, but root would run it; install a copy "
-                    "of its own: sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
+                    f"of its own: {FOR_ALL}"
                 )
+
+
+def check_others(program: Path) -> None:
+    """Check that other users can run the program, by running it as `nobody`.
+
+    Raises:
+        UsageError: they cannot; the text says why, if a mode tells.
+    """
+    words = [str(program), "--version"]
+    try:
+        done = subprocess.run(
+            words,
+            user=NOBODY,
+            group=NOBODY,
+            extra_groups=(),
+            cwd="/",
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    except OSError as exc:
+        if exc.errno != errno.EACCES:  # nobody is no user of this container
+            return
+        said = exc.strerror or ""
+    else:
+        if done.returncode == 0:
+            return
+        said = (done.stderr.splitlines() or [""])[-1]
+    closed = _closed_to_others(program)
+    why = said if closed is None else f"{closed} is closed to them ({_mode(closed)})"
+    raise UsageError(f"other users could not run {program}: {why}; install a copy for all users: {FOR_ALL}")
+
+
+def _closed_to_others(program: Path) -> Path | None:
+    """Return the first file or directory that other users need for a program and may not use."""
+    python = _interpreter(program)
+    for place in (program, python, Path(os.path.realpath(python)), Path(mavftpfs.__file__)):
+        for path in (*reversed(place.parents), place):
+            needed = stat.S_IXOTH if path.is_dir() else stat.S_IROTH
+            if not path.stat().st_mode & needed:
+                return path
+    return None
+
+
+def _interpreter(program: Path) -> Path:
+    """Return what the first line of a script names; our own Python, if there is no such line."""
+    with program.open("rb") as file:
+        mark, words = file.read(2), file.readline().split()
+    return Path(os.fsdecode(words[0])) if mark == b"#!" and words else Path(sys.executable)
+
+
+def _mode(path: Path) -> str:
+    return f"mode {stat.S_IMODE(path.stat().st_mode):04o}"
 
 
 def for_user(

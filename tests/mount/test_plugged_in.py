@@ -3,11 +3,16 @@ simulated serial port; and install, remove, install, upgrade and uninstall, as r
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
+import stat
 import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -79,6 +84,21 @@ written() { (cd "$1/up" && find . -type f -o -type l | sort | sed "s,^,$2 ,"); }
 """
 
 
+def closed_directories() -> list[Path]:
+    """Return the directories above these tests' Python that are closed to other users, the topmost first."""
+    python = Path(sys.executable)
+    above = {*python.parents, *python.resolve().parents}
+    return sorted(path for path in above if not path.stat().st_mode & stat.S_IXOTH)
+
+
+def opened(place: Path) -> str:
+    """Return the lines of a script that show a directory with another mode."""
+    own = f"$1/open{str(place).replace('/', '-')}"
+    where = shlex.quote(str(place))
+    layers = f'"lowerdir={place},upperdir={own}/up,workdir={own}/work"'
+    return f'mkdir -p "{own}/up" "{own}/work"\nmount -t overlay none -o {layers} {where}'
+
+
 class Installation:
     """A program that root installed, run in a namespace whose /usr/local, /usr/sbin and /etc are copies."""
 
@@ -89,8 +109,9 @@ class Installation:
         install_programs(self.programs, self.packages)
 
     def run(self, *steps: str, code: int = 0) -> dict[str, list[str]]:
-        """Run the steps of a script; return what its lines say, by their first words."""
-        script = "\n".join([IN_A_NAMESPACE, *steps])
+        """Run the steps of a script; return what its lines say, by their first words. All users can run these
+        tests' Python there, wherever it lies."""
+        script = "\n".join([IN_A_NAMESPACE, *map(opened, closed_directories()), *steps])
         places = map(str, (self.copy, self.programs, self.packages))
         command = ["unshare", "--mount", "sh", "-c", script, "sh", *places]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
@@ -103,9 +124,11 @@ class Installation:
 
 
 @pytest.fixture
-def installation(tmp_path: Path) -> Installation:
-    """One that is not installed yet."""
-    return Installation(tmp_path)
+def installation() -> Iterator[Installation]:
+    """One that is not installed yet, where all users can run it: pytest's own directories are closed."""
+    with TemporaryDirectory(prefix="mavftpfs-", dir="/tmp") as folder:
+        os.chmod(folder, 0o755)
+        yield Installation(Path(folder))
 
 
 CHECK = 'mount.mavftpfs -f udpin:127.0.0.1:14550 /mnt && echo "version $(/usr/local/bin/mavftpfs --version)"'
@@ -163,3 +186,32 @@ def test_root_does_not_run_what_another_user_owns(installation: Installation, pl
     (line,) = said["error"]
     assert "can be changed by others than root" in line
     assert "PIPX_HOME" in line
+
+
+@pytest.mark.needs("namespaces", "root's Python")
+@pytest.mark.parametrize(
+    ("close", "reason"),
+    [
+        (['chmod 700 "$2"'], "/bin is closed to them (mode 0700)"),
+        (
+            [
+                'mkdir -m 700 "$1/closed"',
+                f'printf \'#!/bin/sh\\nexec {sys.executable} "$@"\\n\' > "$1/closed/python"',
+                'chmod 755 "$1/closed/python"',
+                'sed -i "1s,.*,#!$1/closed/python," "$2/mavftpfs"',
+            ],
+            "/closed is closed to them (mode 0700)",
+        ),
+    ],
+    ids=["program", "interpreter"],
+)
+def test_root_installs_nothing_that_others_could_not_run(
+    installation: Installation, close: list[str], reason: str
+) -> None:
+    steps = (*close, "trap 'written \"$1\" left' EXIT", '"$2/mavftpfs" install')
+    said = installation.run(*steps, code=1)
+    assert "left" not in said
+    (line,) = said["error"]
+    assert line.startswith("mavftpfs: other users could not run ")
+    assert reason in line
+    assert "install a copy for all users: sudo PIPX_HOME=/opt/pipx" in line
