@@ -342,6 +342,13 @@ class Files:
         for version in [v for v in self.open_versions if v.path == path and not v.replaced]:
             self.kill(version)
 
+    def close_readers(self, path: bytes) -> None:
+        """Close what is open on the vehicle of a path that the caller holds alone, and is about to change in
+        several steps. Reads that wait open it again after that."""
+        for version in self._at_or_below(path):
+            version.close_reader()
+            version.ask_again()
+
     def on_changed(self, path: bytes) -> None:
         """Note that we wrote or removed the file of a path and those below it, or may have. Handles of
         the old file open the path again."""

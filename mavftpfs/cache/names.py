@@ -131,8 +131,7 @@ class Names:
     async def require_empty(self, path: bytes) -> None:
         """Check by a new listing that a directory is empty.
 
-        A directory that looks empty may hold reserved names: those of an unlinked file that a program here
-        has open, or those of another mount that may be at work.
+        A directory that looks empty may hold reserved names, of another mount that may be at work.
 
         Raises:
             DirectoryNotEmpty; FileBusy: only reserved names are in it. Else as Directories.ask.
@@ -143,7 +142,7 @@ class Names:
         if not all(is_reserved(name) for name in names):
             raise DirectoryNotEmpty(f"{path!r} is not empty")
         if names:
-            raise FileBusy(f"{path!r} holds files that are open, or temporary files of another mount")
+            raise FileBusy(f"{path!r} holds temporary files, perhaps of another mount")
 
     # --- changing
 
@@ -281,11 +280,8 @@ class Names:
 
     # --- giving a verified file its name
 
-    async def replace(self, source: bytes, target: bytes, *, leave_aside: bool = False) -> bytes | None:
+    async def replace(self, source: bytes, target: bytes) -> None:
         """Rename over a file that exists.
-
-        leave_aside: do not remove the old file. Return its reserved name, which is in `OwnNames.in_use`; None
-        if it was gone.
 
         One rename is enough where the server never leaves the name without a file. NuttX removes the old file
         first (servers.md 9).
@@ -295,11 +291,11 @@ class Names:
             has its name again, unless the replacement is unfinished.
         """
         traits = self._context.store.traits
-        if not leave_aside and traits.rename_replaces is not False and not is_on_nuttx(target):
+        if traits.rename_replaces is not False and not is_on_nuttx(target):
             try:
                 await self.rename(source, target, over=True)
                 traits.rename_replaces = True
-                return None
+                return
             except FtpNak as nak:
                 if errno_for(nak) in _HONEST:
                     raise
@@ -313,11 +309,10 @@ class Names:
         stays = False
         try:
             if await self._swap(source, target, aside):
-                stays = leave_aside or await self._discard_old(target, aside)
+                stays = await self._discard_old(target, aside)
         finally:
             if not stays:
                 own.in_use.discard(aside)
-        return aside if stays and leave_aside else None
 
     def on_unknown(self, *paths: bytes) -> None:
         """Note that it is not known what these names are after an interrupted change: the listings and files

@@ -4,9 +4,8 @@ Servers check little: some remove files by rmdir, or move into directories by re
 and targets are looked up in listings first. A change holds its paths alone (`pathlocks`). A rename first
 delivers the drafts of what it moves.
 
-A program that has a file open reads on when the file loses its name. If the file was written here whole, its
-bytes are here. Else it is hidden: it stays on the vehicle under a reserved name until its last handle is
-closed. Where the card cannot rename (LittleFS), the change of the name is refused (unlink: EBUSY; mv: EXDEV).
+When a file loses its name, the vehicle has it no more. Programs that have it open go on with what was written
+here; to read any other byte of it is ESTALE.
 """
 
 from __future__ import annotations
@@ -19,20 +18,17 @@ import trio
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
+from mavftpfs.cache.reserved import fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     FileBusy,
-    FtpNak,
     InvalidMove,
     IsADirectory,
     NotADirectory,
     NotFound,
     NotSupported,
     OutcomeUnknown,
-    PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
 
@@ -95,18 +91,6 @@ class Namespace:
         async with claimed, self._context.paths.hold(old, new):
             await self._rename(old, new, noreplace=noreplace)
 
-    async def release(self, node: Node) -> None:
-        """Remove an unlinked file from the vehicle, because its last handle was closed. If that fails, it is
-        removed after the next listing of its directory."""
-        node.forget_draft()
-        if not node.hidden:
-            return
-        async with self._context.paths.steady(node) as path:  # a directory above it may be about to move
-            self._context.nodes.forget_hidden(node)
-            self._context.own.in_use.discard(path)
-            await self._names.discard(path)
-            self._context.files.on_changed(path)
-
     @asynccontextmanager
     async def _claim(self, path: bytes) -> AsyncIterator[None]:
         """Claim the file of a path, if it is open or not delivered, for a body that takes its name away."""
@@ -158,9 +142,6 @@ class Namespace:
         await self._names.purge(path)
         if there:
             async with self._looks_later(path):
-                if node is not None and node.needs_card:
-                    await self._hide(node)
-                    return
                 await self._names.remove_if_there(path)
                 context.files.on_changed(path)
         if node is not None:
@@ -212,8 +193,7 @@ class Namespace:
         self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
-        """Rename on the vehicle. listed: what it has at `new`, which is replaced; programs that have it open
-        keep it."""
+        """Rename on the vehicle. listed: what it has at `new`, which is replaced."""
         context, displaced = self._context, self._context.nodes.get(new)
         for node in context.nodes.below(old):
             await self._deliverer.abandon(node)
@@ -222,49 +202,16 @@ class Namespace:
         if displaced is not None:
             await self._deliverer.abandon(displaced)
         await self._names.purge(old)
-        needed = displaced is not None and displaced.needs_card
         try:
             async with self._looks_later(old, new):
                 if listed is not None and listed.kind is EntryKind.FILE:
-                    aside = await self._names.replace(old, new, leave_aside=needed)
-                    if aside is not None and displaced is not None:
-                        await self._on_hidden(displaced, aside)
+                    context.files.close_readers(new)
+                    await self._names.replace(old, new)
                 else:
                     if listed is not None:
                         await self._names.remove_directory(new)
                     await self._names.rename(old, new)
         except NotSupported as error:
             raise CrossDevice(str(error)) from error
-        if displaced is not None and not displaced.removed:
+        if displaced is not None:
             context.nodes.unnamed(displaced)
-
-    # --- inside: open files that lose their names
-
-    async def _hide(self, node: Node) -> None:
-        """Keep an unlinked file on the vehicle under a reserved name as long as a program has it open.
-
-        Raises:
-            FileBusy: the card cannot do that. Else as VehicleStore.rename.
-        """
-        own, path = self._context.own, node.path
-        try:
-            hidden = own.beside(path, Kind.DELETED)
-        except PathTooLong as error:
-            raise FileBusy(f"{path!r} is open, and its path is too long to keep it: {error}") from error
-        own.in_use.add(hidden)
-        try:
-            await self._names.rename(path, hidden)
-        except BaseException as error:
-            own.in_use.discard(hidden)
-            if isinstance(error, FtpNak | NotSupported):
-                raise FileBusy(f"{path!r} is open, and this card cannot keep it: {error}") from error
-            raise
-        await self._on_hidden(node, hidden)
-
-    async def _on_hidden(self, node: Node, hidden: bytes) -> None:
-        """Note that a file was renamed to a reserved name. Its handles read it there."""
-        node.lose_name()
-        self._context.files.on_renamed(node.path, hidden)
-        self._context.nodes.hide(node, hidden)
-        if not node.handles:  # the last handle was closed meanwhile
-            await self.release(node)

@@ -50,16 +50,15 @@ class Attempt:
 class Node:
     """One file.
 
-    path: its name, or the reserved name that it was hidden under. draft: its content here, if it was
-    written. handles: how many are open; writers: how many of them are for writing. generation: counts how
-    often it was delivered; delivered_since_open: since its first writer opened it. removed: it has no name
-    any more. hidden: it was unlinked while it was open, and is still on the vehicle under a reserved name.
-    error: why the last delivery failed. attempt: the present attempt to deliver it. base_handle: on the
-    vehicle's file below the draft. start_after: no upload begins by itself before that time (infinite: only
-    a close sends the file). proven_at: when the vehicle was last proven to have what the draft says it has.
-    lock: a program writes the file, a delivery is under way, or a call takes its name away. delivery: the
-    scope of the delivery under way. claims: how many calls wait for the lock to take its name or content
-    away; they go before deliveries.
+    path: its name, or its last one. draft: its content here, if it was written. handles: how many are open;
+    writers: how many of them are for writing. generation: counts how often it was delivered;
+    delivered_since_open: since its first writer opened it. removed: it has no name any more. error: why the
+    last delivery failed. attempt: the present attempt to deliver it. base_handle: on the vehicle's file below
+    the draft. start_after: no upload begins by itself before that time (infinite: only a close sends the
+    file). proven_at: when the vehicle was last proven to have what the draft says it has. lock: a program
+    writes the file, a delivery is under way, or a call takes its name away. delivery: the scope of the
+    delivery under way. claims: how many calls wait for the lock to take its name or content away; they go
+    before deliveries.
     """
 
     path: bytes
@@ -69,7 +68,6 @@ class Node:
     generation: int = 0
     delivered_since_open: bool = False
     removed: bool = False
-    hidden: bool = False
     error: MavftpfsError | None = None
     attempt: Attempt | None = None
     base_handle: OpenFile | None = None
@@ -109,15 +107,9 @@ class Node:
         finally:
             self.lock.release()
 
-    @property
-    def needs_card(self) -> bool:
-        """Whether a program has it open, and only the card has all of its bytes."""
-        return self.handles > 0 and not (self.draft is not None and self.draft.whole)
-
     def require_reachable(self) -> None:
-        """Raise FileChanged if the file was replaced or removed, and is not hidden: its path may be another
-        file's."""
-        if self.removed and not self.hidden:
+        """Raise FileChanged if the file was replaced or removed: its path may be another file's."""
+        if self.removed:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
     def require_not_stale(self) -> None:
@@ -155,16 +147,15 @@ class Node:
 
 
 class Nodes:
-    """All nodes that have a name, and those that are hidden.
+    """All nodes that have a name.
 
     Attributes:
-        hidden: by their reserved names. replacements: the records of files that we replace.
+        replacements: the records of files that we replace.
     """
 
     def __init__(self) -> None:
         self.replacements = Replacements()
         self._by_path: dict[bytes, Node] = {}
-        self.hidden: dict[bytes, Node] = {}
         self._stale: list[Node] = []
 
     def __iter__(self) -> Iterator[Node]:
@@ -242,23 +233,10 @@ class Nodes:
         """Return whether a file is still open that had this path before another file got it."""
         return any(node.path == path and node.handles for node in self._stale)
 
-    def hide(self, node: Node, path: bytes) -> None:
-        """Give the node of an unlinked file the reserved name `path`."""
-        self.detach(node)
-        self.hidden.pop(node.path, None)
-        node.path, node.hidden = path, True
-        self.hidden[path] = node
-
-    def forget_hidden(self, node: Node) -> None:
-        """Forget a hidden file: it is removed, or left to the next listing."""
-        node.hidden = False
-        self.hidden.pop(node.path, None)
-
     def rename(self, old: bytes, new: bytes) -> None:
         """Move the nodes at `old` and below it to `new`, which must have no nodes."""
-        for nodes in (self._by_path, self.hidden):
-            rename_keys(nodes, old, new)
-            for path, node in nodes.items():
-                node.path = path
-                if node.draft is not None and not node.removed:
-                    node.draft.content.name = path
+        rename_keys(self._by_path, old, new)
+        for path, node in self._by_path.items():
+            node.path = path
+            if node.draft is not None:
+                node.draft.content.name = path

@@ -1,7 +1,7 @@
 """What becomes of reserved names that an interruption left on the card. Layer: cache.
 
 `leftovers` finds them in a listing, `Cleaner` acts on each:
-  what was sent, or unlinked     is removed: no close() reported it to be on the card
+  what was sent                  is removed: no close() reported it to be on the card
   an old file, its name there    is removed: the new one has the name
   an old file, its name missing  gets its name again
   an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy

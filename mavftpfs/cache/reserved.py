@@ -3,8 +3,7 @@
 A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is the token of the mount that made
 it, SSS counts, and the kind k is
   n  what is sent of a file, perhaps incomplete;
-  o  the old file of NAME, moved aside until the new one has its name;
-  d  a file that was unlinked while a program has it open.
+  o  the old file of NAME, moved aside until the new one has its name.
 It lies beside the file that it belongs to. Only o tells its NAME, if that fits: a rename carries both paths
 in one request of 238 bytes.
 
@@ -33,7 +32,7 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([nod])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([no])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
 _OWNER_LENGTH = 4
 
@@ -43,7 +42,6 @@ class Kind(Enum):
 
     NEW = b"n"
     OLD = b"o"
-    DELETED = b"d"
 
 
 @dataclass(frozen=True, slots=True)

@@ -349,7 +349,7 @@ class Tree:
         await self._writing.namespace.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
-        """Remove a file; programs that have it open go on reading it.
+        """Remove a file; programs that have it open go on with what was written here.
 
         Raises:
             NotFound, IsADirectory, Armed, FileBusy.

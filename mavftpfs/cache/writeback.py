@@ -94,7 +94,7 @@ class Writeback:
         self._nursery = nursery
         self._retrying, self._news = False, trio.Event()
         self.namespace = Namespace(context, names, deliverer)
-        self._parts = Parts(context, deliverer, throttle, self.namespace)
+        self._parts = Parts(context, deliverer, throttle)
 
     # --- opening
 

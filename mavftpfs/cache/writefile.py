@@ -16,7 +16,6 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import Draft, State, Where
 from mavftpfs.cache.files import VersionHandle
-from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import Throttle
@@ -39,7 +38,6 @@ class Parts:
     context: Context
     deliverer: Deliverer
     throttle: Throttle
-    namespace: Namespace
 
 
 class ReadFile(OpenFile):
@@ -100,8 +98,7 @@ class ReadFile(OpenFile):
         await self._parts.deliverer.deliver(self._node)
 
     async def release(self) -> None:
-        """Deliver what was written by this handle, and close it. What could not be delivered stays held; the
-        last handle of an unlinked file has it removed.
+        """Deliver what was written by this handle, and close it. What could not be delivered stays held.
 
         Raises:
             Why it is not delivered.
@@ -112,7 +109,7 @@ class ReadFile(OpenFile):
             if self.writable:
                 await self._parts.deliverer.deliver(self._node)
         finally:
-            await self._let_go()
+            self.close()
 
     def close(self) -> None:
         """Close without delivering; closing twice is harmless."""
@@ -124,7 +121,10 @@ class ReadFile(OpenFile):
         node = self._node
         node.handles -= 1
         node.writers -= self.writable
-        if node.handles or node.removed:
+        if node.handles:
+            return
+        if node.removed:
+            node.forget_draft()
             return
         draft, context = node.draft, self._context
         if draft is not None and draft.state is State.CLEAN and not node.lock.locked() and draft.whole:
@@ -136,13 +136,6 @@ class ReadFile(OpenFile):
         context.nodes.maybe_forget(node)
 
     # --- inside
-
-    async def _let_go(self) -> None:
-        """Close; the last handle of an unlinked file has it removed."""
-        if not self._closed:
-            self.close()
-            if self._node.removed and not self._node.handles:
-                await self._parts.namespace.release(self._node)
 
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
@@ -229,7 +222,7 @@ class WriteFile(ReadFile):
         try:
             return await self._parts.deliverer.withdraw(self._node)
         finally:
-            await self._let_go()
+            self.close()
 
     # --- inside
 

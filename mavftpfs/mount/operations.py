@@ -286,7 +286,7 @@ class Operations(pyfuse3.Operations):
         if handle is None:
             return
         try:
-            await handle.file.release()  # also of a reader: the last one of an unlinked file has it removed
+            await handle.file.release()
         except MavftpfsError as exc:
             log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
 

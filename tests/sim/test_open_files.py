@@ -29,7 +29,7 @@ from mavftpfs.shared.errors import (
     ReadOnly,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.rigs import Rig, card, rig, write_file
+from tests.support.rigs import KINDS, RENAMING, Rig, card, rig, write_file
 from tests.support.transfers import content
 
 DATA = bytes(range(256)) * 300
@@ -215,23 +215,30 @@ async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(here: Ri
 # --- files that lose their name: on the card
 
 
-async def test_a_file_that_is_read_is_hidden_until_it_is_closed(here: Rig, tree: Tree) -> None:
-    here.put(FILE, DATA * 5)
-    file = await tree.open(FILE)
-    assert await file.read(0, 10) == DATA[:10]
-    await tree.unlink(FILE)
-    (hidden,) = here.files()
-    assert here.litter() == [hidden]
-    assert await tree.list(b"/d") == []
-    with pytest.raises(NotFound):
-        await tree.stat(hidden)
-    with pytest.raises(FileBusy):
-        await tree.rmdir(b"/d")
-    await tree.rename(b"/d", b"/e")
-    assert await file.read(0, len(DATA) * 5) == DATA * 5
-    await file.release()
-    assert here.files() == {}
-    await tree.rmdir(b"/e")
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize(
+    ("how", "profile"), [("unlink", each) for each in KINDS] + [("rename over", each) for each in RENAMING]
+)
+async def test_a_file_that_lost_its_name_reads_no_other_file(how: str, profile: str) -> None:
+    """Its bytes are on no card any more. What has the name by now has as many."""
+    async with rig(profile, {FILE: DATA * 5, OTHER: DATA[::-1] * 5}, link=LinkSettings(delay=0.05)) as here:
+        tree = here.mount()
+        reader, writer = await tree.open(FILE), await tree.open(FILE, write=True)
+        assert await reader.read(0, 10) == DATA[:10]
+        await writer.write(3, b"here")
+        if how == "unlink":
+            await tree.unlink(FILE)
+            with pytest.raises(NotFound):
+                await tree.stat(FILE)
+        else:
+            await tree.rename(OTHER, FILE, noreplace=False)
+        assert here.litter() == []
+        assert await writer.read(3, 4) == b"here"
+        for handle in (reader, writer):
+            with pytest.raises(FileChanged):
+                await handle.read(100_000, 10)
+            await handle.release()
+        assert tree.status()["bytes_held"] == 0
 
 
 async def test_open_files_below_a_renamed_directory_follow(here: Rig, tree: Tree) -> None:
@@ -465,3 +472,25 @@ async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open
         await tree.list(b"/d")
     assert bytes(await writer.read(0, 900)) == b"mid" + OLD[3:]
     await writer.release()
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
+async def test_while_another_file_gets_its_name_in_three_steps_the_name_is_not_opened(profile: str) -> None:
+    """A read that waits would be answered from the other file, which has the same size."""
+    async with rig(profile, {FILE: DATA, OTHER: DATA[::-1]}, link=LinkSettings(delay=0.05)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE)
+        assert await file.read(0, 10) == DATA[:10]
+        here.faults.ignore(Opcode.READ_FILE)
+
+        async def read() -> None:
+            with pytest.raises(FileChanged):
+                await file.read(40_000, 1000)
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(read)
+            await trio.sleep(0.01)
+            await tree.rename(OTHER, FILE)
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
+        await file.release()
