@@ -37,6 +37,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NoSpace,
     NotSupported,
+    NotVerified,
     OutcomeUnknown,
     RemoteProtocolError,
     RequestTimeout,
@@ -67,7 +68,7 @@ a mount: finding out costs four requests on every card."""
 START_PAUSE = 5.0
 """Seconds after which an upload that could not begin is tried again."""
 
-PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, Armed)
+PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, NotVerified, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 

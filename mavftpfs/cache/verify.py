@@ -4,7 +4,7 @@ Files up to verify_max are compared by the vehicle's CRC32; in doubt, and with v
 A CRC32 covers the whole file, so the right one proves the size, too. Only zeros at the beginning of a file do
 not change it (servers.md 10): a file of nothing but zeros has the CRC32 0. So if it is 0, or if the vehicle
 told none, the file is opened to learn its size. A file without a CRC32 counts as verified by size; that is
-logged and counted. In doubt it is read back instead, past every cache.
+logged and counted. In doubt it is an error, and the delivery that is tried again compares the file.
 """
 
 from __future__ import annotations
@@ -15,33 +15,21 @@ from contextlib import suppress
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
-from mavftpfs.shared.errors import (
-    Armed,
-    FileChanged,
-    FtpNak,
-    RequestTimeout,
-    SessionBusy,
-    VerificationFailed,
-)
+from mavftpfs.shared.errors import Armed, FtpNak, NotVerified, RequestTimeout, VerificationFailed
 from mavftpfs.shared.sameness import Known, Listed, Opened, Sameness, Summed, compare
 
 log = logging.getLogger("mavftpfs.cache")
 
-PIECE = 64 * 1024
-"""Bytes that are read back at once."""
-
 
 class Verifier:
-    """Compares files. Counts for status: comparisons by CRC32, by reading back and by size alone, and
-    requests for a CRC32 that were not answered."""
+    """Compares files. Counts for status: comparisons by CRC32 and by size alone, and requests for a CRC32
+    that were not answered."""
 
     def __init__(self, context: Context, names: Names) -> None:
         self._context = context
         self._names = names
         self.counts = {
             "verified_by_crc": 0,
-            "verified_by_reading": 0,
             "verified_by_size": 0,
             "checksums_unanswered": 0,
         }
@@ -53,10 +41,11 @@ class Verifier:
 
         Raises:
             VerificationFailed: the vehicle has another file or none, or told no CRC32 although verify=crc.
-            Armed: a CRC32 is not asked for in flight. SessionBusy: another client was active while the file
-            was read back. Else as VehicleStore.stat_size.
+            NotVerified: doubted, and the vehicle told no CRC32. Armed: doubted, and a CRC32 is not asked for
+            in flight. Else as VehicleStore.stat_size.
         """
         options, crc32 = self._context.options, None
+        why: Exception | None = None
         if options.verify == "none" and not doubted:
             return None
         by_crc = doubted or options.verify == "crc"
@@ -66,6 +55,7 @@ class Verifier:
                 crc32 = await self._context.store.crc32(path, size=draft.size)
             except (FtpNak, RequestTimeout, Armed) as error:
                 self._go_without(path, error)
+                why = error
         if crc32 is not None and crc32 != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
         if not crc32:
@@ -76,8 +66,10 @@ class Verifier:
                 raise VerificationFailed(f"{path!r} has {size} bytes there, {draft.size} were written")
         if crc32 is not None:
             self.counts["verified_by_crc"] += 1
-        elif doubted and draft.size:
-            await self._read_back(path, draft)
+        elif doubted and why is not None:
+            if isinstance(why, FtpNak):
+                raise NotVerified(f"{path!r} is in doubt, and the vehicle told no checksum: {why}") from why
+            raise why
         else:
             self.counts["verified_by_size"] += 1
         return crc32
@@ -119,34 +111,3 @@ class Verifier:
         if not isinstance(error, Armed):
             self.counts["checksums_unanswered"] += 1
             log.warning("%r: its checksum was not told: %s", path, error)
-
-    async def _read_back(self, path: bytes, draft: Draft) -> None:
-        """Compare byte by byte.
-
-        Raises:
-            VerificationFailed: the card has other bytes. SessionBusy: another client was active meanwhile, or
-            the server ended the session. Else as RemoteStore.open_reader.
-        """
-        context = self._context
-        blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
-        version = Version(blocks, path)  # past every cache
-        version.reader = reader = await context.store.open_reader(path, version)
-        version.size = reader.size
-        try:
-            same = version.size == draft.size
-            at = 0
-            while same and at < draft.size and not version.ignores_data:
-                stop = min(at + PIECE, draft.size)
-                reader.want(at, stop, demand=True)
-                await version.wait_for(at, stop)
-                same = version.get(at, stop) == draft.local_bytes(at, stop)
-                at = stop
-        except FileChanged:
-            same = False
-        finally:
-            version.close_reader()
-        if version.ignores_data:
-            raise SessionBusy(f"while {path!r} was read back, what was read became doubtful")
-        if not same:
-            raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
-        self.counts["verified_by_reading"] += 1

@@ -43,7 +43,6 @@ Tell = Callable[[bytes, int, str], None]
 
 _WAYS = {
     "verified_by_size": BY_SIZE.words,
-    "verified_by_reading": "size and reading it back",
     "verified_by_crc": BY_CRC32.words,
 }
 

@@ -124,6 +124,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.NoSpace: errno.ENOSPC,
     errors.SpoolFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
+    errors.NotVerified: errno.EIO,
     errors.OtherRefusal: errno.EIO,
     errors.MountFailed: errno.EIO,
     errors.NoFtp: errno.EIO,

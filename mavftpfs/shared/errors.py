@@ -162,6 +162,10 @@ class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
 
 
+class NotVerified(MavftpfsError):
+    """What is on the card is in doubt, and the vehicle told no checksum (EIO); it is compared later."""
+
+
 class OtherRefusal(MavftpfsError):
     """A mount refused with an errno for which there is no class here.
 

@@ -16,10 +16,10 @@ import trio
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, UNKNOWN_LATENESS, Doubt, LateCopies
-from mavftpfs.shared.errors import MavftpfsError, RequestTimeout, SessionBusy
+from mavftpfs.shared.errors import MavftpfsError, NotVerified, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support import rigs
@@ -668,41 +668,34 @@ async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(profile:
 
 
 @pytest.mark.holds("promise 2")
-async def test_where_no_checksum_is_told_the_file_is_read_back() -> None:
-    """A byte that is wrong on the card is noticed, and all of it is sent again."""
+@pytest.mark.parametrize("told", ["nothing", "a refusal"])
+async def test_in_doubt_a_file_waits_for_its_checksum(told: str) -> None:
+    """A byte is wrong on the card. Without a checksum nobody says that the file is there."""
     data = bytes(range(1, 240)) * 300
     async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
-        tree = here.mount()
-        here.faults.ignore(Opcode.CALC_FILE_CRC32)
+        tree = here.mount(op_deadline=5.0)
         here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
         here.connection.scheduler.doubt.raise_it("an answer that came twice")
 
         def spoil() -> None:
             here.put(here.litter()[0], data[:70_000] + b"?" + data[70_001:])
 
-        here.faults.at(Opcode.OPEN_FILE_RO, spoil)  # to see its size
-        await write_file(tree, b"/d/new", data)
-        assert here.data(b"/d/new") == data
-        assert here.count(Opcode.CREATE_FILE) == 2
-        assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
-
-
-@pytest.mark.holds("promise 4")
-async def test_a_doubt_in_the_middle_of_reading_back_is_an_error_and_it_is_compared_later() -> None:
-    """It waited 30 s for bytes that were ignored, and failed."""
-    data = content(300_000)
-    async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
-        tree, doubt = here.mount(), here.connection.scheduler.doubt
-        here.faults.ignore(Opcode.CALC_FILE_CRC32)
-        here.connection.store.traits.rename_works = True
-        doubt.raise_it("an answer that came twice")
-        here.faults.at(Opcode.READ_FILE, lambda: doubt.raise_it("another FTP client is active"), nth=400)
-        with pytest.raises(SessionBusy):
+        here.faults.at(Opcode.CALC_FILE_CRC32, spoil)
+        if told == "nothing":
+            here.faults.ignore(Opcode.CALC_FILE_CRC32)
+        else:
+            here.faults.refuse(Opcode.CALC_FILE_CRC32, NakCode.UNKNOWN_COMMAND, times=1000)
+        with pytest.raises(RequestTimeout if told == "nothing" else NotVerified):
             await write_file(tree, b"/d/new", data)
+        await trio.sleep(60)
+        assert b"/d/new" not in here.files()
+        assert tree.undelivered() == [b"/d/new"]
+        assert here.count(Opcode.CREATE_FILE) == 1
+        here.faults.call_off()
         assert await tree.drain(200) == []
         assert here.data(b"/d/new") == data
-        assert here.count(Opcode.CREATE_FILE) == 1, "what was sent is not sent again"
-        assert tree.status()["verified_by_reading"] == 2, "once more under its own name"
+        assert here.count(Opcode.CREATE_FILE) == 2
+        assert tree.status()["verified_by_crc"] == 2, "once more under its own name"
 
 
 def delay(here: Rig, chosen: Callable[[bytes], bool], writes: int) -> None:
