@@ -63,7 +63,7 @@ class Context:
 
     def require_idle(self, path: bytes) -> None:
         """Raise FileBusy if the vehicle, or another client, seems to write the file."""
-        if not self.options.force and self.directories.is_growing(path):
+        if self.directories.is_growing(path):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
 
     def touch(self, path: bytes) -> None:

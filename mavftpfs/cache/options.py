@@ -36,11 +36,10 @@ class CacheOptions:
     at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
     probe_time: how long listing an `@` directory may spend on finding out which entries open.
     op_deadline: a read ends when none of its bytes came for so long.
-    rmw_max: the largest file that is sent whole for a change of a part of it; None = what can be fetched and
-    sent in two minutes. link_rate: bytes per second that the link carries at most, where that is known before
-    anything is measured.
+    link_rate: bytes per second that the link carries at most, where that is known before anything is
+    measured.
     verify: auto, size, crc (see cache.verify) or none; verify_max: largest file whose CRC32 is
-    asked. write_armed: change things in flight too. force: change files that others are writing.
+    asked. write_armed: change things in flight too.
     inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the
     vehicle; local_max: bytes they may take.
 
@@ -58,12 +57,10 @@ class CacheOptions:
     at_stat_limit: int = 128 * KIB
     probe_time: float = 3.0
     op_deadline: float = 30.0
-    rmw_max: int | None = None
     link_rate: float | None = None
     verify: str = "auto"
     verify_max: int = 4 * MIB
     write_armed: bool = False
-    force: bool = False
     inplace: bool = False
     local: tuple[str, ...] = DEFAULT_LOCAL
     local_max: int = 16 * MIB

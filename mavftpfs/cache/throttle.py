@@ -31,7 +31,7 @@ REWRITE_SECONDS = 120.0
 """How long it may take to fetch and send a file of which a part was changed."""
 
 LEAST_REWRITE, MOST_REWRITE = 64 * KIB, 64 * MIB
-"""Bytes of such a file that are always allowed, and the most that ever are, unless rmw_max is set."""
+"""Bytes of such a file that are always allowed, and the most that ever are."""
 
 STALL = 5.0
 """After so many seconds in which nothing was ACKed a writer asks why."""
@@ -73,20 +73,23 @@ class Throttle:
         """
         if not draft.base_limit:
             return
-        context, limit = self._context, self._context.options.rmw_max
-        if limit is None:
-            limit = MOST_REWRITE
-            read = context.files.cache.meter.rate
-            write = self._limit.meter.rate or read or context.options.link_rate
-            read = read or write
-            if write and read:
-                missing = sum([stop - start for start, stop in draft.missing_base()])
-                possible = int((REWRITE_SECONDS - missing / read) * write)
-                limit = min(max(possible, LEAST_REWRITE), MOST_REWRITE)
+        limit = self._rewritable(draft)
         if size > limit:
             raise FileTooLarge(
-                f"changing a part of {size} bytes means sending them all; rmw_max allows {limit}"
+                f"a change of a part sends the whole file: {size} bytes, and two minutes of the link carry "
+                f"{limit}; write a new file instead"
             )
+
+    def _rewritable(self, draft: Draft) -> int:
+        """Return how large a file may be of which a part is changed, as far as the rates are known."""
+        read = self._context.files.cache.meter.rate
+        write = self._limit.meter.rate or read or self._context.options.link_rate
+        read = read or write
+        if not write or not read:
+            return MOST_REWRITE
+        missing = sum([stop - start for start, stop in draft.missing_base()])
+        possible = int((REWRITE_SECONDS - missing / read) * write)
+        return min(max(possible, LEAST_REWRITE), MOST_REWRITE)
 
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""

@@ -179,9 +179,12 @@ async def test_what_is_cut_goes_to_the_card_as_a_whole(each: Rig) -> None:
     assert each.count(Opcode.TRUNCATE_FILE) == 0
 
 
-async def test_a_part_of_a_large_file_is_refused_where_it_would_be_sent_whole(here: Rig) -> None:
-    file = await here.mount(rmw_max=1000).open(FILE, write=True)
-    with pytest.raises(FileTooLarge):
+async def test_a_part_of_a_large_file_is_refused_where_it_would_be_sent_whole(
+    here: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavftpfs.cache.throttle.MOST_REWRITE", len(OLD) - 1)
+    file = await here.mount().open(FILE, write=True)
+    with pytest.raises(FileTooLarge, match="write a new file instead"):
         await file.write(5, b"x")
     await file.release()
     assert here.data(FILE) == OLD
