@@ -28,13 +28,13 @@ from mavftpfs.api.params import Number, Params, get_values, set_values
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
 from mavftpfs.client import download, names, upload
-from mavftpfs.client.choice import Choice
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetcher
 from mavftpfs.client.files import File, Files, Session, Target, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
+from mavftpfs.client.selection import Selection
 from mavftpfs.client.several import IN_PYTHON
 from mavftpfs.client.source import target_of
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
@@ -500,7 +500,7 @@ class Drone:
             OSError: a log did not come; the text says how many did.
         """
         where = None if place is None else remote(place)
-        wish = download.Wish(Path(local), where, Choice(newest, since))
+        wish = download.Wish(Path(local), where, Selection(newest, since))
         outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
         return [fetched.wanted.local for fetched in outcome.fetched]
 

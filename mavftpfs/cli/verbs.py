@@ -28,12 +28,12 @@ from mavftpfs.cli.report import count_files
 from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
-from mavftpfs.client.choice import Choice
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
+from mavftpfs.client.selection import Selection
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
 from mavftpfs.mount import daemon
@@ -161,8 +161,8 @@ def sync(args: Args) -> int:
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since, datetime.now())
-    choice = Choice(args.newest, since, tuple(args.include), tuple(args.exclude))
-    wish = download.Wish(Path(args.local), place, choice, args.dry_run)
+    selection = Selection(args.newest, since, tuple(args.include), tuple(args.exclude))
+    wish = download.Wish(Path(args.local), place, selection, args.dry_run)
     if args.watch:
         return watching.watch(args, wish, lambda work: run(args, work, component))
     if args.command is not None:
@@ -203,14 +203,16 @@ def get(args: Args) -> int:
     if args.to == STDOUT:
         if args.recursive:
             raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
+        if args.include or args.exclude:
+            raise UsageError("--to - writes all that PATH names; leave out --include and --exclude")
         return cat(args)
     wanted, component = _paths_of(args)
-    choice = Choice(include=tuple(args.include), exclude=tuple(args.exclude))
+    selection = Selection(include=tuple(args.include), exclude=tuple(args.exclude))
     outcome = download.Outcome()
 
     async def work(downloads: download.Downloads) -> None:
         into = args.to.endswith("/")
-        await downloads.get(wanted, Path(args.to), into=into, recursive=args.recursive, choice=choice)
+        await downloads.get(wanted, Path(args.to), into=into, recursive=args.recursive, selection=selection)
 
     _download(args, outcome, work, component)
     _say_what_is_not_proven(outcome)

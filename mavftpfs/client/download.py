@@ -11,7 +11,6 @@ from pathlib import Path
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.brought import NAME as MEMORY
 from mavftpfs.client.brought import Brought, Memory
-from mavftpfs.client.choice import EVERYTHING, Choice
 from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
@@ -25,6 +24,7 @@ from mavftpfs.client.fetch import (
 from mavftpfs.client.files import Found, Session, Unlisted, walk
 from mavftpfs.client.names import fixed_part, matching
 from mavftpfs.client.proof import BY_CRC32, Proof, Verify, ask_crc32, local_crc32, proof_needed
+from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.shared.errors import (
     IsADirectory,
     LinkError,
@@ -51,7 +51,7 @@ class Wish:
 
     local: Path
     place: bytes | None = None
-    choice: Choice = EVERYTHING
+    selection: Selection = EVERYTHING
     dry_run: bool = False
 
 
@@ -161,7 +161,7 @@ class Downloads:
         self.outcome.place = session.on_vehicle(place)
         for path, error in unlisted:
             self.fail(path, error)
-        warning = wish.choice.warning(logs)
+        warning = wish.selection.warning(logs)
         if warning and not self.outcome.checked:
             self.complain(warning)
         return logs
@@ -192,16 +192,16 @@ class Downloads:
         *,
         into: bool,
         recursive: bool,
-        choice: Choice = EVERYTHING,
+        selection: Selection = EVERYTHING,
     ) -> None:
         """Fetch files, and with `recursive` directories; names may be patterns.
 
         One file goes into `local` if that is a directory, else it gets that name. All else goes into `local`,
         which is made. Files that match a pattern go there with their directories, from the first wildcard on.
-        The patterns of `choice` see the same paths below `local`.
+        The patterns of `selection` see the same paths below `local`.
 
         Raises:
-            UsageError: two files would get one local name, or `choice` takes none of those that were found;
+            UsageError: two files would get one local name. NotFound: `selection` takes no file. In both cases
             nothing was fetched. Else as Fetcher.fetch where only one file is asked for, else as `sync`.
         """
         alone = len(paths) == 1
@@ -214,22 +214,22 @@ class Downloads:
                 top = split(path)[0] if plain else fixed_part(path)
                 for name in names:
                     place = Place(name, top, path if plain else top, local, into or not alone)
-                    found += await self._found(place, choice, recursive=recursive)
+                    found += await self._found(place, selection, recursive=recursive)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=alone)
         found = list(dict.fromkeys(found))
-        if choice.by_name and not found and not self.outcome.failed:
+        if selection.by_name and not found and not self.outcome.failed:
             raise NotFound("--include and --exclude leave no file to fetch")
         _require_apart(found)
         self.outcome.wanted = _apart(found)
         await self._fetch_all(alone=alone and [one.remote for one in found] == [*paths])
 
-    async def _found(self, place: Place, choice: Choice, *, recursive: bool) -> list[Wanted]:
+    async def _found(self, place: Place, selection: Selection, *, recursive: bool) -> list[Wanted]:
         """Make the local directories for the files of a path, and return the files."""
         session, path = self.fetcher.session, place.path
         stat = await session.files.stat(path)
         if stat.kind is EntryKind.FILE:
-            if not choice.takes(place.below_source(path)):
+            if not selection.takes(place.below_source(path)):
                 return []
             return [_wanted(path, place.of_file(), session.on_vehicle(path), stat)]
         if not recursive:
@@ -237,7 +237,7 @@ class Downloads:
         found, unlisted = await walk(session.files, path)
         for unreadable, error in unlisted:
             self.fail(unreadable, error)
-        return _made(session, place, found, choice)
+        return _made(session, place, found, selection)
 
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
         """Hand on the bytes of files, one behind the other.
@@ -331,19 +331,19 @@ def _below_top(path: bytes, top: bytes) -> bytes:
     return path.removeprefix(top).lstrip(b"/")
 
 
-def _made(session: Session, place: Place, found: Found, choice: Choice) -> list[Wanted]:
+def _made(session: Session, place: Place, found: Found, selection: Selection) -> list[Wanted]:
     """Make the directories below a directory, and return its files; if these are chosen by name, make only
     the directories that they need."""
     files, top = [], place.whole
     with local_disk(top):
-        if not choice.by_name:
+        if not selection.by_name:
             top.mkdir(parents=True, exist_ok=True)
         for below, stat in found:
             remote, local = join(place.path, below), top / os.fsdecode(below)
             if stat.kind is EntryKind.DIRECTORY:
-                if not choice.by_name:
+                if not selection.by_name:
                     local.mkdir(exist_ok=True)
-            elif choice.takes(place.below_source(remote)):
+            elif selection.takes(place.below_source(remote)):
                 local.parent.mkdir(parents=True, exist_ok=True)
                 files.append(_wanted(remote, local, session.on_vehicle(remote), stat))
     return files
@@ -396,9 +396,9 @@ async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes,
         for below, stat in found
         if stat.kind is EntryKind.FILE
         and below != MEMORY.encode()  # local logs that were copied to the card
-        and wish.choice.takes(below)
+        and wish.selection.takes(below)
     ]
-    return place, _apart(wish.choice.of_logs(logs)), unlisted
+    return place, _apart(wish.selection.of_logs(logs)), unlisted
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:

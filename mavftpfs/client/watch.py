@@ -18,7 +18,6 @@ from pathlib import Path
 import trio
 
 from mavftpfs.client.brought import HEAD, Brought, Memory
-from mavftpfs.client.choice import is_no_log
 from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
 from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
 from mavftpfs.client.download import Wish, named, wanted_logs
@@ -28,6 +27,7 @@ from mavftpfs.client.flights import Fetch, Log, Look, Policy, Step, Wait
 from mavftpfs.client.options import Options
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
+from mavftpfs.client.selection import is_no_log
 from mavftpfs.link.base import Link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
@@ -249,7 +249,7 @@ class Watch:
             _, logs, unlisted = await wanted_logs(session, self._wish.logs, local)
             logs = [log for log in logs if not is_no_log(log)]
             new = [log for log in logs if not await self._is_known(name, log, session)]
-            warning = self._wish.logs.choice.warning(new)
+            warning = self._wish.logs.selection.warning(new)
             if warning:
                 self._complain(f"times of {system}", f"vehicle {system}: {warning}")
         except NotFound as exc:

@@ -10,7 +10,6 @@ from typing import Any, cast
 import pytest
 import trio
 
-from mavftpfs.client.choice import Choice
 from mavftpfs.client.download import Downloads, Outcome, Wish
 from mavftpfs.client.fetch import (
     Fetched,
@@ -24,6 +23,7 @@ from mavftpfs.client.fetch import (
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import BY_CRC32, GENERATED, Proof, Verify
+from mavftpfs.client.selection import Selection
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
@@ -445,7 +445,7 @@ async def sync(
     fetcher = fetcher_of(tree, root, verify)
     downloads = Downloads(fetcher, outcome, lambda fetched: told.append(fetched.wanted.name), said.append)
     try:
-        await downloads.sync(Wish(local, choice=Choice(newest), dry_run=dry_run))
+        await downloads.sync(Wish(local, selection=Selection(newest), dry_run=dry_run))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said

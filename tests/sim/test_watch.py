@@ -14,11 +14,11 @@ import pytest
 import trio
 
 from mavftpfs.client.brought import NAME, Memory
-from mavftpfs.client.choice import EVERYTHING, Choice
 from mavftpfs.client.contact import Hearing
 from mavftpfs.client.download import Wish
 from mavftpfs.client.files import Session
 from mavftpfs.client.options import Options
+from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.client.watch import Watch, WatchWish
 from mavftpfs.link.messages import Address
 from mavftpfs.link.uri import parse_source
@@ -57,7 +57,7 @@ class Day:
         self.handed: list[str] = []
         self.problem = ""
         self.count = 0
-        self.choice = EVERYTHING
+        self.selection = EVERYTHING
 
     @property
     def vehicle(self) -> SimVehicle:
@@ -89,7 +89,7 @@ class Day:
     async def watched(self) -> AsyncIterator[None]:
         """Have the watch run during the body; a second time is another process."""
         hand_on = self._hand_on
-        watch = Watch(WatchWish(Wish(self.local, choice=self.choice)), self.said.append, hand_on)
+        watch = Watch(WatchWish(Wish(self.local, selection=self.selection)), self.said.append, hand_on)
         async with trio.open_nursery() as nursery:
             nursery.start_soon(watch._hand_on_all)
             nursery.start_soon(watch.run_on, self.rig.link, SPEC, Options())
@@ -141,7 +141,7 @@ def day(tmp_path: Path) -> Day:
 
 
 async def test_patterns_and_since_choose_logs_and_what_since_cannot_leave_out_is_said_first(day: Day) -> None:
-    day.choice = Choice(since=MAY, include=("*.ulg",))
+    day.selection = Selection(since=MAY, include=("*.ulg",))
     day.put("2024-04-30/10_00_00.ulg", content(3000, 1))
     day.put("2024-05-01/10_00_00.ulg", content(3000, 2))
     day.put("sess001/log001.ulg", content(3000, 3))

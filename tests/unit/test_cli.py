@@ -110,6 +110,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("install", "--root", "/x"), "--root"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
         (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
+        (("get", SOURCE, "/a*", "--to", "-", "--include", "*.ulg"), "leave out --include"),
         (("sim", "/proc/none/a b"), "mkdir -p '/proc/none/a b/fs/microsd/log'"),
         (("sim", "/proc/none/a", "--profile", "ardupilot"), "mkdir -p /proc/none/a/APM/LOGS"),
         (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),

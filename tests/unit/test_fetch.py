@@ -9,9 +9,9 @@ import pytest
 
 from mavftpfs.cli.verbs import parse_date
 from mavftpfs.client import fetch, proof
-from mavftpfs.client.choice import Choice, latest_in, newest_first
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
+from mavftpfs.client.selection import Selection, latest_in, newest_first
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296
@@ -73,9 +73,9 @@ def test_the_newest_come_first_by_time_then_by_number(logs: list[Wanted], ordere
 
 def test_which_logs_are_wished_for() -> None:
     logs = newest_first([log("a", MAY), log("b", JUNE), log("c")])
-    assert [one.name for one in Choice(newest=1).of_logs(logs)] == ["b"]
-    assert [one.name for one in Choice(since=MAY + 1).of_logs(logs)] == ["b", "c"]  # c may be a new one
-    assert Choice(newest=9).of_logs(logs) == logs
+    assert [one.name for one in Selection(newest=1).of_logs(logs)] == ["b"]
+    assert [one.name for one in Selection(since=MAY + 1).of_logs(logs)] == ["b", "c"]  # c may be a new one
+    assert Selection(newest=9).of_logs(logs) == logs
 
 
 @pytest.mark.parametrize(
@@ -96,11 +96,11 @@ def test_times_in_paths(path: bytes, time: int | None) -> None:
 
 
 def test_patterns_see_the_path_and_the_name() -> None:
-    some = Choice(include=("*.ulg", "sess001/*"), exclude=("2024-05-01/*", "log002.*"))
+    some = Selection(include=("*.ulg", "sess001/*"), exclude=("2024-05-01/*", "log002.*"))
     taken = [b"a/b.ulg", b"sess001/x/y.txt", b"sess001/log001.ulg"]
     left = [b"a/b.ULG", b"2024-05-01/10_00_00.ulg", b"sess001/log002.ulg", b"sess002/x.txt"]
     assert [path for path in taken + left if some.takes(path)] == taken
-    assert Choice().takes(b"anything")
+    assert Selection().takes(b"anything")
 
 
 def test_a_clock_that_was_not_set_tells_nothing() -> None:

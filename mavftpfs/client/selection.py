@@ -21,7 +21,7 @@ _DAY_END = (23, 59, 59)
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class Selection:
     """The files that a user wants.
 
     newest: at most so many; since: none that is older, seconds UTC. include: patterns, one of which a file
@@ -68,7 +68,7 @@ class Choice:
         )
 
 
-EVERYTHING = Choice()
+EVERYTHING = Selection()
 
 
 def _matches_one(below: str, patterns: Sequence[str]) -> bool:
