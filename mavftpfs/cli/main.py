@@ -423,7 +423,7 @@ def _param_parser(name: str) -> Parser:
 
 
 def _umount_parser(name: str) -> Parser:
-    parser = Parser(f"mavftpfs {name}", description="Deliver what is held, close the session, unmount.")
+    parser = Parser(f"mavftpfs {name}", description="Unmount, upload what is pending, close the session.")
     parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="where a vehicle is mounted")
     parser.add_argument("-l", "--lazy", action="store_true", help="also if it is in use")
     return parser

@@ -177,6 +177,22 @@ def told(process: Process) -> Path:
     return recovered(process.text())
 
 
+@pytest.mark.holds("promise 2")
+def test_fsync_confirms_an_empty_file_and_close_does_not(field: Field) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    vehicle.pause()
+    mount.python(
+        "import os, sys; os.close(os.open(sys.argv[1], os.O_CREAT | os.O_WRONLY))", mount.path / "empty"
+    )
+    vehicle.resume()
+    wait_until("it is made a moment later", lambda: (card / "empty").exists())
+    sync = "import os, sys; number = os.open(sys.argv[1], os.O_CREAT | os.O_WRONLY); os.fsync(number)"
+    mount.python(sync, mount.path / "synced")
+    assert (card / "synced").exists()
+
+
 @pytest.mark.holds("promise 3")
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
     mount, vehicle, card = holding(field, data)
@@ -251,6 +267,7 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
             f"mavftpfs: Ctrl-C ends only the waiting; to keep the rest now: kill {process.popen.pid}\n"
         )
         assert third == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
+        assert not mounted_at(mount.path)
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
         assert child.returncode == ExitCode.INTERRUPTED
