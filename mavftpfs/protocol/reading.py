@@ -257,11 +257,14 @@ class ReadToEof(Operation):
 
     Attributes:
         data: the whole content, once done without error.
+        shorter: bytes of a short block that is not the last one, because there is more behind it: the server
+            sends no longer ones. The file is to be read anew in such blocks.
 
     Fails with DataUnproven (longer than `limit`, or a short block in the middle), SessionLost, FtpNak.
     """
 
     urgent = False
+    shorter: int | None = None
 
     def __init__(self, session: int, chunk: int, limit: int) -> None:
         if not 1 <= chunk <= MAX_DATA:
@@ -330,7 +333,9 @@ class ReadToEof(Operation):
     def _maybe_finish(self) -> None:
         end, last = self._end, self._last
         newest = max(self._blocks, default=-1)
-        if (end is not None and newest >= end) or (last is not None and newest > last):
+        if last is not None and newest > last:
+            self.shorter = len(self._blocks[last])
+        if self.shorter is not None or (end is not None and newest >= end):
             self.fail(DataUnproven("blocks of different lengths of the file do not fit together"))
         elif end is not None and self._whole == end:
             self.data = b"".join(self._blocks[index] for index in range(end))

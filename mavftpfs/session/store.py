@@ -205,14 +205,21 @@ class Store:
             return await self._read_whole(path, limit)
 
     async def _read_whole(self, path: bytes, limit: int) -> bytes:
-        async with self._opened(path) as session:
+        """Read it once; anew in shorter blocks as long as the server turns out to send no longer ones."""
+        block: int | None = self._scheduler.read_chunks.size
+        while block is not None:
             began = self._clock()
-            operation = ReadToEof(session.id, self._scheduler.read_chunks.size, limit)
-            await self._server.driver.run(operation)
-            self._server.require_open(session)
+            async with self._opened(path) as session:
+                operation = ReadToEof(session.id, block, limit)
+                with suppress(DataUnproven):
+                    await self._server.driver.run(operation)
+                self._server.require_open(session)
             if self._scheduler.doubt.reads_arose_since(began):
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
-            return operation.data
+            block = operation.shorter
+        if operation.error is not None:
+            raise operation.error
+        return operation.data
 
     @asynccontextmanager
     async def _opened(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> AsyncIterator[OpenSession]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
+from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 
@@ -53,6 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_const",
         const=False,
         help="do not tell the size of the card (default: as the profile does)",
+    )
+    parser.add_argument(
+        "--clamp",
+        type=_data_bytes,
+        default=MAX_DATA,
+        metavar="N",
+        help=f"send at most N bytes of a file in a reply, as PX4 may over a radio (default {MAX_DATA})",
     )
     parser.add_argument("--armed", action="store_true", help="be armed from the start")
     parser.add_argument(
@@ -117,6 +125,12 @@ def _between(low: float, high: float, what: str) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def _data_bytes(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MAX_DATA:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of bytes from 1 to {MAX_DATA}")
+    return int(text)
 
 
 def _system(text: str) -> int:

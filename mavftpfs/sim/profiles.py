@@ -1,13 +1,15 @@
 """Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
 
-The firmwares that are simulated. Sources of the numbers: servers.md, PX4
-`mavlink_ftp.cpp`, ArduPilot `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
+The firmwares that are simulated. Sources of the numbers: servers.md, PX4 `mavlink_ftp.cpp`, ArduPilot
+`GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
+
+from mavftpfs.protocol.payload import MAX_DATA
 
 TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 """The `@` directories of an ArduPilot."""
@@ -71,6 +73,9 @@ class Profile:
     """A path may count its trailing NUL in `size` (ArduPilot since mid-2025)."""
     path_limit: int = 238
     """Longer paths are cut silently (PX4, ArduPilot)."""
+
+    longest_reply: int = MAX_DATA
+    """Data bytes of a reply to a read or a burst at most. PX4 may send less over a radio (servers.md 7)."""
 
     tells_storage: bool = True
     """STORAGE_INFORMATION is sent when asked for (not by MAVSDK's server)."""

@@ -55,11 +55,12 @@ Replies = list[tuple[Address, bytes]]
 
 @dataclass(slots=True)
 class Stream:
-    """A running burst. sent: bytes."""
+    """A running burst. most: bytes of a packet. sent: bytes."""
 
     target: Address
     offset: int
     seq: int
+    most: int
     sent: int = 0
 
     def read(self, opened: OpenFile, *, last: bool, alone: bool, rng: random.Random) -> bytes:
@@ -70,7 +71,7 @@ class Stream:
         Raises:
             OSError: reading failed.
         """
-        data = opened.read(self.offset, MAX_DATA)
+        data = opened.read(self.offset, self.most)
         self.sent += len(data)
         over = self.is_over(last)
         # The field is not written on a tick's last packet; only then is it the stack's garbage.
@@ -472,7 +473,7 @@ class Px4(px4ops.PathRequests):
     def _burst(self, request: Request) -> bytes:
         """Start a burst. Some versions accept session 0 with no file open. The request's size is ignored."""
         self._check_session(request.session)
-        self._stream = Stream(request.source, request.offset, request.seq + 1)
+        self._stream = Stream(request.source, request.offset, request.seq + 1, self.profile.longest_reply)
         self._tick = max(self._tick, self._tick_after(self._last_request))
         return b""
 

@@ -29,7 +29,7 @@ from mavftpfs.link.messages import (
     FtpRun,
     Heartbeat,
 )
-from mavftpfs.protocol.payload import PAYLOAD_SIZE
+from mavftpfs.protocol.payload import MAX_DATA, PAYLOAD_SIZE, Opcode
 from mavftpfs.sim.ardupilot import ArduPilot
 from mavftpfs.sim.firmware import Firmware
 from mavftpfs.sim.mavsdk import Mavsdk
@@ -41,6 +41,7 @@ from mavftpfs.sim.tree import Tree
 
 AUTOPILOT = Address(1, 1)
 _OPCODE = itemgetter(3)
+_ASKING_DATA = (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 _FIRMWARES: dict[Family, type[Firmware]] = {
     Family.PX4: Px4,
     Family.ARDUPILOT: ArduPilot,
@@ -77,14 +78,21 @@ class FtpServer:
             return
         self.requests[wire[3]] += 1
         if not self.firmware.crashed:
-            self.firmware.handle(wire, source, now)
+            self.firmware.handle(self._shortened(wire), source, now)
+
+    def _shortened(self, wire: bytes) -> bytes:
+        """Return a request as it is, or one for data that asks for no more than the server sends."""
+        longest = self.profile.longest_reply
+        if longest == MAX_DATA or wire[3] not in _ASKING_DATA or 0 < wire[4] <= longest:
+            return wire
+        return wire[:4] + bytes([longest]) + wire[5:]
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
         """Take payloads that came together: the same as one by one, in less time."""
         firmware = self.firmware
         alone = len(wires) == 1  # as over every link in memory, where tests look at each in `handle`
         unfit = firmware.crashed or any(len(wire) != PAYLOAD_SIZE for wire in wires)
-        if alone or unfit:
+        if alone or unfit or self.profile.longest_reply < MAX_DATA:
             for wire in wires:
                 self.handle(wire, source, now)
             return

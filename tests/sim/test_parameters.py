@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 import trio
@@ -168,6 +168,19 @@ async def test_reading_is_what_the_vehicle_has(profile: str, link: LinkSettings)
         assert {line.name for line in changed} == {
             one.name.decode() for one in table_of(here).visible(0) if one.default != one.value
         }
+
+
+@MARKS
+@pytest.mark.parametrize("longest", [91, 78])
+async def test_parameters_come_whole_where_replies_are_shorter_than_asked(profile: str, longest: int) -> None:
+    """PX4 may send what a radio carries (servers.md 7). A block of another length is another question."""
+    async with vehicle(profile, parameters=many(drifting=0)[:-1]) as (here, tree):
+        here.server.profile = here.server.firmware.profile = replace(
+            here.server.profile, longest_reply=longest
+        )
+        lines, problems = parse((await read_file(tree, ALL)).decode())
+        assert problems == []
+        assert {line.name: line.value for line in lines} == pytest.approx(numbers(here), rel=1e-6)
 
 
 @MARKS

@@ -3,6 +3,8 @@ unkind. Virtual time."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import trio
 
@@ -54,6 +56,17 @@ async def test_little_of_a_large_file_is_asked_for_twice_over_a_bad_link(
         asked = sent[Opcode.READ_FILE] + sent[Opcode.BURST_READ_FILE]
         assert asked <= 1.5 * (-(-len(data) // MAX_DATA)) / (1 - BAD.loss) ** 2
     assert here.server.open_sessions == 0
+
+
+@BOTH
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "ardupilot", "mavsdk"])
+async def test_replies_may_be_shorter_than_asked(profile: str, mode: ReadMode) -> None:
+    """As PX4 may clamp them to what a radio carries (servers.md 7)."""
+    data = content(20_000)
+    here = Rig(profile, {b"/big": data}, LinkSettings(delay=0.02))
+    here.server.profile = here.server.firmware.profile = replace(here.server.profile, longest_reply=91)
+    async with here.connected(ConnectOptions(read_mode=mode)) as connection:
+        assert await read_file(connection, here.root + b"/big") == data
 
 
 async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:

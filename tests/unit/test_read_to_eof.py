@@ -83,6 +83,7 @@ def test_a_short_block_before_another_proves_nothing(late: bool) -> None:
         reading.answer(0, bytes(50))
         reading.answer(100, bytes(200))
     assert isinstance(reading.op.error, DataUnproven)
+    assert reading.op.shorter == 50, "the server sends no more at once"
 
 
 def test_eight_is_an_end_only_behind_a_short_block() -> None:
