@@ -46,13 +46,11 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import (
-    DOT,
     ROOT,
     DirEntry,
     EntryKind,
     Listing,
     join,
-    omits_files,
     split,
     usable_name,
 )
@@ -291,7 +289,6 @@ class Directories:
     def _forget_server(self) -> None:
         self.tells_times = False
         self._root_proven = self._options.root == ROOT
-        self._dot_refused = False
 
     # --- asking
 
@@ -422,8 +419,6 @@ class Directories:
                 listing = await self._store.list_directory(
                     path, known_end=None if known is None else known.end
                 )
-                if not self._dot_refused and omits_files(path, listing.entries):
-                    listing = await self._with_dot(listing)
             except FtpNak:  # perhaps the directory is gone: its parent is listed again
                 self.forget(path)
                 if path != ROOT:
@@ -436,25 +431,6 @@ class Directories:
                 self._on_listed(path, directory)
             if not sweep.changes or tries == SWEEP_TRIES:
                 return directory
-
-    async def _with_dot(self, listing: Listing) -> Listing:
-        """Add what only `.` shows: ArduPilot on SITL omits every plain file of `/` (servers.md 14.32)."""
-        try:
-            dot = await self._store.list_directory(DOT)
-        except FtpNak:
-            self._dot_refused = True
-            return listing
-        if not any(entry.kind is EntryKind.FILE for entry in dot.entries):
-            return listing  # asked again next time: its first file may come later
-        shown = {entry.name for entry in listing.entries}
-        more = tuple(entry for entry in dot.entries if entry.name not in shown)
-        return Listing(
-            listing.entries + more,
-            listing.took + dot.took,
-            listing.complete and dot.complete,
-            listing.unshown + dot.unshown,
-            listing.end,
-        )
 
     def begin(self, path: bytes) -> Sweep:
         """Note that a listing of `path` begins. Each directory has one at a time."""

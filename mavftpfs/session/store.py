@@ -40,14 +40,12 @@ from mavftpfs.shared.errors import (
     SessionLost,
 )
 from mavftpfs.shared.model import (
-    DOT,
     RENAME_ROOM,
     DirEntry,
     EntryKind,
     Listing,
     Traits,
     is_on_nuttx,
-    omits_files,
     split,
     wire_path,
 )
@@ -463,9 +461,6 @@ class Store:
                 seen = fresh
                 break
             seen |= fresh
-        if omits_files(directory, tuple(seen.values())):
-            with suppress(FtpNak):
-                seen |= (await self._names(DOT))[0]
         return seen, complete
 
     async def _is_absent(self, path: bytes) -> Outcome:

@@ -6,7 +6,7 @@ Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; 
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import MutableMapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import TypeVar
@@ -54,19 +54,6 @@ class Listing:
     complete: bool = True
     unshown: int = 0
     end: int | None = None
-
-
-DOT = b"."
-"""The working directory of a server that runs as a process (ArduPilot SITL)."""
-
-
-def omits_files(path: bytes, entries: Sequence[DirEntry]) -> bool:
-    """Return whether a listing looks like that of `/` by ArduPilot's SITL, which shows no files: they are in
-    `DOT` (servers.md 14.32)."""
-    if path != ROOT:
-        return False
-    names, kinds = {entry.name for entry in entries}, {entry.kind for entry in entries}
-    return EntryKind.FILE not in kinds and not names.isdisjoint((b"@SYS", b"@ROMFS"))
 
 
 def join(parent: bytes, name: bytes) -> bytes:

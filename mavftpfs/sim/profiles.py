@@ -155,7 +155,6 @@ _ARDUPILOT = Profile(
     unknown_code=1,
     virtual_trees=TREES,
     double_nul=True,
-    root_omits_files=True,
     counted_path_nul=False,
     write_only_creates=False,
     burst_packets=500,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -127,7 +128,8 @@ def unpack_parameters(packed: bytes) -> list[Parameter]:
 def replay(name: str, steps: list[Step]) -> Iterator[tuple[Step, list[tuple[float, Payload]]]]:
     """Hand every request over at its time and yield each step with the simulated replies."""
     tree, virtual = build_tree(name, steps), build_virtual(name, steps)
-    server = FtpServer(tree, PROFILES[name], rng=random.Random(1), virtual=virtual)
+    profile = replace(PROFILES[name], root_omits_files=name == "ardupilot")  # it was recorded under SITL
+    server = FtpServer(tree, profile, rng=random.Random(1), virtual=virtual)
     ends = [step.requests[0][0] for step in steps[1:]] + [float("inf")]
     for step, end in zip(steps, ends, strict=True):
         replies: list[tuple[float, Payload]] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -13,7 +14,7 @@ from mavftpfs.cache.directories import SWEEP_TRIES
 from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.tree import Stat, Tree
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, crc32
+from mavftpfs.protocol.payload import Opcode, Payload, crc32
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
@@ -27,7 +28,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.replies import nak
+from mavftpfs.sim.profiles import PROFILES
 from tests.support.rigs import Rig, card, read_file, rig
 
 FILE, DIRECTORY = EntryKind.FILE, EntryKind.DIRECTORY
@@ -283,45 +284,19 @@ async def test_a_root_that_is_a_file_is_not_listed(here: Rig, root: bytes) -> No
     assert root not in asked
 
 
-# --- SITL's root
-
-
-async def test_dot_shows_what_root_hides() -> None:
+@pytest.mark.holds("rule 14.32")
+async def test_files_that_the_root_of_sitl_does_not_list_are_not_shown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(PROFILES, "ardupilot", replace(PROFILES["ardupilot"], root_omits_files=True))
     async with rig("ardupilot", FILES) as here:
         tree, asked = here.mount(), listed(here)
-        for _ in range(2):
-            stats = dict(await tree.list(b"/"))
-            assert (stats[b"top"].size, stats[b"fs"].kind) == (1, DIRECTORY)
-            await trio.sleep(21)
-        assert await read_file(tree, b"/top") == b"t"
-        assert asked.count(b".") == 3
-
-
-async def test_dot_that_was_refused_is_not_asked_for_again() -> None:
-    async with rig("ardupilot", FILES) as here:
-        asked: list[Payload] = []
-
-        def answer(request: Payload) -> list[Payload] | None:
-            if request.opcode != Opcode.LIST_DIRECTORY or request.data.rstrip(b"\0") != b".":
-                return None
-            asked.append(request)
-            return [nak(request, NakCode.FILE_NOT_FOUND)]
-
-        here.server.answer = answer
-        tree = here.mount()
-        for _ in range(2):
-            assert b"fs" in dict(await tree.list(b"/"))
-            await trio.sleep(21)
-        assert len(asked) == 1
-
-
-@pytest.mark.parametrize("profile", ["ardupilot5", "px4-2026"])
-async def test_dot_is_asked_of_no_other_server(profile: str) -> None:
-    """One that shows files there, and one that shows no `@` trees."""
-    async with rig(profile, {b"/top" if profile == "ardupilot5" else b"/fs/a": b"t"}) as here:
-        asked = listed(here)
-        await here.mount().list(b"/")
-        assert asked == [b"/"]
+        shown = dict(await tree.list(b"/"))
+        assert b"fs" in shown
+        assert b"top" not in shown
+        with pytest.raises(NotFound):
+            await tree.open(b"/top")
+        assert set(asked) == {b"/"}
 
 
 # --- checksums
