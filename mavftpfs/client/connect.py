@@ -118,9 +118,6 @@ def _print_payload(now: float, direction: str, wire: bytes) -> None:
     print(f"{datetime.now():%H:%M:%S.%f} {text_line(direction, wire)}", file=sys.stderr)
 
 
-OPENING_TIME = 0.4
-"""Seconds after which a person is told that a link takes long to open."""
-
 HOLDER_PATIENCE = 3.0
 """Seconds for mounts to say whether they have a link."""
 
@@ -133,13 +130,10 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 
 
 @asynccontextmanager
-async def opened(
-    spec: LinkSpec, options: Options, *, beats: bool = False, tell: Callable[[str], None] = lambda line: None
-) -> AsyncIterator[Link]:
+async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other programs of ours.
 
-    beats: only to hear heartbeats; then the link is shared from the beginning. tell: gets a line for people
-    if opening takes long.
+    beats: only to hear heartbeats; then the link is shared from the beginning.
 
     Raises:
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
@@ -151,15 +145,7 @@ async def opened(
             raise UsageError(
                 f"forward={place} is SOURCE itself; name another place, such as udpout:127.0.0.1:14551"
             )
-    opening = trio.CancelScope()
-
-    async def tell_if_slow() -> None:
-        with opening:
-            await trio.sleep(OPENING_TIME)
-            tell(f"opening {spec.description}: it takes long, perhaps because another program has it")
-
-    async with plain_nursery() as nursery, AsyncExitStack() as stack:
-        nursery.start_soon(tell_if_slow)
+    async with AsyncExitStack() as stack:
         try:
             link = await stack.enter_async_context(open_shared(spec, wish))
         except LinkClosed as exc:
@@ -170,8 +156,6 @@ async def opened(
             if status is None:
                 raise
             raise LinkClosed(_had_by(spec, status)) from exc
-        finally:
-            opening.cancel()
         yield link
 
 
@@ -216,7 +200,7 @@ async def attached(
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
     async with (
-        opened(spec, options, tell=sinks.tell) as link,
+        opened(spec, options) as link,
         connected(link, settings, on_payload=sinks.payload, on_frame=sinks.frame) as connection,
     ):
         await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))

@@ -44,7 +44,7 @@ async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     assert target.spec is not None
     found = _shown([_own_entry(status) for status in await mounts_on(target.spec)], show)
     try:
-        async with opened(target.spec, target.options, tell=target.sinks.tell) as link:
+        async with opened(target.spec, target.options) as link:
             async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
                 found += _shown([entry], show)
     except LinkClosed:  # the mount is another user's, and does not share the port

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import socket
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,36 +68,6 @@ def test_scan_tells_each_vehicle_as_it_comes(two: tuple[SimVehicle, SimVehicle])
     header, *rows = out.splitlines()
     assert header == "SYSTEM/COMPONENT\tWHAT\tFIRMWARE\tUNIQUE ID\tFTP"
     assert [row.split("\t")[0] for row in rows] == ["1/1", "2/1"]
-
-
-def test_a_port_in_use_is_said_to_be_while_it_is_waited_for() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind((HOST, free_udp_port()))
-        source = f"udpin:{HOST}:{other.getsockname()[1]}"
-        for verb in ("scan", "ls"):
-            first, last = command(verb, source, code=2)[1].splitlines()
-            assert first.startswith(
-                f"mavftpfs: opening {source}: it takes long, perhaps because another program"
-            )
-            assert "is in use by another program" in last
-
-
-@pytest.mark.holds("promise 2")
-def test_what_is_put_under_the_name_of_a_swap_file_is_on_the_card_or_an_error(
-    field: Field, tmp_path: Path
-) -> None:
-    """A mount keeps such names in its memory."""
-    card = field.local("card")
-    vehicle = field.sim(card)
-    (tmp_path / ".a.swp").write_bytes(b"swap")
-    mavftpfs("put", vehicle.source, tmp_path / ".a.swp", "/")
-    assert (card / ".a.swp").read_bytes() == b"swap"
-    (card / ".a.swp").unlink()
-    mount = field.mount(vehicle.source)
-    for target in ("/", "/.b.swp"):
-        _, said = mavftpfs("put", mount.path, tmp_path / ".a.swp", target, code=4)
-        assert "would stay in the mount's memory" in said
-    assert mount.run("ls", "-A", mount.path).stdout == ""
 
 
 @pytest.mark.holds("promise 1")
