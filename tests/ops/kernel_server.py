@@ -45,7 +45,8 @@ class Server:
         """Stand in for a vehicle, of which nothing but its files is known."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self.listen, invalidate)
-            vehicle = SimpleNamespace(tree=self.tree, status=dict, space=lambda: None, notice=str)
+            vehicle = SimpleNamespace(tree=self.tree, space=lambda: None, notice=str)
+            vehicle.status = lambda: {"vehicle": {"system": 1, "component": 1}}
             vehicle.watcher = SimpleNamespace(run=trio.sleep_forever)
             yield cast(Attached, vehicle)
             nursery.cancel_scope.cancel()
