@@ -102,10 +102,16 @@ def _hubs(source: str | None, request: Facts) -> Iterator[tuple[str, Status]]:
 
 
 def _ask(name: str, request: Facts) -> Status | None:
-    """Return the reply of the hub that has a port; None if there is none, but perhaps a program alone."""
+    """Return the reply of the hub that has a port; None if there is none, but perhaps a program alone.
+
+    Raises:
+        UsageError: the hub refuses that.
+    """
     with suppress(OSError), connect(name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(pack_facts({"protocol": PROTOCOL, **request}))
         reply = unpack_facts(sock.recv(1 << 16))
-        return reply if reply is not None and "refused" not in reply else None
+        if reply is not None and "refused" in reply:
+            raise UsageError(reply["refused"])
+        return reply
     return None

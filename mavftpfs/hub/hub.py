@@ -64,7 +64,9 @@ _COMPONENTS = 249
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
 _USB = "/dev/ttyACM"
-_OTHERS = "{} is shared by programs of another user, who alone can stop that or forward frames"
+_OTHERS = (
+    "{}: the hub of another user has this port; only that user, or root, may use forward= or stop the hub"
+)
 
 
 @dataclass(slots=True)
