@@ -1,8 +1,7 @@
 """Open regular files: close-to-open consistency over cached blocks. Layer: cache.
 
 At open it is decided whether the version in the cache is still the vehicle's file:
-- It is if a fresh listing shows its size and mtime. For a file that we wrote this proves nothing: others may
-  have replaced it before any listing told its time.
+- It is if a fresh listing shows its size and mtime.
 - It is if that was proven (by an open reply or a listing) less than `dir_timeout` ago, and no later listing
   contradicts. Then the vehicle is not asked.
 - Else the file is opened on the vehicle, and a new version starts with the size in the reply: equal sizes
@@ -59,9 +58,6 @@ PAUSES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Seconds that a read waits before it tries again after its bytes were dropped in doubt. Together they are
 longer than it takes to notice that another client used our session."""
 
-ADOPTED_AT_ONCE = 64 * 1024
-"""Bytes of a file we wrote that are read at once."""
-
 COMPARE_PAUSE = 2.0
 """Seconds between two listings that only compare one file, or 50 times what the last one took if that is
 more. A read that reaches the end of the file does not wait for that."""
@@ -94,7 +90,6 @@ class Files:
         self.cache = cache
         self._clock = cache.clock
         self._proof_time = proof_time
-        self._restarted_at = NEVER
         self._directories = directories
         self._invalidate = invalidate
         self.paths = PathLocks(cache.patience)
@@ -330,9 +325,9 @@ class Files:
 
     def rebooted(self) -> None:
         """Forget all proofs. Open files are compared before more of their bytes are given out."""
-        self._restarted_at = self._clock()
+        now = self._clock()
         for version in dict.fromkeys((*self._newest.values(), *self.open_versions)):
-            version.on_restart(self._restarted_at)
+            version.on_restart(now)
 
     # --- we changed the file ourselves
 
@@ -358,19 +353,6 @@ class Files:
             version.mark_replaced(f"{version.path!r} was changed here")
         for node in self._nodes.below(path):
             node.close_base()
-
-    def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
-        """Cache the content of a file that we wrote, and that was proven then; `read(start, stop)` returns
-        it."""
-        self.on_changed(path)
-        if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
-            return
-        version = self._version(path, size)
-        version.proven_at, version.in_kernel = proven_at, True
-        version.ours = True
-        self._set_newest(version)
-        for at in range(0, size, ADOPTED_AT_ONCE):
-            version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """Note that a file, or a directory with all below it, has another path now; open files follow."""

@@ -49,12 +49,6 @@ from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_vir
 
 __all__ = ["OpenFile", "Stat", "Tree"]
 
-CLOCK_SET = 1_420_070_400
-"""2015-01-01 UTC: an older mtime is that of a vehicle whose clock was not set."""
-
-MAX_CHECKSUMS = 1024
-"""How many of the vehicle's checksums are remembered."""
-
 
 class Tree:
     """The vehicle's files below `options.root`, which is `/` in every path given and called back.
@@ -103,7 +97,6 @@ class Tree:
         self._local = LocalFiles(
             () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
         )
-        self._checksums: dict[tuple[bytes, int, int], int] = {}
         self._writing = Writeback(
             store=store,
             directories=self._directories,
@@ -239,8 +232,7 @@ class Tree:
         return await self._writing.open_reader(remote)
 
     async def crc32(self, path: bytes) -> int:
-        """Return the vehicle's CRC32 of a file (start value 0, no final xor). If the vehicle's clock was set,
-        it is asked for again only after size or mtime changed.
+        """Return the vehicle's CRC32 of a file (start value 0, no final xor).
 
         Of an `@` file it is the CRC32 of the bytes that a reader gets: the vehicle makes them at every open.
 
@@ -261,16 +253,8 @@ class Tree:
         found = await self._directories.find(remote)
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{remote!r} is a directory")
-        key = (remote, found.size, found.entry.mtime or 0)
-        value = self._checksums.get(key)
-        if value is None:
-            self._directories.require_heard()
-            value = await self._store.crc32(remote, size=found.size)
-            if len(self._checksums) == MAX_CHECKSUMS:
-                self._checksums.clear()
-            if key[2] >= CLOCK_SET and self._directories.entry(remote) is found.entry:
-                self._checksums[key] = value
-        return value
+        self._directories.require_heard()
+        return await self._store.crc32(remote, size=found.size)
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
 
@@ -377,10 +361,7 @@ class Tree:
             await self._require_parent(target)
             self._local.rename(source, target, noreplace=noreplace)
         else:
-            try:
-                await self._writing.namespace.rename(source, target, noreplace=noreplace)
-            finally:
-                self._checksums.clear()  # two files may have one size and mtime
+            await self._writing.namespace.rename(source, target, noreplace=noreplace)
             self._local.follow_rename(source, target)
 
     async def withdraw(self, path: bytes) -> bool | None:
@@ -424,7 +405,6 @@ class Tree:
     def forget_caches(self) -> None:
         """Drop everything that no open file uses."""
         self._directories.forget(ROOT)
-        self._checksums.clear()
         self._files.forget_closed()
         self._forget_virtual()
 
@@ -452,7 +432,6 @@ class Tree:
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
         self._directories.rebooted()
-        self._checksums.clear()
         self._forget_virtual()
         self._files.rebooted()
         self._writing.retry()

@@ -165,7 +165,7 @@ class Version:
 
     Attributes:
         path: its present path. size: in bytes, by the open reply. mtime: None if not known to belong to this
-            size. ours: we wrote it.
+            size.
         proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
         opened_at: when the server opened the file for the present session.
         compare_after: until then no listing is asked for only to compare it.
@@ -192,7 +192,7 @@ class Version:
         self.handles = 0
         self.proven_at = cache.clock()
         self.opened_at = self.compare_after = NEVER
-        self.ours = self.in_kernel = self.ignores_data = False
+        self.in_kernel = self.ignores_data = False
         self.doubts = 0
         self._why = ""  # it was replaced
         self._on_doubt = on_doubt
@@ -239,10 +239,10 @@ class Version:
             block[at : at + count] = data
             self._present.add(offset, offset + count)
             return
-        self.preload(offset, data)
+        self._keep(offset, data)
 
-    def preload(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep bytes that did not come over the link, where none are here yet."""
+    def _keep(self, offset: int, data: bytes | memoryview) -> None:
+        """Keep bytes where none are here yet."""
         whole = memoryview(data)
         for at, stop in self._present.missing(offset, min(offset + len(data), self.size)):
             while at < stop:
@@ -322,7 +322,7 @@ class Version:
     def known(self) -> Known:
         """What it is compared by."""
         restarted = self.proven_at == NEVER
-        return Known(self.size, self.mtime, restarted=restarted, ours=self.ours)
+        return Known(self.size, self.mtime, restarted=restarted)
 
     def require_not_replaced(self) -> None:
         """Raise FileChanged if another file has the path."""

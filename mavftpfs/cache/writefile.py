@@ -7,7 +7,6 @@ handle reads nothing more, whatever is written under the path later: that belong
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,16 +18,13 @@ from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
+from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError
 
 TRIES = 3
 """How often a read starts again because the file was delivered meanwhile."""
 
 MAX_FILE = 2**32 - 1
 """Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
-
-ADOPTED_PART = 4
-"""A delivered file goes to the block cache if the cache is at least so many times as large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +122,7 @@ class ReadFile(OpenFile):
         if node.removed:
             node.forget_draft()
             return
-        draft, context = node.draft, self._context
-        if draft is not None and draft.state is State.CLEAN and not node.lock.locked() and draft.whole:
-            # The vehicle has it: its content is ordinary cache from now on.
-            fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-            if fits:
-                with suppress(SpoolFailed):  # the local disk does not give it back
-                    context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.proven_at)
-        context.nodes.maybe_forget(node)
+        self._context.nodes.maybe_forget(node)
 
     # --- inside
 

@@ -34,7 +34,6 @@ class Known:
     size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
     restarted: the vehicle restarted since the last proof. After a restart no program goes on writing an old
     file.
-    ours: we wrote it. Others may have replaced it before a listing told its time: an equal one is no proof.
     at_open: a program opens it now. Then equal sizes are no proof where no time is told.
     """
 
@@ -42,7 +41,6 @@ class Known:
     mtime: int | None = None
     crc32: int | None = None
     restarted: bool = False
-    ours: bool = False
     at_open: bool = False
 
 
@@ -101,7 +99,7 @@ def _by_listing(known: Known, seen: Listed) -> Sameness:
     timed = known.mtime is not None and entry.mtime is not None
     if timed and known.mtime != entry.mtime:
         return Sameness.OTHER
-    if known.ours or (known.at_open and not timed):
+    if known.at_open and not timed:
         return Sameness.UNDECIDED
     return Sameness.SAME
 

@@ -40,8 +40,6 @@ TABLE: list[tuple[str, Known, Seen, Sameness]] = [
     ("equal, and of that time", Known(SIZE, 5, at_open=True), listed(mtime=5), SAME),
     ("equal, and of that time after a restart", Known(SIZE, 5, restarted=True), listed(mtime=5), SAME),
     ("equal, of another time", Known(SIZE, 5), listed(mtime=6), OTHER),
-    ("ours, and of the time that was told later", Known(SIZE, 5, ours=True), listed(mtime=5), UNDECIDED),
-    ("ours, of another time", Known(SIZE, 5, ours=True), listed(mtime=6), OTHER),
     ("its CRC32 is not known", Known(SIZE), Summed(7), UNDECIDED),
     ("the same CRC32", Known(SIZE, crc32=7), Summed(7), SAME),
     ("another CRC32", Known(SIZE, crc32=7), Summed(8), OTHER),

@@ -302,17 +302,11 @@ async def test_files_that_the_root_of_sitl_does_not_list_are_not_shown(
 # --- checksums
 
 
-@pytest.mark.parametrize(("mtime", "asked"), [(MTIME, 2), (315_532_800, 4)])
-async def test_a_checksum_is_kept_as_long_as_size_and_mtime(
-    here: Rig, tree: Tree, mtime: int, asked: int
-) -> None:
-    """An mtime of a clock that was not set tells nothing."""
-    for number, content in enumerate((b"hello", b"olleh")):
-        here.put(A, content, mtime + number)
-        for _ in range(2):
-            assert await tree.crc32(A) == crc32(content)
-            await trio.sleep(30)
-    assert here.count(CRC) == asked
+async def test_a_checksum_is_that_of_now(here: Rig, tree: Tree) -> None:
+    """Size and time are the same."""
+    for content in (b"hello", b"olleh"):
+        here.put(A, content, MTIME)
+        assert await tree.crc32(A) == crc32(content)
 
 
 async def test_checksums_are_refused(here: Rig, tree: Tree) -> None:
