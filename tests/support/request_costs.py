@@ -164,10 +164,10 @@ ELSEWHERE = {
         "first append": f"{REWRITE}, crc 3, {REPLACED}; 602 B",
         "echo >>": f"{REWRITE}, crc 2, {REPLACED}; 602 B",
     },
-    "ardupilot": {MOUNT: "list 7"},  # "/" shows no files, so "." is listed too
+    "ardupilot": {MOUNT: "list 4"},
     "ardupilot5": {
         **FAT,
-        MOUNT: "list 6",
+        MOUNT: "list 3",
         # That it does not rename over a file is learnt, and the names are looked at after the refusal.
         "first append": f"list 6, {REWRITE}, crc 2, rename 3, remove 1; 602 B",
         "echo >>": f"{TIMED}, {REPLACED}; 602 B",
