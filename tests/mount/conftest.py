@@ -6,6 +6,7 @@ Nothing here skips: a machine that cannot mount fails these tests (scripts/setup
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -95,6 +96,16 @@ def field(tmp_path: Path) -> Iterator[Field]:
     field = Field(tmp_path)
     yield field
     field.close()
+
+
+@pytest.fixture
+def open_field() -> Iterator[Field]:
+    """A field in a directory that other users may enter; they may not enter those of pytest."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name, ExitStack() as stack:
+        Path(name).chmod(0o755)
+        field = Field(Path(name))
+        stack.callback(field.close)
+        yield field
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -118,16 +115,6 @@ def test_a_dead_mount_is_said_to_be_dead_and_watching_it_ends_when_it_is_cleared
             abort_mount(mount.path)
         assert watch.wait(COMMAND_TIMEOUT) == ExitCode.MOUNT_FAILED
         assert watch.stderr.read() == f"mavftpfs: no vehicle of yours is mounted on {mount.path}\n"
-
-
-@pytest.fixture
-def open_field() -> Iterator[Field]:
-    """A field in a directory that other users may enter; they may not enter those of pytest."""
-    with tempfile.TemporaryDirectory(dir="/tmp") as name, ExitStack() as stack:
-        Path(name).chmod(0o755)
-        field = Field(Path(name))
-        stack.callback(field.close)
-        yield field
 
 
 def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(

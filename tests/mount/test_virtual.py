@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,22 @@ def test_modes_show_what_can_be_written(ardupilot: Mount) -> None:
     assert told == shown
     ardupilot.run("chmod", "u+w", "@SYS/uarts.txt", cwd=ardupilot.path)
     assert not (ardupilot.path / "@SYS/uarts.txt").stat().st_mode & 0o222
+
+
+@pytest.mark.needs("root")
+def test_an_ordinary_user_edits_parameters_and_is_told_what_is_only_read(
+    open_field: Field, small_tree: Path
+) -> None:
+    """An editor tries to make a file beside the text first, which the modes must not forbid."""
+    options = ("allow_other", "uid=65534", "gid=65534")
+    mount = open_field.mount(open_field.sim(small_tree, "ardupilot").source, *options)
+    vim = "HOME=/tmp vim -es -u NONE -i NONE -n -c '%s/^RTL_ALT,.*/RTL_ALT,3100/' -c wq @PARAM/params.parm"
+    user = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "sh", "-c")
+    where = f"cd {shlex.quote(str(mount.path))}"
+    mount.run(*user, f"{where} && {vim} && grep -x RTL_ALT,3100 @PARAM/params.parm", cwd=Path("/"))
+    for change in ("echo x > @SYS/uarts.txt", "echo x > @SYS/new", "mkdir @SYS/new", "rm @PARAM/param.pck"):
+        done = mount.run(*user, f"{where} && {change}", cwd=Path("/"), code=None)
+        assert ("Read-only" if "@PARAM" in change else "Permission denied") in done.stderr
 
 
 PLAN = """QGC WPL 110
