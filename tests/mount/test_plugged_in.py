@@ -196,7 +196,7 @@ def test_root_does_not_run_what_another_user_owns(installation: Installation, pl
         (
             [
                 'mkdir -m 700 "$1/closed"',
-                f'printf \'#!/bin/sh\\nexec {sys.executable} "$@"\\n\' > "$1/closed/python"',
+                f'printf \'#!/bin/sh\\nexec "{sys.executable}" "$@"\\n\' > "$1/closed/python"',
                 'chmod 755 "$1/closed/python"',
                 'sed -i "1s,.*,#!$1/closed/python," "$2/mavftpfs"',
             ],
