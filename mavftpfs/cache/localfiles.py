@@ -20,6 +20,12 @@ from mavftpfs.shared.model import EntryKind, rename_keys, split
 
 MAX_FILES = 10_000
 
+NAMES = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
+"""What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
+find out whether the disk cuts names short."""
+
+_PATTERN = compile_pattern("|".join(map(translate, NAMES)).encode())
+
 
 @dataclass(slots=True, eq=False)
 class LocalFile:
@@ -31,11 +37,9 @@ class LocalFile:
     named: bool = True
 
 
-def matching(patterns: tuple[str, ...]) -> Callable[[bytes], bool]:
-    """Return a function that returns whether a path is local: a name in it fits one of the patterns."""
-    joined = "|".join(translate(pattern) for pattern in patterns) or r"(?!)"
-    pattern = compile_pattern(joined.encode("utf-8", "surrogateescape"))
-    return lambda path: any(map(pattern.match, path.split(b"/")))
+def stays_local(path: bytes) -> bool:
+    """Return whether a name in a path is one of those that never reach the vehicle."""
+    return any(map(_PATTERN.match, path.split(b"/")))
 
 
 class LocalFiles:
@@ -45,9 +49,9 @@ class LocalFiles:
         used: bytes of content, also of files that are open and have no name any more.
     """
 
-    def __init__(self, patterns: tuple[str, ...], limit: int, now_ns: Callable[[], int]) -> None:
-        """`limit`: bytes of all content."""
-        self._matches = matching(patterns)
+    def __init__(self, limit: int, now_ns: Callable[[], int], *, used: bool) -> None:
+        """`limit`: bytes of all content. used: False if all names are the vehicle's."""
+        self._is_used = used
         self._limit = limit
         self._now_ns = now_ns
         self._files: dict[bytes, LocalFile] = {}
@@ -55,7 +59,7 @@ class LocalFiles:
 
     def owns(self, path: bytes) -> bool:
         """Return whether a path is local, whether it exists or not."""
-        return self._matches(path)
+        return self._is_used and stays_local(path)
 
     def find(self, path: bytes) -> LocalFile:
         """Return the file of a path.

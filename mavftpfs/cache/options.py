@@ -19,10 +19,6 @@ DIR_TIMEOUT = 20.0
 ATTRIBUTES_HOLD, ABSENCE_HOLDS = 1.0, 2.0
 """Seconds that the kernel may keep attributes, and an absent name; less if `dir_timeout` is shorter."""
 
-DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
-"""What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
-find out whether the disk cuts names short."""
-
 
 @dataclass(frozen=True, slots=True)
 class CacheOptions:
@@ -38,10 +34,9 @@ class CacheOptions:
     op_deadline: a read ends when none of its bytes came for so long.
     link_rate: bytes per second that the link carries at most, where that is known before anything is
     measured.
-    verify: auto, size, crc (see cache.verify) or none; verify_max: largest file whose CRC32 is
-    asked. write_armed: change things in flight too.
-    inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the
-    vehicle; local_max: bytes they may take.
+    verify_max: largest written file whose CRC32 is asked for without a doubt. write_armed: change things in
+    flight too. inplace: overwrite files where they cannot be replaced. local: files of `localfiles` never
+    reach the vehicle; local_max: bytes they may take.
 
     Raises:
         UsageError: a value is out of range.
@@ -58,11 +53,10 @@ class CacheOptions:
     probe_time: float = 3.0
     op_deadline: float = 30.0
     link_rate: float | None = None
-    verify: str = "auto"
     verify_max: int = 4 * MIB
     write_armed: bool = False
     inplace: bool = False
-    local: tuple[str, ...] = DEFAULT_LOCAL
+    local: bool = True
     local_max: int = 16 * MIB
 
     @property

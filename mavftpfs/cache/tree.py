@@ -95,7 +95,7 @@ class Tree:
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )
         self._local = LocalFiles(
-            () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
+            options.local_max, lambda: int(wall() * SECOND), used=options.local and not options.read_only
         )
         self._writing = Writeback(
             store=store,
@@ -315,7 +315,7 @@ class Tree:
         remote = self._remote(path)
         self._require_writable(remote)
         if self._local.owns(remote):
-            raise NotSupported(f"{remote!r} is a name for files that stay in memory (local=)")
+            raise NotSupported(f"{remote!r} is a name for files that stay in memory")
         await self._writing.namespace.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:

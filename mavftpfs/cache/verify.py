@@ -1,6 +1,6 @@
 """Compares a file that was sent with what it should be (promise 2). Layer: cache.
 
-Files up to verify_max are compared by the vehicle's CRC32; in doubt, and with verify=crc, files of any size.
+Files up to verify_max are compared by the vehicle's CRC32; in doubt, files of any size.
 A CRC32 covers the whole file, so the right one proves the size, too. Only zeros at the beginning of a file do
 not change it (servers.md 10): a file of nothing but zeros has the CRC32 0. So if it is 0, or if the vehicle
 told none, the file is opened to learn its size. A file without a CRC32 counts as verified by size; that is
@@ -40,22 +40,20 @@ class Verifier:
         doubted: the file may have other bytes than the ACKs say, so the size alone proves nothing.
 
         Raises:
-            VerificationFailed: the vehicle has another file or none, or told no CRC32 although verify=crc.
-            NotVerified: doubted, and the vehicle told no CRC32. Armed: doubted, and a CRC32 is not asked for
-            in flight. Else as VehicleStore.stat_size.
+            VerificationFailed: the vehicle has another file or none.
+            NotVerified: doubted, and the vehicle told no CRC32. Armed: none is asked for in flight, and it is
+            doubted, or nothing may be changed now. Else as VehicleStore.stat_size.
         """
-        options, crc32 = self._context.options, None
-        why: Exception | None = None
-        if options.verify == "none" and not doubted:
-            return None
-        by_crc = doubted or options.verify == "crc"
-        by_crc |= options.verify == "auto" and draft.size <= options.verify_max
-        if by_crc and draft.size:
+        crc32, why = None, None
+        if draft.size and (doubted or draft.size <= self._context.options.verify_max):
             try:
                 crc32 = await self._context.store.crc32(path, size=draft.size)
             except (FtpNak, RequestTimeout, Armed) as error:
-                self._go_without(path, error)
+                self._context.require_disarmed()  # it is asked for after the flight
                 why = error
+                if not isinstance(error, Armed):
+                    self.counts["checksums_unanswered"] += 1
+                    log.warning("%r: its checksum was not told: %s", path, error)
         if crc32 is not None and crc32 != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
         if not crc32:
@@ -80,13 +78,13 @@ class Verifier:
         Raises:
             As VehicleStore.stat_size and Directories.ask_entry.
         """
-        context, options = self._context, self._context.options
+        context = self._context
         timed = context.directories.tells_times or base.mtime is not None
         if timed:
             entry = await context.directories.ask_entry(path)
             if compare(base, Listed(entry)) in (Sameness.OTHER, Sameness.GREW):
                 return False
-        if base.crc32 is not None and base.size <= options.verify_max and options.verify in ("auto", "crc"):
+        if base.crc32 is not None and base.size <= context.options.verify_max:
             with suppress(FtpNak, RequestTimeout, Armed):
                 told = Summed(await context.store.crc32(path, size=base.size))
                 answer = compare(base, told)
@@ -96,18 +94,3 @@ class Verifier:
             return True
         size = await self._names.size(path)
         return size is not None and compare(base, Opened(size)) is Sameness.SAME
-
-    # --- inside
-
-    def _go_without(self, path: bytes, error: Exception) -> None:
-        """Note that no checksum came.
-
-        Raises:
-            VerificationFailed: verify=crc needs one. Armed: it can be asked for after the flight.
-        """
-        if self._context.options.verify == "crc":
-            self._context.require_disarmed()  # Armed: it is asked for after the flight
-            raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
-        if not isinstance(error, Armed):
-            self.counts["checksums_unanswered"] += 1
-            log.warning("%r: its checksum was not told: %s", path, error)

@@ -17,8 +17,7 @@ from typing import TypeVar
 import trio
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.cache.localfiles import matching
-from mavftpfs.cache.options import DEFAULT_LOCAL
+from mavftpfs.cache.localfiles import stays_local
 from mavftpfs.client import control
 from mavftpfs.client.mountpoint import XATTR_CRC32
 from mavftpfs.client.status import is_read_only, told_by
@@ -212,9 +211,6 @@ def _size_of_opened(fd: int) -> int:
     return found.st_size
 
 
-_stays_in_memory = matching(DEFAULT_LOCAL)
-
-
 class MountedFiles:
     """Implements Files by the kernel's calls."""
 
@@ -271,7 +267,7 @@ class MountedFiles:
 
     async def _open(self, path: bytes, flags: int) -> MountedFile:
         writable = bool(flags & (os.O_RDWR | os.O_TRUNC))
-        if writable and _stays_in_memory(path):
+        if writable and stays_local(path):
             raise errors.NotSupported(
                 f"{name_text(path)} would stay in the mount's memory, as editors' swap files do, and never "
                 "reach the card; choose another name, or unmount first"

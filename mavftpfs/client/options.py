@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from mavftpfs.cache.options import DEFAULT_LOCAL
 from mavftpfs.link.uri import LinkSpec, parse_endpoint
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
@@ -46,7 +45,7 @@ class Options:
     verify_max: int = 4 << 20
     when_armed: Literal["ro", "ok"] = "ro"
     inplace: bool = False
-    local: tuple[str, ...] = DEFAULT_LOCAL
+    local: bool = True
     tlog: str | None = None
     forward: tuple[str, ...] = ()
     gone: tuple[str, ...] = field(default=(), compare=False)

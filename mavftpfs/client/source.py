@@ -58,7 +58,7 @@ def target_of(source: str, options: Options) -> Target:
         UsageError: it is no SOURCE, or contradicts the options.
     """
     # A mount keeps editors' swap files in memory. What a command or a program puts is meant for the card.
-    options = replace(options, local=())
+    options = replace(options, local=False)
     mount = mountpoint_of(source)
     if mount is not None:
         if options.root != ROOT:

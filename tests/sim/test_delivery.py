@@ -119,15 +119,14 @@ def never_rename(here: Rig, *, loses: bool) -> None:
 @pytest.mark.parametrize("loses", [False, True], ids=["does nothing", "removes it"])
 @pytest.mark.parametrize("size", [0, 600, 50_000])
 @pytest.mark.parametrize(
-    ("profile", "verify"),
-    [("px4", "auto"), ("px4", "none"), ("ardupilot5", "crc"), ("mavsdk", "size"), ("mavsdk", "none")],
+    ("profile", "verify_max"), [("px4", 1 << 20), ("px4", 0), ("ardupilot5", 1 << 20), ("mavsdk", 0)]
 )
 async def test_a_server_that_says_that_it_renames_and_does_not(
-    profile: str, verify: str, size: int, loses: bool
+    profile: str, verify_max: int, size: int, loses: bool
 ) -> None:
     """Each close() said that the file is there, and nothing was on the card."""
     async with rig(profile, {FILE: OLD}) as here:
-        tree = here.mount(verify=verify)
+        tree = here.mount(verify_max=verify_max)
         never_rename(here, loses=loses)
         for path in (FRESH, b"/d/newer"):
             await write_file(tree, path, content(size))
@@ -285,12 +284,12 @@ async def test_a_new_file_of_which_it_is_not_known_whether_it_was_made_in_place(
 
 @pytest.mark.holds("promise 3")
 @pytest.mark.parametrize("target_too", [False, True])
-@pytest.mark.parametrize("verify", ["auto", "none"])
+@pytest.mark.parametrize("verify_max", [1 << 20, 0])
 async def test_a_temporary_that_vanished_is_not_taken_for_success(
-    here: Rig, verify: str, target_too: bool
+    here: Rig, verify_max: int, target_too: bool
 ) -> None:
     """While the link was lost between the verification and the rename, somebody tidied up."""
-    tree = here.mount(verify=verify)
+    tree = here.mount(verify_max=verify_max)
     here.put(FILE, NEW[::-1])  # of the same size
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
@@ -368,50 +367,49 @@ async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(here: Rig) -
 
 
 @pytest.mark.holds("promise 2")
-async def test_an_unanswered_checksum_counts_as_verified_by_size_unless_it_is_demanded(here: Rig) -> None:
+async def test_an_unanswered_checksum_counts_as_verified_by_size(here: Rig) -> None:
     here.faults.ignore(Opcode.CALC_FILE_CRC32)
     tree = here.mount()
     await write_file(tree, FRESH, NEW)
     assert (tree.status()["checksums_unanswered"], tree.status()["verified_by_size"]) == (1, 1)
-    with pytest.raises(VerificationFailed):
-        await write_file(here.mount(verify="crc"), b"/d/newer", NEW)
 
 
-@pytest.mark.parametrize(("verify", "asked"), [("size", 0), ("none", 0), ("auto", 0), ("crc", 2)])
-async def test_what_is_too_large_or_not_wanted_is_not_summed(here: Rig, verify: str, asked: int) -> None:
-    await write_file(here.mount(verify=verify, verify_max=100), FRESH, NEW)
-    assert here.count(Opcode.CALC_FILE_CRC32) == asked
+@pytest.mark.parametrize("verify_max", [0, len(NEW) - 1])
+async def test_what_is_too_large_is_not_summed(here: Rig, verify_max: int) -> None:
+    await write_file(here.mount(verify_max=verify_max), FRESH, NEW)
+    assert here.count(Opcode.CALC_FILE_CRC32) == 0
 
 
 @pytest.mark.holds("promise 2")
-@pytest.mark.parametrize(("verify", "data"), [("size", NEW), ("auto", bytes(5000))])
-async def test_what_was_cut_off_is_noticed_by_its_size(here: Rig, verify: str, data: bytes) -> None:
+@pytest.mark.parametrize(("verify_max", "data"), [(0, NEW), (1 << 20, bytes(5000))])
+async def test_what_was_cut_off_is_noticed_by_its_size(here: Rig, verify_max: int, data: bytes) -> None:
     """The checksum of zeros is right, however many there are."""
     here.faults.at(Opcode.TERMINATE_SESSION, lambda: here.put(here.litter()[0], data[:300]))
-    await write_file(here.mount(verify=verify), FRESH, data)
+    await write_file(here.mount(verify_max=verify_max), FRESH, data)
     assert here.data(FRESH) == data
     assert here.count(Opcode.CREATE_FILE) == 2
 
 
 @pytest.mark.holds("promise 9")
 async def test_no_checksum_is_asked_for_in_flight() -> None:
-    """So with verify=crc nothing is delivered then."""
+    """Where a file is in doubt it is not delivered then."""
     async with rig(options=ConnectOptions(when_armed="ok")) as here:
-        tree = here.mount(verify="crc", write_armed=True)
+        tree = here.mount(write_armed=True)
         await here.arm()
-        with pytest.raises(VerificationFailed):
-            await write_file(tree, b"/new", b"x" * 200)
+        await write_file(tree, b"/new", NEW)
+        assert here.data(b"/new") == NEW
+        here.connection.scheduler.doubt.raise_it("for the test")
+        with pytest.raises(Armed):
+            await write_file(tree, b"/newer", NEW)
+        assert b"/newer" not in here.files()
         assert here.count(Opcode.CALC_FILE_CRC32) == 0
-        assert b"/new" not in here.files()
-        await write_file(here.mount(write_armed=True), b"/newer", NEW)
-        assert here.data(b"/newer") == NEW
 
 
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("path", [FRESH, FILE])
 async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> None:
     """What is there is compared after it was disarmed."""
-    tree = here.mount(verify="crc")
+    tree = here.mount()
     here.faults.at(Opcode.TERMINATE_SESSION, here.vehicle.arm)
     with pytest.raises(Armed):
         await write_file(tree, path, b"x" * 5000)

@@ -50,7 +50,7 @@ async def test_names_that_look_alike_are_the_vehicles(here: Rig, tree: Tree) -> 
 
 
 async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
-    await write_file(here.mount(local=()), SWAP, b"data")
+    await write_file(here.mount(local=False), SWAP, b"data")
     assert here.data(SWAP) == b"data"
 
 

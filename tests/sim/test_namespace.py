@@ -244,7 +244,7 @@ async def test_a_name_that_no_listing_can_show_is_refused_and_nothing_is_sent(
     fat: Rig, act: Callable[[Tree, bytes], Awaitable[None]], path: bytes
 ) -> None:
     """It could never be removed. Of names that never reach the vehicle any will do."""
-    tree = fat.mount(local=("*.swp",))
+    tree = fat.mount()
     with pytest.raises(MavftpfsError) as told:
         await act(tree, path)
     assert errno_for(told.value) == errno.EINVAL

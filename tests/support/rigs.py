@@ -2,7 +2,7 @@
 test may do to them.
 
     async with rig("px4", {FILE: b"content"}) as here:
-        tree = here.mount(verify="size")
+        tree = here.mount(verify_max=0)
 
 `card` makes a fixture of it. Paths are the mount's: where only a part of the card may be written (px4-nuttx),
 that part is the root of the mount. What happens to single requests is `here.faults`. What goes through the
