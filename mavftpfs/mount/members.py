@@ -82,13 +82,13 @@ class Member:
 
 
 class Members:
-    """The vehicles of one mount."""
+    """The vehicles of one mount, in the order of their system ids."""
 
     def __init__(self) -> None:
         self._members: dict[int, Member] = {}
 
     def __iter__(self) -> Iterator[Member]:
-        return iter(list(self._members.values()))
+        return iter(sorted(self._members.values(), key=lambda member: member.system))
 
     def __len__(self) -> int:
         return len(self._members)

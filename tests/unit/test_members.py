@@ -13,14 +13,14 @@ def beat(system: int, component: int = 1, autopilot: int = 12) -> Heartbeat:
     return Heartbeat(Address(system, component), 2, autopilot, False)
 
 
-def test_an_autopilots_heartbeat_makes_its_vehicle_known() -> None:
+def test_an_autopilots_heartbeat_makes_its_vehicle_known_and_they_are_in_order() -> None:
     members = Members()
     members.hear(beat(255, 190, MAV_AUTOPILOT_INVALID), 0.0)
     members.hear(beat(2, 100, MAV_AUTOPILOT_INVALID), 0.0)
     assert len(members) == 0
+    members.hear(beat(10), 1.0)
     members.hear(beat(2), 1.0)
-    members.hear(beat(1), 1.0)
-    assert [member.name for member in members] == ["2", "1"]
+    assert [member.name for member in members] == ["2", "10"]
 
 
 def due(members: Members, now: float) -> list[str]:
