@@ -85,6 +85,8 @@ class Deliverer:
         self._names = names
         self._throttle = throttle
         self.verifier = Verifier(context, names)
+        self.parts: list[bytes] = []
+        """What broken files left on the card: their temporary files, or parts under their own names."""
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
         """Bring a node's file to the vehicle, and verify it, if it is to be delivered at all. `wanted` is
@@ -92,7 +94,7 @@ class Deliverer:
 
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileChanged, AlreadyExists,
-            NoSpace, SpoolFailed, RemoteProtocolError.
+            NoSpace, SpoolFailed, RemoteProtocolError, WriteFailed.
         """
         try:
             while (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
@@ -102,7 +104,8 @@ class Deliverer:
                     # If a claim cancels it, also while it waits for its path, the loop goes on.
                     with trio.CancelScope() as node.delivery:
                         await self._deliver(node)
-                        return
+                        break
+            node.require_not_broken()
         finally:
             if node.undelivered:  # also if the caller was cancelled
                 self._context.retry_later()
@@ -177,6 +180,64 @@ class Deliverer:
         finally:
             self._context.own.in_use.discard(attempt.path)
 
+    async def break_off(self, node: Node, error: MavftpfsError) -> None:
+        """Break a file, because a program was told that a write failed after others had been taken.
+
+        Nothing of the file is placed, and the vehicle's file, if there is one, has the name again. The part
+        that was written is kept for the recovery directory. The caller has the node's lock, and the draft is
+        neither delivered nor stale.
+        """
+        context, draft, path, attempt = self._context, node.draft, node.path, node.attempt
+        assert draft is not None
+        draft.on(Event.FAILED)
+        node.attempt, node.error = None, error
+        if attempt is not None:
+            with trio.CancelScope(shield=True):
+                await attempt.upload.end()  # only its task ends: the link is not waited for
+            if not attempt.in_place and attempt.upload.may_exist:
+                self.parts.append(attempt.path)
+        if draft.base is None and draft.sent_in_place:
+            self.parts.append(path)
+        context.nodes.on_broken(node)
+        context.times.forget(path)
+        context.files.on_changed(path)
+        context.files.forget_pages(path)
+        context.retry_later()
+        self._throttle.waiting.unpark_all()
+        log.warning(
+            "a write to %r failed (%s): nothing of it is put on the card; the part is kept here", path, error
+        )
+        self._persist(node, draft)
+        draft.content.leave_budget()
+        self._forget_oldest_parts()
+
+    def _forget_oldest_parts(self) -> None:
+        """Forget the oldest broken files if they hold more than the spool may, beside the spool."""
+        broken, most = self._context.nodes.broken, self._context.spool.spool_max
+        held = {path: 0 if node.draft is None else node.draft.held.total for path, node in broken.items()}
+        for path in list(broken)[:-1]:
+            if sum(held.values()) > most:
+                log.warning(
+                    "the part of %r is removed here: parts of later failed writes need its room", path
+                )
+                self._context.nodes.forget_broken(path)
+                del held[path]
+
+    async def remove_parts(self, path: bytes | None = None) -> None:
+        """Remove from the card what broken files left there. path: only of this one.
+
+        Raises:
+            As VehicleStore, after a refusal nothing: what could not be removed is tried again later.
+        """
+        for part in [part for part in self.parts if path in (None, part)]:
+            try:
+                await self._names.remove_if_there(part)
+            except FtpNak as nak:
+                log.info("%r stays on the card: %s", part, nak)
+            if part in self.parts:  # else another call was faster
+                self.parts.remove(part)
+            self._context.own.in_use.discard(part)
+
     async def withdraw(self, node: Node) -> bool | None:
         """Take back the undelivered bytes of a file: nothing of it is sent from now on.
 
@@ -187,12 +248,14 @@ class Deliverer:
         context = self._context
         async with node.claim(), context.paths.steady(node, lasting=True):
             draft = node.draft
-            if draft is None or not node.undelivered:
+            if draft is None or not (node.undelivered or node.broken):
                 return not node.removed
-            if node.writers > 1:
+            if node.writers > 1 and not node.broken:
                 return None
             # Where a part was delivered meanwhile, the vehicle has neither the old file nor the new one.
             there: bool | None = None if node.delivered_since_open else False
+            if node.broken:
+                return await self._withdraw_broken(node, draft, there)
             try:
                 if context.replacements.is_unfinished(node.path):
                     await self._end_unfinished(node, draft)
@@ -212,6 +275,15 @@ class Deliverer:
             context.files.on_changed(node.path)
             context.files.forget_pages(node.path)
             return there
+
+    async def _withdraw_broken(self, node: Node, draft: Draft, there: bool | None) -> bool | None:
+        """Forget a broken file; arguments and result as in `withdraw`."""
+        if self._context.nodes.broken.get(node.path) is node:
+            self._context.nodes.forget_broken(node.path)
+        with suppress(MavftpfsError):
+            await self.remove_parts()
+        emptied = draft.sent_in_place and draft.base is not None
+        return None if emptied or node.path in self.parts else there
 
     # --- one delivery
 
@@ -456,6 +528,7 @@ class Deliverer:
         if crc32 is None and draft.size <= context.options.verify_max:
             crc32 = draft.crc32()
         draft.delivered(crc32)
+        context.nodes.forget_broken(node.path)
         node.generation += 1
         node.delivered_since_open = True
         node.proven_at = context.clock()
@@ -466,9 +539,12 @@ class Deliverer:
         known, node.error = node.error, error
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
-        if node.draft is not draft:
-            return
+        if node.draft is draft:
+            self._persist(node, draft)
+
+    def _persist(self, node: Node, draft: Draft) -> None:
+        """Hold the bytes of a file, and what is known of it, where they outlive this process."""
         try:
-            draft.content.persist(describe(node.path, draft, error, self._context.wall))
+            draft.content.persist(describe(node.path, draft, node.error, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
             log.warning("%r may be lost when this mount ends: %s", node.path, trouble)

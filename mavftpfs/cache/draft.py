@@ -32,7 +32,7 @@ class State(Enum):
     CLEAN: it has all of it. DIRTY: it lacks some, or may lack it after interrupted renames (`replacements`
     tells), and nothing is under way. SENDING: a new file is written under a reserved name, or under its own
     if the card cannot rename. COMMITTING: that file is verified and being renamed into place. STALE: the base
-    is another file now.
+    is another file now. BROKEN: a program was told that a write failed, so the vehicle never gets the draft.
     """
 
     CLEAN = "clean"
@@ -40,6 +40,7 @@ class State(Enum):
     SENDING = "sending"
     COMMITTING = "committing"
     STALE = "stale"
+    BROKEN = "broken"
 
 
 class Event(Enum):
@@ -48,7 +49,8 @@ class Event(Enum):
     CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
     BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
     is verified, and the first rename is about to be asked for. PLACED: it has its name. NOT_PLACED: it does
-    not have its name, or that is not known. REPLACED: others replaced the base.
+    not have its name, or that is not known. REPLACED: others replaced the base. FAILED: a write was answered
+    with an error after others had been taken.
     """
 
     CHANGED = "changed"
@@ -59,6 +61,7 @@ class Event(Enum):
     PLACED = "placed"
     NOT_PLACED = "not placed"
     REPLACED = "replaced"
+    FAILED = "failed"
 
 
 TRANSITIONS: dict[State, dict[Event, State]] = {
@@ -73,12 +76,14 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
         Event.BEGUN: State.SENDING,
         Event.PLACED: State.CLEAN,
         Event.REPLACED: State.STALE,
+        Event.FAILED: State.BROKEN,
     },
     State.SENDING: {
         Event.CHANGED: State.SENDING,
         Event.EMPTIED: State.DIRTY,
         Event.GIVEN_UP: State.DIRTY,
         Event.COMMITS: State.COMMITTING,
+        Event.FAILED: State.BROKEN,
     },
     State.COMMITTING: {
         Event.PLACED: State.CLEAN,
@@ -87,6 +92,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.STALE: {
         Event.EMPTIED: State.DIRTY,
     },
+    State.BROKEN: {},
 }
 """State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""
 
@@ -101,6 +107,7 @@ class Content(Protocol):
     def cut(self, size: int) -> None: ...
     def mark_unneeded(self) -> None: ...
     def persist(self, facts: dict[str, Any]) -> str: ...
+    def leave_budget(self) -> None: ...
     def close(self) -> None: ...
 
 

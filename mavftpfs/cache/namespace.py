@@ -134,12 +134,14 @@ class Namespace:
             ours = draft.base is not None or draft.sent_in_place or context.replacements.is_unfinished(path)
             there &= ours or (entry is not None and not entry.size)
         elif entry is None:
+            context.nodes.forget_broken(path)
             raise NotFound(f"{path!r} does not exist")
         elif not there:
             raise IsADirectory(f"{path!r} is a directory")
         else:
             context.require_idle(path)
         await self._names.purge(path)
+        context.nodes.forget_broken(path)
         if there:
             async with self._looks_later(path):
                 await self._names.remove_if_there(path)
@@ -188,6 +190,8 @@ class Namespace:
             context.directories.forget(old)
         context.files.on_renamed(old, new)
         context.nodes.rename(old, new)
+        for path in (old, new):
+            context.nodes.forget_broken(path)
         context.own.follow_rename(old, new)
         context.replacements.follow_rename(old, new)
         self._context.times.rename(old, new)

@@ -19,7 +19,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.shared.errors import FileChanged, MavftpfsError
+from mavftpfs.shared.errors import FileChanged, MavftpfsError, WriteFailed
 from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import SendBuffer
@@ -53,12 +53,12 @@ class Node:
     path: its name, or its last one. draft: its content here, if it was written. handles: how many are open;
     writers: how many of them are for writing. generation: counts how often it was delivered;
     delivered_since_open: since its first writer opened it. removed: it has no name any more. error: why the
-    last delivery failed. attempt: the present attempt to deliver it. base_handle: on the vehicle's file below
-    the draft. start_after: no upload begins by itself before that time (infinite: only a close sends the
-    file). proven_at: when the vehicle was last proven to have what the draft says it has. lock: a program
-    writes the file, a delivery is under way, or a call takes its name away. delivery: the scope of the
-    delivery under way. claims: how many calls wait for the lock to take its name or content away; they go
-    before deliveries.
+    last delivery failed, or the write that broke the file. attempt: the present attempt to deliver it.
+    base_handle: on the vehicle's file below the draft. start_after: no upload begins by itself before that
+    time (infinite: only a close sends the file). proven_at: when the vehicle was last proven to have what the
+    draft says it has. lock: a program writes the file, a delivery is under way, or a call takes its name
+    away. delivery: the scope of the delivery under way. claims: how many calls wait for the lock to take its
+    name or content away; they go before deliveries.
     """
 
     path: bytes
@@ -81,6 +81,11 @@ class Node:
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
         return self.draft is not None and not self.removed and self.draft.state is not State.CLEAN
+
+    @property
+    def broken(self) -> bool:
+        """Whether a write of it failed, so that nothing of it reaches the card."""
+        return self.draft is not None and self.draft.state is State.BROKEN
 
     @property
     def changing(self) -> bool:
@@ -117,6 +122,13 @@ class Node:
         if self.draft is not None and self.draft.state is State.STALE:
             raise FileChanged(f"{self.path!r} is another file by now")
 
+    def require_not_broken(self) -> None:
+        """Raise WriteFailed if a write of it failed."""
+        if self.broken:
+            raise WriteFailed(
+                f"nothing written to {self.path!r} reaches the card, because a write failed: {self.error}"
+            )
+
     def close_base(self) -> None:
         """Close the handle on the vehicle's file: that is another file now, or is not needed."""
         handle, self.base_handle = self.base_handle, None
@@ -150,12 +162,14 @@ class Nodes:
     """All nodes that have a name.
 
     Attributes:
-        replacements: the records of files that we replace.
+        replacements: the records of files that we replace. broken: the last broken file of each path, until
+            the path gets a good file, or loses the one that it has.
     """
 
     def __init__(self) -> None:
         self.replacements = Replacements()
         self._by_path: dict[bytes, Node] = {}
+        self.broken: dict[bytes, Node] = {}
         self._stale: list[Node] = []
 
     def __iter__(self) -> Iterator[Node]:
@@ -201,6 +215,22 @@ class Nodes:
         self.detach(node)
         if not node.handles:
             node.forget_draft()
+
+    def on_broken(self, node: Node) -> None:
+        """Take the name from a file of which a write failed: the file on the vehicle has it again. What was
+        written is kept."""
+        self.detach(node)
+        node.removed = True
+        self.forget_broken(node.path)
+        self.broken[node.path] = node
+
+    def forget_broken(self, path: bytes) -> None:
+        """Forget what was written to a path before a write failed. Programs that have it open read on."""
+        node = self.broken.pop(path, None)
+        if node is not None:
+            node.lose_name()
+            if not node.handles:
+                node.forget_draft()
 
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or a change may have happened in

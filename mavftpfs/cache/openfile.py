@@ -24,6 +24,11 @@ class OpenFile:
         return False
 
     @property
+    def broken(self) -> bool:
+        """Whether a write of the file failed: nothing of it reaches the card, and the name is not its own."""
+        return False
+
+    @property
     def writable(self) -> bool:
         """Whether write, truncate and flush do something. fsync may do something on any handle."""
         return False
@@ -39,16 +44,19 @@ class OpenFile:
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
 
+        If the handle changed the file before, an error breaks the file: see `broken`.
+
         Raises:
-            NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken.
+            NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken. WriteFailed: the file is broken.
         """
         raise LocalProtocolError("write to a handle opened for reading")
 
     async def truncate(self, size: int) -> None:
-        """Cut or extend the file, locally; delivered like written bytes.
+        """Cut or extend the file, locally; delivered like written bytes. An error breaks the file as that of
+        a write does.
 
         Raises:
-            NoSpace, Armed, RequestTimeout.
+            NoSpace, Armed, RequestTimeout, WriteFailed.
         """
         raise LocalProtocolError("truncate of a handle opened for reading")
 
@@ -59,8 +67,9 @@ class OpenFile:
             The reason why bytes are undelivered; as long as they are, at every call.
         """
 
-    async def fsync(self) -> None:
-        """Return when everything written is on the card, checked (promise 2).
+    async def fsync(self, *, ends_write: bool = False) -> None:
+        """Return when everything written is on the card, checked (promise 2). ends_write: a write waits for
+        this (O_SYNC), so an error is one of the write.
 
         Raises:
             As flush.

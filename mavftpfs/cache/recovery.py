@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.reserved import new_owner
 from mavftpfs.cache.spool import remove
 from mavftpfs.shared.private import make_private_directory
@@ -199,11 +199,12 @@ def describe(
     path: bytes, draft: Draft, error: Exception | None, wall: Callable[[], float]
 ) -> dict[str, object]:
     """Return the description of a spooled file, for people and JSON; `held`: the extents whose bytes are
-    here."""
+    here; `broken`: it is what was written before a write failed."""
     return {
         "path": path.decode(errors="surrogateescape"),
         "size": draft.size,
         "whole": draft.whole,
+        "broken": draft.state is State.BROKEN,
         "held": list(draft.held),
         "size_on_vehicle": None if draft.base is None else draft.base.size,
         "error": None if error is None else readable(str(error)),

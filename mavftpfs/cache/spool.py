@@ -150,7 +150,7 @@ class SpoolContent:
 
     def persist(self, facts: dict[str, Any]) -> str:
         """Make bytes and `facts` (JSON) survive the end of this process. A second call does nothing, until
-        more is put or cut.
+        more is put or cut, or other facts than the time (`at`) are given.
 
         Returns the path of the file that holds the bytes.
 
@@ -162,14 +162,19 @@ class SpoolContent:
         assert self._path is not None
         if os.fstat(self._file).st_size < self._stored.end:
             raise SpoolFailed(f"{self._path} lost bytes that were in it")
-        if self._durable:
-            return str(self._path)
         facts = {**facts, **self._spool.vehicle()}
+        if self._durable and {**facts, "at": None} == {**(self._told or {}), "at": None}:
+            return str(self._path)
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
         write_facts(self._path, facts, durable=True)
         self._told, self._durable = facts, True
         return str(self._path)
+
+    def leave_budget(self) -> None:
+        """Stop counting these bytes, because other files need the room. Nothing is put from now on."""
+        self._spool.held -= self._stored.total
+        self._stored = ExtentSet()
 
     def close(self) -> None:
         """Forget the bytes: the vehicle has them, or no program wants them. Raises nothing."""

@@ -493,7 +493,7 @@ class TextHandle(OpenFile, Generic[B]):
             self._before += text
             del self._content[: len(text)]
 
-    async def fsync(self) -> None:
+    async def fsync(self, *, ends_write: bool = False) -> None:
         """As flush."""
         await self.flush()
 

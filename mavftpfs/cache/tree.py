@@ -372,6 +372,10 @@ class Tree:
         """Return the paths of files of which the vehicle does not provably have every byte."""
         return [self._below(remote) for remote in self._writing.undelivered()]
 
+    def broken(self) -> Sequence[bytes]:
+        """Return the paths of files of which a write failed; the parts that were written are kept."""
+        return [self._below(remote) for remote in self._writing.broken()]
+
     async def drain(self, timeout: float) -> Sequence[bytes]:
         """Deliver everything, trying again for at most `timeout` seconds; return what remains."""
         await self._writing.drain(timeout)
@@ -382,7 +386,7 @@ class Tree:
         await self._writing.tidy_up()
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
-        """Move undelivered files, each with its description, to a directory, which is made.
+        """Move undelivered and broken files, each with its description, to a directory, which is made.
 
         Returns the files, [] if there was nothing. A file that cannot be moved stays in the spool for the
         next mount. Blocks the event loop: only for the end of a mount.

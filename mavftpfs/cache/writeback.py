@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -15,7 +16,7 @@ from random import Random
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.delivery import Deliverer, may_pass
+from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
@@ -109,6 +110,7 @@ class Writeback:
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
         """Open a file for writing."""
         self._context.require_disarmed()
+        await self._deliverer.remove_parts(path)
         async with self._context.paths.hold(path, shared=True):
             file = WriteFile(self._parts, await self._need_draft(path, truncate=truncate))
         if truncate:
@@ -124,6 +126,7 @@ class Writeback:
         self._context.require_disarmed()
         require_writable(path)
         require_listable(path)
+        await self._deliverer.remove_parts(path)
         async with self._context.paths.hold(path, shared=True):
             context, node = self._context, self._context.nodes.get(path)
             drafted = node is not None and node.draft is not None  # it is shown, stale or not
@@ -139,7 +142,10 @@ class Writeback:
                 if made:
                     node.begin_draft(context.spool, None, context.clock())
                     context.touch(path)
-                return WriteFile(self._parts, node)
+                file = WriteFile(self._parts, node)
+                if made:
+                    file.on_made()
+                return file
         if exclusive:
             raise AlreadyExists(f"{path!r} exists")
         return await self.open(path, truncate=False)
@@ -189,6 +195,7 @@ class Writeback:
             if node.writers > 1:
                 file.close()  # the others deliver it
             else:
+                await self._deliverer.deliver(node)  # an error undoes the call, and breaks no file
                 await file.release()
         except BaseException:
             file.close()
@@ -198,7 +205,10 @@ class Writeback:
 
     async def withdraw(self, path: bytes) -> bool | None:
         """See Tree.withdraw."""
-        node = self._context.nodes.get(path)
+        nodes = self._context.nodes
+        node = nodes.get(path)
+        if node is None or not node.undelivered:
+            node = nodes.broken.get(path, node)
         return None if node is None else await self._deliverer.withdraw(node)
 
     async def _undo_truncate(self, node: Node) -> None:
@@ -218,6 +228,10 @@ class Writeback:
         """See Tree.undelivered."""
         return [node.path for node in self._context.nodes if node.undelivered]
 
+    def broken(self) -> list[bytes]:
+        """See Tree.broken."""
+        return list(self._context.nodes.broken)
+
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""
         with trio.move_on_after(timeout):
@@ -228,15 +242,19 @@ class Writeback:
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
-        if self._context.replacements and self._context.store.why_lost() is None:
+        if self._context.store.why_lost() is not None:
+            return
+        with suppress(MavftpfsError):
+            await self._deliverer.remove_parts()
+        if self._context.replacements:
             await self.cleaner.finish(at_once=True)
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
         context, kept = self._context, []
         failed: OSError | NoSpace | SpoolFailed | None = None
-        for node in context.nodes:
-            if not node.undelivered or node.draft is None:
+        for node in [*context.nodes, *context.nodes.broken.values()]:
+            if not (node.undelivered or node.broken) or node.draft is None:
                 continue
             facts = describe(node.path, node.draft, node.error, context.wall)
             try:
@@ -246,6 +264,8 @@ class Writeback:
                 log.error("%r could not be saved: %s", node.path, error)
                 failed = error
             else:
+                if node.broken:
+                    del context.nodes.broken[node.path]
                 node.forget_draft()
         if failed is not None and not kept:
             raise failed
@@ -261,15 +281,19 @@ class Writeback:
         self.retry()
 
     def retry(self) -> None:
-        """Deliver what no program writes any more: the vehicle is back, or may be written again."""
-        if self._context.replacements or self.undelivered():
+        """Deliver what no program writes any more: the vehicle is back, or may be written again. Errors that
+        this ends are forgotten."""
+        for node in self._context.nodes:
+            if isinstance(node.error, PASSING):
+                node.error = None
+        if self._context.replacements or self._deliverer.parts or self.undelivered():
             self._news.set()
             self._retry_later()
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes. bytes_undelivered: of whole files; bytes_held: what they take
         here."""
-        nodes = list(self._context.nodes)
+        nodes, broken = list(self._context.nodes), self._context.nodes.broken.items()
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: readable(str(n.error)) for n in nodes if n.error is not None}
         return {
@@ -277,6 +301,7 @@ class Writeback:
             "unacked_max": self._limit.bytes(),
             "write_rate": self._throttle.speed,
             "files_undelivered": len(self.undelivered()),
+            "broken": {path.decode(errors="replace"): readable(str(node.error)) for path, node in broken},
             "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
@@ -298,7 +323,8 @@ class Writeback:
                 self._context.nodes.maybe_forget(node)
 
     def _retry_later(self) -> None:
-        """Try again later: something was not delivered, or a replacement is unfinished."""
+        """Try again later: something was not delivered, a replacement is unfinished, or a broken file left a
+        part on the card."""
         if not self._retrying:
             self._retrying = True
             self._nursery.start_soon(self._retry)
@@ -308,8 +334,14 @@ class Writeback:
         that may help, because a link may fail and return between two heartbeats. When there are news of the
         vehicle, everything is tried at once, also what was refused."""
         nodes, replacements, (pause, longest) = self._context.nodes, self._context.replacements, PAUSES
+        parts = self._deliverer.parts
         try:
-            while self._news.is_set() or replacements or any(n.undelivered and may_pass(n) for n in nodes):
+            while (
+                self._news.is_set()
+                or replacements
+                or parts
+                or any(n.undelivered and may_pass(n) for n in nodes)
+            ):
                 with trio.move_on_after(pause):
                     await self._news.wait()
                 is_new, pause = self._news.is_set(), min(2 * pause, longest)
@@ -317,6 +349,8 @@ class Writeback:
                     self._news, pause = trio.Event(), PAUSES[0]
                     for node in nodes:
                         node.start_after = float("-inf")
+                with suppress(MavftpfsError):
+                    await self._deliverer.remove_parts()
                 await self.cleaner.finish()
                 await self._deliver_each(partial(self._is_left_to_us, is_new))
         finally:

@@ -7,6 +7,8 @@ handle reads nothing more, whatever is written under the path later: that belong
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +20,7 @@ from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError
+from mavftpfs.shared.errors import Armed, FileChanged, FileTooLarge, LocalProtocolError, MavftpfsError
 
 TRIES = 3
 """How often a read starts again because the file was delivered meanwhile."""
@@ -67,6 +69,11 @@ class ReadFile(OpenFile):
         """Whether the kernel's pages are still right."""
         return self._node.draft is None and self._handle is not None and self._handle.keep_cache
 
+    @property
+    def broken(self) -> bool:
+        """See OpenFile.broken."""
+        return self._node.broken
+
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end of the file.
 
@@ -89,9 +96,9 @@ class ReadFile(OpenFile):
                     raise
         raise AssertionError
 
-    async def fsync(self) -> None:
+    async def fsync(self, *, ends_write: bool = False) -> None:
         """Deliver what was written through any handle; see OpenFile.fsync."""
-        await self._parts.deliverer.deliver(self._node)
+        await self._deliver(ends_write=ends_write)
 
     async def release(self) -> None:
         """Deliver what was written by this handle, and close it. What could not be delivered stays held.
@@ -103,7 +110,7 @@ class ReadFile(OpenFile):
             return
         try:
             if self.writable:
-                await self._parts.deliverer.deliver(self._node)
+                await self._deliver()
         finally:
             self.close()
 
@@ -120,11 +127,15 @@ class ReadFile(OpenFile):
         if node.handles:
             return
         if node.removed:
-            node.forget_draft()
+            if self._context.nodes.broken.get(node.path) is not node:
+                node.forget_draft()
             return
         self._context.nodes.maybe_forget(node)
 
     # --- inside
+
+    async def _deliver(self, *, ends_write: bool = False) -> None:
+        await self._parts.deliverer.deliver(self._node)
 
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
@@ -165,34 +176,35 @@ class WriteFile(ReadFile):
         if not node.writers:
             node.delivered_since_open = False
         node.writers += 1
+        self._changed: int | None = None  # the node's generation when this handle changed the file
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data`; see OpenFile.write."""
-        node, stop = self._node, offset + len(data)
-        await self._have_room(stop)
-        async with node.lock:
-            self._context.require_disarmed()
-            node.require_not_stale()
-            assert node.draft is not None
-            self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
-            node.draft.write(offset, data)
-            await self._parts.deliverer.push(node)
+        stop = offset + len(data)
+        async with self._changing(stop) as draft:
+            self._node.require_not_stale()
+            self._parts.throttle.require_sendable(draft, max(draft.size, stop))
+            draft.write(offset, data)
         return len(data)
 
     async def truncate(self, size: int) -> None:
         """Cut or extend; see OpenFile.truncate."""
         node = self._node
         assert node.draft is not None
-        if size or not node.draft.size:
-            await self._have_room(size)
-            async with node.lock:
-                await self._truncate(node, size)
-            return
-        if self._closed:
-            raise LocalProtocolError("truncate of a closed handle")
-        # The bytes under way to the vehicle are not wanted any more, and new ones need no room.
-        async with node.claim():
-            await self._truncate(node, 0)
+        async with self._changing(size, empties=not size and node.draft.size > 0) as draft:
+            if node.removed or size:
+                node.require_not_stale()
+            if size == draft.size and draft.state is not State.STALE:
+                return
+            if size:
+                self._parts.throttle.require_sendable(draft, size)
+            draft.truncate(size)
+            if not (size or node.removed):
+                self._context.nodes.forget_broken(node.path)
+
+    def on_made(self) -> None:
+        """Note that this handle made the file, which is a change of it."""
+        self._changed = self._node.generation
 
     async def flush(self) -> None:
         """Deliver, but not a file that was only emptied: bytes are about to come.
@@ -204,7 +216,7 @@ class WriteFile(ReadFile):
         """
         draft = self._node.draft
         if draft is not None and (draft.size > 0 or self._node.error is not None):
-            await self._parts.deliverer.deliver(self._node)
+            await self._deliver()
 
     async def take_back(self) -> bool | None:
         """See OpenFile.take_back. May take as long as a request that is not answered."""
@@ -215,14 +227,66 @@ class WriteFile(ReadFile):
 
     # --- inside
 
+    @asynccontextmanager
+    async def _changing(self, size: int, *, empties: bool = False) -> AsyncIterator[Draft]:
+        """Hold the file's lock while the body changes the draft. If the body fails, or there is no room for
+        it, the file breaks, if this handle changed it before.
+
+        size: bytes that the file will have at least. empties: the body empties the file: the bytes on their
+        way to the vehicle are not wanted any more, and new ones need no room.
+
+        Raises:
+            As _have_room; WriteFailed.
+        """
+        node, refused = self._node, None
+        if self._closed:
+            raise LocalProtocolError("write to a closed handle")
+        if not empties:
+            try:
+                await self._have_room(size)
+            except MavftpfsError as error:
+                refused = error
+        async with node.claim() if empties else node.lock:
+            try:
+                node.require_not_broken()
+                if refused is not None:
+                    raise refused
+                self._context.require_disarmed()
+                assert node.draft is not None
+                yield node.draft
+            except MavftpfsError as error:
+                await self._break(error)
+                raise
+            self._changed = node.generation
+            await self._parts.deliverer.push(node)
+
+    async def _break(self, error: MavftpfsError) -> None:
+        """Break the file, because a program is told that a change of it failed, if this handle made changes
+        that the vehicle lacks. The caller has the node's lock."""
+        node = self._node
+        stale = node.draft is not None and node.draft.state is State.STALE
+        if self._changed == node.generation and node.undelivered and not stale:
+            await self._parts.deliverer.break_off(node, error)
+
+    async def _deliver(self, *, ends_write: bool = False) -> None:
+        """Deliver for a program. If the rest of the old file cannot be fetched, there is no whole file that
+        could be delivered later, so the file breaks."""
+        node = self._node
+        try:
+            await self._parts.deliverer.deliver(node)
+        except MavftpfsError as error:
+            lacks_base = node.draft is not None and not node.draft.whole and not isinstance(error, Armed)
+            if ends_write or lacks_base:
+                async with node.lock:
+                    await self._break(error)
+            raise
+
     async def _have_room(self, size: int) -> None:
         """Wait until not too much is un-ACKed. size: bytes that the file will have.
 
         Raises:
             FileTooLarge, Armed. Else as Deliverer.deliver, when nothing moves.
         """
-        if self._closed:
-            raise LocalProtocolError("write to a closed handle")
         if size > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
         throttle = self._parts.throttle
@@ -230,15 +294,3 @@ class WriteFile(ReadFile):
             self._context.require_disarmed()
             if not await throttle.wait():
                 await throttle.while_full(self._node, partial(self._parts.deliverer.deliver, self._node))
-
-    async def _truncate(self, node: Node, size: int) -> None:
-        self._context.require_disarmed()
-        if node.removed or size:
-            node.require_not_stale()
-        assert node.draft is not None
-        if size == node.draft.size and node.draft.state is not State.STALE:
-            return
-        if size:
-            self._parts.throttle.require_sendable(node.draft, size)
-        node.draft.truncate(size)
-        await self._parts.deliverer.push(node)

@@ -138,8 +138,10 @@ def _transfer_line(transfer: Status) -> Line:
 
 def _held_lines(status: Status) -> Iterator[Line]:
     held, files = status["held"], status["held"]["files"]
+    for path, error in held.get("broken", {}).items():
+        yield Line("  write failed ", path, f": {error}; the part is kept here, and not put on the card")
     if not files:
-        if not status.get("read_only"):
+        if not (status.get("read_only") or held.get("broken")):
             yield Line("  nothing is held back: all that was written is on the vehicle")
         return
     yield Line(f"  held back: {count_files(files)}, {readable_size(held['bytes'])}{_waits_for(status)}")

@@ -247,7 +247,7 @@ async def with_tree(
                 await tree.tidy_up()
             finally:
                 connection.news.clear()  # the tree can begin nothing while the session is closed
-                if spool is not None and (rescue_for is None or not tree.undelivered()):
+                if spool is not None and (rescue_for is None or not (tree.undelivered() or tree.broken())):
                     spool.discard()
 
 

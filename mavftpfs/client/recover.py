@@ -81,6 +81,8 @@ class Recovered:
             return "where it belongs was not written down"
         if "whole" not in self.facts:
             return "a program was still writing it, so it may be a part only"
+        if self.facts.get("broken"):
+            return "a write failed, so this is only the part that was written before"
         return "" if self.facts.get("whole") else "only the changed parts of it are here"
 
 
@@ -159,15 +161,12 @@ async def put_back(
     Returns those of other vehicles, which stay here.
 
     Raises:
-        UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
+        UsageError: one of them cannot be put back, and the text says why; the others were put back.
+        NotDelivered: it did not arrive.
     """
     others = await _of_others(session, wanted)
-    wanted = [copy for copy in wanted if copy not in others]
-    for copy in wanted:
-        if copy.hindrance:
-            raise UsageError(
-                f"{copy.file}: {copy.hindrance}; look at it, use `mavftpfs put`, and delete it here"
-            )
+    hindered = [copy for copy in wanted if copy not in others and copy.hindrance]
+    wanted = [copy for copy in wanted if copy not in others and not copy.hindrance]
     progress.plan(len(wanted), sum(copy.size for copy in wanted))
     for copy in wanted:
         path = _in_session(session, copy)
@@ -178,6 +177,8 @@ async def put_back(
                 raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {copy.file}")
         _forget(copy)
         tell(copy, there_already)
+    for copy in hindered:
+        raise UsageError(f"{copy.file}: {copy.hindrance}; look at it, use `mavftpfs put`, and delete it here")
     return others
 
 

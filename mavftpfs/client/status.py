@@ -39,7 +39,7 @@ Facts = Mapping[str, Any]
 
 MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
-_TOLD = {"transfers", "errors", "reads"}
+_TOLD = {"transfers", "errors", "broken", "reads"}
 """Keys of the cache's status that are in the snapshot's own lists."""
 
 
@@ -56,6 +56,7 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str
             "bytes": cache.get("bytes_undelivered", 0),
             "bytes_on_disk": cache.get("bytes_held", 0),
             "errors": dict(islice(cache.get("errors", {}).items(), MOST)),
+            "broken": dict(islice(cache.get("broken", {}).items(), MOST)),
         },
         "cache": {key: value for key, value in cache.items() if key not in _TOLD},
     }

@@ -18,10 +18,13 @@ DRAIN_LIMIT = 300.0
 
 def keep_the_rest(tree: Tree, directory: Path) -> str:
     """Move what is still undelivered to a local directory; return the line that says so, or ""."""
-    left = tree.undelivered()
+    broken = tree.broken()
+    left = [*tree.undelivered(), *broken]
     if not left:
         return ""
     lost = f"{len(left)} file(s) did not reach the vehicle"
+    if broken:
+        lost += f", {len(broken)} of them because a write failed"
     try:
         kept = tree.recover_to(directory)
     except OSError as exc:
@@ -46,8 +49,9 @@ async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> N
             await tree.drain(DRAIN_LIMIT)
     finally:
         directory = recovery_directory(source)
+        put_back = put_back_by(source, directory) if tree.undelivered() else "list them by: mavftpfs recover"
         message = keep_the_rest(tree, directory)
         if message:
-            message += f"; {put_back_by(source, directory)}" if directory.exists() else ""
+            message += f"; {put_back}" if directory.exists() else ""
             log.error("%s", message)
             tell(message)

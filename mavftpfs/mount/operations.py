@@ -19,7 +19,8 @@ import mmap
 import os
 import stat as stat_bits
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import pyfuse3
@@ -255,7 +256,8 @@ class Operations(pyfuse3.Operations):
         known.told_size = max(told, stop)  # the kernel counts on without asking
         if handle.flags & os.O_APPEND and not is_mapped_page(off, stop, told):
             off = file.size  # the size that the kernel knows may be older than ours
-        return await file.write(off, buf)
+        with self._losing_its_name(handle):
+            return await file.write(off, buf)
 
     @handler
     async def flush(self, fh: int) -> None:
@@ -269,15 +271,19 @@ class Operations(pyfuse3.Operations):
         """
         handle = self._file(fh)
         if handle.file.writable:
-            await handle.file.flush()
+            with self._losing_its_name(handle):
+                await handle.file.flush()
         for cancel in list(handle.ahead):
             handle.let_go = True
             cancel()
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:
-        """0 means that everything written is on the card, checked, whichever handle wrote it."""
-        await self._file(fh).file.fsync()
+        """0 means that everything written is on the card, checked, whichever handle wrote it. The kernel also
+        calls fsync after each write to a file with O_SYNC, and the write returns its error."""
+        handle = self._file(fh)
+        with self._losing_its_name(handle):
+            await handle.file.fsync(ends_write=bool(handle.flags & os.O_DSYNC))
 
     @handler
     async def release(self, fh: int) -> None:
@@ -286,7 +292,8 @@ class Operations(pyfuse3.Operations):
         if handle is None:
             return
         try:
-            await handle.file.release()
+            with self._losing_its_name(handle):
+                await handle.file.release()
         except MavftpfsError as exc:
             log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
 
@@ -312,7 +319,8 @@ class Operations(pyfuse3.Operations):
     async def _resize(self, ino: int, size: int, fh: int | None) -> None:
         handle = self.files.get(fh) if fh is not None else None
         if handle is not None and handle.file.writable:
-            await handle.file.truncate(size)
+            with self._losing_its_name(handle):
+                await handle.file.truncate(size)
         else:
             await self._tree.truncate(self._path(ino), size)
 
@@ -426,6 +434,18 @@ class Operations(pyfuse3.Operations):
         return [XATTR_STATUS] if inode == ROOT_INO else []
 
     # -- helpers ----------------------------------------------------------------------------------
+
+    @contextmanager
+    def _losing_its_name(self, handle: FileHandle) -> Iterator[None]:
+        """Take the name from the inode of a file that the body breaks. Programs that open the path then get
+        another inode, and so never a page of the broken file."""
+        try:
+            yield
+        except MavftpfsError:
+            inode = self.inodes.get(handle.ino)
+            if handle.file.broken and inode is not None and inode.path is not None:
+                self.inodes.unlink(inode.path)
+            raise
 
     def _inode(self, ino: int) -> Inode:
         inode = self.inodes.get(ino)

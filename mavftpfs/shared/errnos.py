@@ -123,6 +123,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.FileTooLarge: errno.EFBIG,
     errors.NoSpace: errno.ENOSPC,
     errors.SpoolFailed: errno.EIO,
+    errors.WriteFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
     errors.NotVerified: errno.EIO,
     errors.OtherRefusal: errno.EIO,

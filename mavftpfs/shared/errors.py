@@ -158,6 +158,10 @@ class SpoolFailed(MavftpfsError):
     """The local disk that keeps undelivered bytes failed (EIO)."""
 
 
+class WriteFailed(MavftpfsError):
+    """An earlier write of this open file failed, so nothing of the file reaches the card (EIO)."""
+
+
 class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
 

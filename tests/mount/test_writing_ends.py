@@ -44,6 +44,19 @@ print("taken", taken, flush=True)
 """
 """Writes blocks and says what each call said."""
 
+CLOSER = """
+import errno, sys
+file = open(sys.argv[1], "w")
+file.write("whole\\n"); file.flush()
+print("written", flush=True)
+sys.stdin.readline()
+try:
+    file.close()
+except OSError as error:
+    print(errno.errorcode[error.errno])
+"""
+"""Writes a file, and closes it when it is told to."""
+
 BLOCK = bytes(range(256)) * 64
 
 
@@ -87,19 +100,24 @@ def test_a_killed_program_leaves_what_it_wrote(field: Field) -> None:
     wait_until("it arrives", lambda: (card / "killed.bin").read_bytes() == written)
 
 
-@pytest.mark.holds("promise 9")
-def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None:
+@pytest.mark.holds("promise 3", "promise 9")
+def test_arming_in_mid_copy_refuses_and_puts_no_part_on_the_card(field: Field, state: Path) -> None:
     card = field.local("card")
     (card / "APM").mkdir()
     (card / "APM" / "old.txt").write_text("old\n")
     vehicle = field.sim(card, "px4", ("--rate", "60000"))
     mount = field.mount(vehicle.source)
     writer = start_writer(mount, "APM/flight.bin", 100)
+    argv = [sys.executable, "-c", CLOSER, str(mount.path / "APM/whole.txt")]
+    closer = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert closer.stdout is not None
+    assert closer.stdout.readline() == "written\n"
     vehicle.react(signal.SIGUSR1)
+    assert closer.communicate("\n", timeout=60)[0] == "EROFS\n"
     results = said(writer, mount)
     assert set(results["write"][:-1]) == {"ok"}
     assert results["write"][-1] == "EROFS"
-    assert (results["fsync"], results["close"]) == (["EROFS"], ["EROFS"])
+    assert (results["fsync"], results["close"]) == (["EIO"], ["EIO"])
     taken = int(results["taken"][0])
     assert 0 < taken < 100 * len(BLOCK)
     for code in CHANGES:
@@ -108,14 +126,20 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
     assert (card / "APM" / "old.txt").read_text() == "old\n"
     status = json.loads(command("status", mount.path, "--json")[0])
     assert status["vehicle"]["armed"] is True
-    assert (status["held"]["files"], status["held"]["bytes"]) == (1, taken)
-    assert "flight.bin" in command("status", mount.path)[0]
+    assert (status["held"]["files"], list(status["held"]["broken"])) == (1, ["/APM/flight.bin"])
+    assert "write failed /APM/flight.bin" in command("status", mount.path)[0]
     vehicle.react(signal.SIGUSR1)
-    expected = BLOCK * (taken // len(BLOCK))
-    place = card / "APM" / "flight.bin"
-    wait_until("what was held is delivered", lambda: place.read_bytes() == expected)
+    whole = card / "APM/whole.txt"
+    wait_until("what was accepted is delivered", lambda: whole.exists() and whole.read_text() == "whole\n")
     mount.run("sh", "-c", f"echo new > {mount.path}/APM/new.txt")
     assert (card / "APM" / "new.txt").read_text() == "new\n"
+    _, said_last = command("umount", mount.path, code=4)
+    mount.process = None
+    assert sorted(os.listdir(card / "APM")) == ["new.txt", "old.txt", "whole.txt"]
+    (copy,) = state.glob("*/APM__flight.bin")
+    assert copy.read_bytes() == BLOCK * (taken // len(BLOCK))
+    assert f"1 of them because a write failed; they are kept in {copy.parent}" in said_last
+    assert "the part that was written before" in command("recover")[0]
 
 
 CHANGES = (

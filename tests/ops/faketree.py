@@ -38,7 +38,7 @@ class FakeFile:
     writable: bool = False
     path: bytes = b""
     made: bool = False
-    direct_io = keep_cache = False
+    direct_io = keep_cache = broken = False
 
     @property
     def size(self) -> int:
@@ -58,7 +58,7 @@ class FakeFile:
         await self.tree.pause("flush", self.path)
         self.tree.files[self.path] = self.content
 
-    async def fsync(self) -> None:
+    async def fsync(self, *, ends_write: bool = False) -> None:
         await self.tree.pause("fsync", self.path)
         self.tree.files[self.path] = self.content
 
@@ -205,6 +205,9 @@ class FakeTree:
     async def drain(self, timeout: float) -> Sequence[bytes]:
         await self.pause("drain")
         return self.left
+
+    def broken(self) -> Sequence[bytes]:
+        return []
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
         self.calls.append(("recover_to", os.fsencode(directory)))

@@ -506,15 +506,15 @@ async def test_a_file_that_could_not_be_made_can_be_made_later_or_removed(here: 
 @pytest.mark.holds("promise 9")
 async def test_armed_means_an_error_at_once_and_delivery_after(here: Rig) -> None:
     tree = here.mount()
-    file = await tree.create(FRESH, exclusive=True)
+    file, other = await tree.create(FRESH, exclusive=True), await tree.open(FILE, write=True)
     await file.write(0, NEW)
     await here.arm()
     before, asked = trio.current_time(), len(here.faults.requests)
     asks = [
         file.flush(),
         file.fsync(),
-        file.write(0, b"x"),
-        file.truncate(1),
+        other.write(0, b"x"),
+        other.truncate(1),
         tree.create(b"/d/x", exclusive=False),
         tree.open(FILE, write=True),
         tree.open(FILE, write=True, truncate=True),

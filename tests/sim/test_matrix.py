@@ -25,12 +25,13 @@ from zlib import crc32
 import pytest
 import trio
 
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import FileTooLarge, MavftpfsError, WriteFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.rigs import GOOD_LINK, Rig
@@ -40,7 +41,7 @@ from tests.support.transfers import content
 State = dict[bytes, bytes | None]
 """What is in the directory: contents of files by name, None for a directory."""
 
-OLD, OTHER, NEW = content(900, 1), content(400, 2), content(700, 3)
+OLD, OTHER, NEW, LARGE = content(900, 1), content(400, 2), content(700, 3), content(70_000, 4)
 BEFORE: State = {b"file": OLD, b"other": OTHER, b"sub": None}
 QUICK = ConnectOptions(op_deadline=8.0)
 IN_TIME = 60.0
@@ -115,6 +116,30 @@ async def append(tree: Tree) -> None:
     await write(tree, b"/d/file", len(OLD), NEW)
 
 
+async def fail(file: OpenFile) -> None:
+    """Have a program told that a write failed, while a part of the file is on its way, and close."""
+    try:
+        await file.write(0, LARGE)
+        await trio.sleep(0.1)
+        with pytest.raises(FileTooLarge):
+            await file.write(1 << 32, b"beyond the end of what a vehicle takes")
+        with pytest.raises(WriteFailed):
+            await file.flush()
+    finally:
+        with suppress(MavftpfsError):
+            await file.release()
+
+
+async def fail_to_create(tree: Tree) -> None:
+    """Run cp to a new name; a write is refused."""
+    await fail(await tree.create(b"/d/new", exclusive=False))
+
+
+async def fail_to_replace(tree: Tree) -> None:
+    """Run cp over a file; a write is refused."""
+    await fail(await tree.open(b"/d/file", write=True, truncate=True))
+
+
 async def truncate(tree: Tree) -> None:
     """Run truncate -s."""
     await tree.truncate(b"/d/file", 300)
@@ -172,6 +197,8 @@ OPERATIONS: dict[Call, State] = {
     replace: changed(file=NEW),
     change: changed(file=OLD[:200] + NEW[:100] + OLD[300:]),
     append: changed(file=OLD + NEW),
+    fail_to_create: BEFORE,
+    fail_to_replace: BEFORE,
     truncate: changed(file=OLD[:300]),
     rename: without(b"file", new=OLD),
     rename_over: without(b"file", other=OLD),
@@ -182,8 +209,9 @@ OPERATIONS: dict[Call, State] = {
 }
 """What the directory holds after each."""
 
+FAILING = (fail_to_create, fail_to_replace)
 RENAMES = (rename, rename_over, rename_over_open)
-IN_PLACE = (create, replace, change, append, truncate)
+IN_PLACE = (create, replace, change, append, truncate, fail_to_create)
 """What is done byte by byte where nothing can be renamed."""
 
 
@@ -476,6 +504,10 @@ async def sampled(profile: str, operation: Call, event: Event, place: Path) -> i
 
 def can(profile: str, operation: Call, event: Event) -> bool:
     """Return whether a server can do it at all, and in one step."""
+    if operation in FAILING and event in (give_up, give_up_in_silence):
+        return False  # the program is told nothing, so its part becomes the file
+    if operation is fail_to_replace and in_place(profile):
+        return False  # the old file is emptied as soon as the new one is sent
     return not in_place(profile) or operation not in (*RENAMES, *(IN_PLACE if event is power_off else ()))
 
 
