@@ -14,6 +14,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, command, hub_of, wait_until
+from tests.support.places import FOLDERS, start_place
 from tests.support.vehicles import HOST, free_udp_port
 
 CONTENT = bytes(range(256)) * 400
@@ -66,6 +67,21 @@ def test_two_mounts_and_commands_share_a_port_that_nobody_configured(field: Fiel
     assert reads_right(two, cards[1]), "the hub goes on for the other one"
     assert two.unmount() == 0
     wait_until("the hub ended with its last client", lambda: hub_of(source) is None)
+
+
+@pytest.mark.parametrize("kind", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
+def test_an_upload_goes_on_when_a_second_program_comes(field: Field, kind: str) -> None:
+    place = start_place(field, kind, ("--rate", "15000"))
+    source = place.vehicle.source
+    mount = field.mount(source)
+    (mount.folder / "new").write_bytes(CONTENT)
+    target = mount.path / FOLDERS[kind] / "new"
+    with mount.started("cp", mount.folder / "new", target) as copying:
+        wait_until("the upload began", lambda: any(mount.status()["connection"]["uploads"]))
+        command("scan", source)
+        assert mount.status()["link"]["reopened"] == 1
+        assert copying.wait(60) == 0
+    assert (place.card / "new").read_bytes() == CONTENT
 
 
 def kill_hub(source: str, mounts: list[Mount]) -> None:
