@@ -60,6 +60,8 @@ _OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
 _NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
 """What servers say to a Terminate of a session that is not there; 8 is PX4's sticky errno."""
 
+_IN_USE = "the vehicle's only FTP session is in use by another client"
+
 Asked = TypeVar("Asked", bound=Operation)
 
 
@@ -184,11 +186,11 @@ class ServerSession:
         | the refusal | may an open of ours have been carried out? | `maybe_open` | then |
         |---|---|---|---|
         | one of _OPEN_TAKEN | yes | stays: a remedy may close it | a remedy |
-        | one of _OPEN_TAKEN | no | is cleared | a remedy |
+        | one of _OPEN_TAKEN | no | is cleared | another client's file is waited for, or a remedy |
         | FAIL, perhaps of an ArduPilot | yes | stays: a remedy may close it | a remedy |
         | any other | - | is cleared | it is raised |
         """
-        remedies, resent = _Remedies(), False
+        remedies, resent, began = _Remedies(), False, self.clock()
         while True:
             asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
             operation = OpenRequest(opcode, wire_path(path), session=asked)
@@ -210,9 +212,25 @@ class ServerSession:
                     self.maybe_open.clear()
                 if not taken:
                     raise
-                await self._remedy(nak, remedies)
+                if ours or not await self._another_closes(nak, began + self.op_deadline):
+                    await self._remedy(nak, remedies)
             else:
                 return
+
+    async def _another_closes(self, nak: FtpNak, deadline: float) -> bool:
+        """Wait until another client, which opened a file just before us, has closed it. Return False if no
+        client is heard to have one open.
+
+        Raises:
+            SessionBusy: it is still open at the deadline.
+        """
+        heard = False
+        while (now := self.clock()) < self.others.file_open_until:
+            if now >= deadline:
+                raise SessionBusy(_IN_USE) from nak
+            await self.sleep(min(self.others.file_open_until, deadline) - now)
+            heard = True
+        return heard
 
     def _on_opened(self, path: bytes, resent: bool, operation: OpenRequest) -> None:
         """The ACK of an open came. Noted at once: what shows that another file is open there may come right
@@ -379,7 +397,7 @@ class ServerSession:
             if await self.driver.be_silent(seconds):
                 return
         if not left.resets or self._another_client_heard():
-            raise SessionBusy("the vehicle's only FTP session is in use by another client") from nak
+            raise SessionBusy(_IN_USE) from nak
         left.resets -= 1
         session = self.engine.home_session
         await self._try(Simple(Opcode.RESET_SESSIONS, session=session))

@@ -387,6 +387,24 @@ async def test_a_file_is_opened_once_the_other_clients_is_closed_or_left(closes:
         assert opened - done == pytest.approx(1.0 if closes else LEFT_OPEN, abs=0.2)
 
 
+async def test_a_client_that_opened_a_file_just_before_us_is_waited_for() -> None:
+    """Several commands of ours at once all open theirs when one of them has closed its file."""
+    here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+
+        async def rival() -> None:
+            here.another_asks(Opcode.OPEN_FILE_RO, b"/d/theirs")
+            for _ in range(20):
+                await trio.sleep(1.0)
+                here.another_asks(Opcode.READ_FILE)
+            here.another_asks(Opcode.TERMINATE_SESSION)
+
+        nursery.start_soon(rival)
+        assert await read_file(connection, b"/d/f") == DATA
+        times = here.faults.times(Opcode.OPEN_FILE_RO)
+        assert len(times) == 2, "it was refused once, and asked again when the other one had closed its file"
+
+
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ONE_SESSION)
 @pytest.mark.parametrize("reads", [True, False])
