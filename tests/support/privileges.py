@@ -20,7 +20,7 @@ import pytest
 SUDO = ("sudo", "-n")
 TIMEOUT = 300.0
 """Seconds for one test of root's: longer than any wait in it."""
-_MARK = "not run: "
+_MARK = "not run without "
 
 
 def _why_no_root() -> str:
@@ -45,7 +45,7 @@ def _why_no_safe_python() -> str:
 
 NEEDS: dict[str, tuple[str, Callable[[], str]]] = {
     "root": ("root", _why_no_root),
-    "namespaces": ("root and namespaces of their own", _why_no_namespaces),
+    "namespaces": ("root and namespaces of its own", _why_no_namespaces),
     "root's Python": ("a Python that only root can change", _why_no_safe_python),
 }
 """Each need of tests: the words for it, and the function that returns why it is missing."""
@@ -70,7 +70,7 @@ def _missing(need: str) -> str:
     """Return the whole reason why a need is missing, "" if it is there."""
     words, why = NEEDS[need]
     reason = why()
-    return f"that need {words} ({reason})" if reason else ""
+    return f"{words} ({reason})" if reason else ""
 
 
 class AsRoot(pytest.Item):
@@ -136,6 +136,6 @@ def write_summary(reporter: pytest.TerminalReporter) -> None:
             reasons.setdefault(reason, []).append(report.nodeid)
     for reason, tests in reasons.items():
         count = "1 test" if len(tests) == 1 else f"{len(tests)} tests"
-        reporter.write_line(f"{_MARK}{count} {reason}", yellow=True)
+        reporter.write_line(f"{_MARK}{reason}: {count}", yellow=True)
         for test in sorted(tests):
             reporter.write_line(f"  {test}")

@@ -60,7 +60,7 @@ def test_sudo_runs_a_test_of_root_and_its_failure_is_the_tests_failure(tmp_path:
 def test_what_sudo_refuses_is_named_in_the_last_lines(tmp_path: Path) -> None:
     lines = run(tmp_path, REFUSES)
     assert lines[-4:-1] == [
-        "not run: 2 tests that need root (sudo: a password is required)",
+        "not run without root (sudo: a password is required): 2 tests",
         "  test_it.py::test_of_root[0]",
         "  test_it.py::test_of_root[1]",
     ]
