@@ -81,7 +81,6 @@ class _Client:
     name: str
     forward: tuple[str, ...]
     is_in: bool = False
-    dropped: int = 0
 
     def send(self, messages: Sequence[bytes]) -> None:
         """Send messages. It loses those for which its socket is full, as on a port of its own."""
@@ -89,7 +88,7 @@ class _Client:
             try:
                 self.sock.send(message)
             except BlockingIOError:
-                self.dropped += 1
+                pass
             except OSError:
                 return  # its own task notices
 
@@ -482,8 +481,7 @@ class Hub:
             "source": self.spec.description,
             "pid": os.getpid(),
             "clients": [
-                {"name": client.name, "address": list(client.own), "dropped": client.dropped}
-                for client in self._clients.values()
+                {"name": client.name, "address": list(client.own)} for client in self._clients.values()
             ],
             "endpoints": endpoints,
             "armed": sorted(system for system, armed in self.router.armed.items() if armed),
@@ -491,5 +489,4 @@ class Hub:
                 {"system": sender.system, "component": sender.component, "address": readable_address(where)}
                 for sender, where in self.router.senders.doubles().items()
             ],
-            "dropped": self._outbox.dropped,
         }

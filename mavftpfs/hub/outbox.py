@@ -25,14 +25,9 @@ class Waiting(NamedTuple):
 
 
 class Outbox:
-    """A queue for each side. limit: bytes that one side may have waiting; what does not fit is refused.
-
-    Attributes:
-        dropped: frames refused.
-    """
+    """A queue for each side. limit: bytes that one side may have waiting; what does not fit is dropped."""
 
     def __init__(self, limit: int) -> None:
-        self.dropped = 0
         self._limit = limit
         self._sizes: Counter[int] = Counter()
         self._queues: OrderedDict[int, deque[Waiting]] = OrderedDict()
@@ -43,11 +38,9 @@ class Outbox:
     def push(self, side: int, waiting: Waiting) -> None:
         """Append a frame that came from a side."""
         size = self._sizes[side] + len(waiting.frame)
-        if size > self._limit:
-            self.dropped += 1
-            return
-        self._sizes[side] = size
-        self._queues.setdefault(side, deque()).append(waiting)
+        if size <= self._limit:
+            self._sizes[side] = size
+            self._queues.setdefault(side, deque()).append(waiting)
 
     def pop(self) -> Waiting:
         """Take the next frame. There must be one."""
