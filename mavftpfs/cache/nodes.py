@@ -83,6 +83,11 @@ class Node:
         return self.draft is not None and not self.removed and self.draft.state is not State.CLEAN
 
     @property
+    def is_new_and_empty(self) -> bool:
+        """Whether the vehicle has no file of it yet, and nothing was written to it."""
+        return self.draft is not None and self.draft.base is None and not self.draft.size
+
+    @property
     def broken(self) -> bool:
         """Whether a write of it failed, so that nothing of it reaches the card."""
         return self.draft is not None and self.draft.state is State.BROKEN

@@ -262,9 +262,14 @@ class WriteFile(ReadFile):
 
     async def _break(self, error: MavftpfsError) -> None:
         """Break the file, because a program is told that a change of it failed, if this handle made changes
-        that the vehicle lacks. The caller has the node's lock."""
+        that the vehicle lacks. The caller has the node's lock.
+
+        A new file that is too large at once does not break, because the program can go on with less.
+        """
         node = self._node
         stale = node.draft is not None and node.draft.state is State.STALE
+        if isinstance(error, FileTooLarge) and node.is_new_and_empty:
+            return
         if self._changed == node.generation and node.undelivered and not stale:
             await self._parts.deliverer.break_off(node, error)
 

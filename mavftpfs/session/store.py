@@ -206,8 +206,8 @@ class Store:
         """Read it once; anew in shorter blocks as long as the server turns out to send no longer ones."""
         block: int | None = self._scheduler.read_chunks.size
         while block is not None:
-            began = self._clock()
             async with self._opened(path) as session:
+                began = self._clock()
                 operation = ReadToEof(session.id, block, limit)
                 with suppress(DataUnproven):
                     await self._server.driver.run(operation)

@@ -189,12 +189,24 @@ async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
 async def test_a_new_file_of_which_the_first_write_failed_gets_no_name(here: Rig) -> None:
     tree = await mount(here)
     file = await tree.create(FRESH, exclusive=True)
-    with pytest.raises(FileTooLarge):
-        await file.write(BEYOND, b"x")
+    await here.arm()
+    with pytest.raises(Armed):
+        await file.write(0, PART)
     with pytest.raises(WriteFailed):
         await file.release()
+    await here.disarm()
     await trio.sleep(LONG)
     assert here.files() == {FILE: OLD}
+
+
+async def test_a_new_file_that_is_too_large_at_once_can_be_written_smaller(here: Rig) -> None:
+    tree = await mount(here)
+    file = await tree.create(FRESH, exclusive=True)
+    with pytest.raises(FileTooLarge):
+        await file.write(BEYOND, b"x")
+    await file.write(0, PART)
+    await file.release()
+    assert here.data(FRESH) == PART
 
 
 @pytest.mark.parametrize("closed", [False, True])
