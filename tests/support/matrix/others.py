@@ -1,0 +1,221 @@
+"""Columns of the matrix: others change the directory, over the vehicle or through the same mount."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+import trio
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.sim.profiles import PROFILES, Family, Storage
+from tests.support.faults import STATION
+from tests.support.matrix.operations import FILE, NAME, D, keeping, making, read, rewriting, taking
+from tests.support.matrix.scene import Others, Scene
+from tests.support.replies import decode_reply, request
+from tests.support.rigs import Rig
+from tests.support.transfers import content
+
+THEIRS, MORE, BESIDE = content(800, 5), content(150, 6), content(3000, 7)
+TAKES = 300.0
+"""Seconds for which the other computer uploads."""
+
+PIECE = 100
+PATIENCE = 60
+
+
+class Gone(MavftpfsError):
+    """The file was not there."""
+
+
+class OtherClient:
+    """Another FTP client of the vehicle, which repeats what is refused.
+
+    heard: our link carries what it asks, and its answers.
+    """
+
+    def __init__(self, here: Rig, heard: bool) -> None:
+        self._here = here
+        self._heard = heard
+        self._seq = 20_000
+        self._replies: dict[int, Payload] = {}
+        self._came = trio.Event()
+        self._session = 77 if PROFILES[here.profile].family is Family.ARDUPILOT else 0
+        self._outgoing = here.server.outgoing
+        here.server.outgoing = self._on_outgoing  # type: ignore[method-assign]
+
+    def _on_outgoing(self, now: float) -> list[tuple[Address, bytes]]:
+        replies = self._outgoing(now)
+        for target, wire in replies:
+            if target == STATION:
+                reply = decode_reply(wire)
+                self._replies[reply.seq] = reply
+                self._came.set()
+        return [reply for reply in replies if self._heard or reply[0] != STATION]
+
+    async def ask(self, opcode: Opcode, data: bytes = b"", *, offset: int = 0) -> bool:
+        """Ask once; return whether it was done."""
+        self._seq += 10  # so far apart that no server takes one for the one before
+        asked = request(self._seq, opcode, session=self._session, offset=offset, data=data)
+        now = trio.current_time()
+        self._here.vehicle.foreign_request(asked.encode(), STATION, now, audible=self._heard)
+        with trio.move_on_after(5.0):
+            while self._seq + 1 not in self._replies:
+                self._came = trio.Event()
+                await self._came.wait()
+            reply = self._replies[self._seq + 1]
+            if opcode in (Opcode.CREATE_FILE, Opcode.OPEN_FILE_WO) and reply.opcode == Opcode.ACK:
+                self._session = reply.session
+            return reply.opcode == Opcode.ACK
+        return False
+
+    async def write(self, path: bytes, opcode: Opcode, offset: int, data: bytes) -> bool:
+        """Open or make a file, write a piece and close it; return whether all of that was done."""
+        if not await self.ask(opcode, path):
+            return False
+        done = await self.ask(Opcode.WRITE_FILE, data, offset=offset)
+        return await self.ask(Opcode.TERMINATE_SESSION) and done
+
+    async def remove(self, path: bytes) -> None:
+        """Remove a file, unless it is gone."""
+        await self.insist(partial(self.ask, Opcode.REMOVE_FILE, path))
+
+    async def insist(self, attempt: Callable[[], Awaitable[bool]]) -> None:
+        """Try until it is done: somebody else may have the session."""
+        for _ in range(PATIENCE):
+            if await attempt():
+                return
+            await trio.sleep(2.0)
+        raise AssertionError("the other client was never served")
+
+
+# --- another client of the vehicle
+
+
+def replacing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
+    """Return what puts another file in the place of the file, by a rename."""
+
+    async def act(scene: Scene) -> None:
+        here, temporary = scene.here, b"/theirs"
+        if not heard:
+            here.replace(FILE, THEIRS)
+            scene.effect()
+            return
+        here.put(temporary, THEIRS)
+        client = OtherClient(here, heard)
+        if PROFILES[here.profile].storage is not Storage.POSIX:
+            await client.remove(here.root + FILE)
+        paths = here.root + temporary + b"\0" + here.root + FILE
+        await client.insist(partial(client.ask, Opcode.RENAME, paths))
+        scene.effect()
+
+    return act
+
+
+def removing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
+    """Return what removes the file."""
+
+    async def act(scene: Scene) -> None:
+        here = scene.here
+        if FILE not in here.files():
+            raise Gone
+        if heard:
+            client = OtherClient(here, heard)
+            await client.remove(here.root + FILE)
+        else:
+            here.take(FILE)
+        scene.effect()
+
+    return act
+
+
+def lengthening(heard: bool) -> Callable[[Scene], Awaitable[None]]:
+    """Return what appends to the file, as a logger does."""
+
+    async def act(scene: Scene) -> None:
+        here = scene.here
+        client = OtherClient(here, heard)
+
+        async def attempt() -> bool:
+            files = here.files()
+            if FILE not in files:
+                raise Gone
+            if not heard:
+                here.put(FILE, files[FILE] + MORE)
+                return True
+            return await client.write(here.root + FILE, Opcode.OPEN_FILE_WO, len(files[FILE]), MORE)
+
+        await client.insist(attempt)
+        scene.effect()
+
+    return act
+
+
+def uploading(heard: bool) -> Callable[[Scene], Awaitable[None]]:
+    """Return another computer's mavftpfs, which uploads a file for five minutes over a slow radio."""
+
+    async def act(scene: Scene) -> None:
+        here = scene.here
+        client, temporary = OtherClient(here, heard), here.root + D + b"/.mavftpfs-zzzznabc"
+        stays_open = PROFILES[here.profile].write_only_truncates
+        if stays_open:
+            await client.insist(partial(client.ask, Opcode.CREATE_FILE, temporary))
+        for at in range(0, len(BESIDE), PIECE):
+            piece, opcode = BESIDE[at : at + PIECE], Opcode.OPEN_FILE_WO if at else Opcode.CREATE_FILE
+            if stays_open:
+                await client.insist(partial(client.ask, Opcode.WRITE_FILE, piece, offset=at))
+            else:
+                await client.insist(partial(client.write, temporary, opcode, at, piece))
+            await trio.sleep(TAKES * PIECE / len(BESIDE))
+        if stays_open:
+            await client.ask(Opcode.TERMINATE_SESSION)
+        assert await client.ask(Opcode.RENAME, temporary + b"\0" + here.root + D + b"/theirs")
+
+    return act
+
+
+# --- another program of this mount
+
+
+async def open_too(scene: Scene) -> None:
+    """Read the file."""
+    scene.saw = await read(scene.tree)
+
+
+async def rename_too(scene: Scene) -> None:
+    """Give the file another name."""
+    await scene.tree.rename(FILE, b"/d/moved")
+
+
+async def empty_too(scene: Scene) -> None:
+    """Empty the file."""
+    await (await scene.tree.open(FILE, write=True, truncate=True)).release()
+
+
+async def remove_too(scene: Scene) -> None:
+    """Remove the file."""
+    await scene.tree.unlink(FILE)
+
+
+def _clients() -> list[Others]:
+    return [
+        Others(f"{verb}_{'heard' if heard else 'unheard'}", model, act(heard), outside=True)
+        for heard in (True, False)
+        for verb, model, act in (
+            ("replaced", making(NAME, THEIRS), replacing),
+            ("removed", taking(NAME), removing),
+            ("lengthened", rewriting(lambda old: old + MORE), lengthening),
+            ("beside", making(b"theirs", BESIDE), uploading),
+        )
+    ]
+
+
+OTHERS = [
+    *_clients(),
+    Others("open_too", keeping, open_too),
+    Others("rename_too", taking(NAME, b"moved"), rename_too),
+    Others("empty_too", rewriting(lambda _: b""), empty_too),
+    Others("remove_too", taking(NAME), remove_too),
+]
