@@ -18,6 +18,8 @@ from tests.support.matrix.operations import (
     BEFORE,
     FILE,
     NAME,
+    NEW,
+    OLD,
     ON_THE_WAY,
     OPERATIONS,
     VIEWS,
@@ -26,6 +28,7 @@ from tests.support.matrix.operations import (
     Model,
     State,
     after,
+    append,
     append_in_doubt,
     rename_over,
     rename_over_open,
@@ -68,8 +71,8 @@ class Watch:
     names: files that are to stay there under these names.
 
     Attributes:
-        raced: whether the first request of ours after others changed the directory renames something, so
-            that no look of ours could show the change.
+        raced: whether others changed the directory right after a rename of ours, so that it looks as if the
+            rename had failed, or between our last look and a rename.
         nameless: the longest time in seconds for which one of the names had no file.
     """
 
@@ -79,6 +82,7 @@ class Watch:
         self._here = here
         self._paths = [here.root + D + b"/" + name for name in names]
         self._changed = False
+        self._last = 0
         self._missing_since: float | None = None
         self._handle, self._outgoing = here.server.handle, here.server.outgoing
         here.server.handle = self._on_request  # type: ignore[method-assign]
@@ -87,8 +91,12 @@ class Watch:
     def on_effect(self) -> None:
         """Note that others changed the directory now."""
         self._changed = True
+        if self._last == Opcode.RENAME:
+            self.raced = True
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
+        if source != STATION:
+            self._last = wire[_OPCODE]
         if self._changed and self.raced is None and source != STATION:
             asked = wire[HEADER_SIZE : HEADER_SIZE + wire[_SIZE]].rstrip(b"\0")
             if wire[_OPCODE] in _LISTINGS or (
@@ -147,6 +155,9 @@ def expected(scene: Scene, watch: Watch, done: bool) -> list[State]:
     found = ends(*plays)
     if others is not None and others.outside and (watch.raced or scene.operation in REPLACING):
         found.append(after(scene.operation))  # what others did is replaced
+    if scene.operation in (append, append_in_doubt) and others is not None and not others.outside:
+        # It asks for the size, then writes. In a mount the kernel's lock keeps others out meanwhile.
+        found.append(BEFORE | {NAME: bytes(len(OLD)) + NEW})
     return found
 
 
