@@ -121,6 +121,11 @@ class _Changes:
             return await _call(path, function, *args)
         except errors.ReadOnly as exc:
             raise await self._explained(path, exc) from exc
+        except errors.OtherRefusal as exc:
+            # Modes below @ lack write permission, so the kernel refuses ordinary users itself.
+            if exc.number == errno.EACCES and is_virtual(normalise(self.root + path)):
+                raise errors.ReadOnly(readonly.virtual(path)) from exc
+            raise
 
     async def _explained(self, path: bytes, error: errors.ReadOnly) -> errors.MavftpfsError:
         ask = partial(told_by, self.mountpoint, STATUS_PATIENCE)
