@@ -92,8 +92,12 @@ CHANGING = {
 DOUBLING = LinkSettings(delay=0.01, duplicate=0.01)
 """A link that delivers one frame in a hundred twice."""
 
-KNOWN: dict[tuple[str, str, str], str] = {}
-"""Cells of the daily run that fail on today's code, with the reason."""
+_STALE = "a refused removal interrupts the end of a replacement, and the file is STALE"
+KNOWN: dict[tuple[str, str, str], str] = {
+    ("px4-nuttx", "change", "fail_to_remove_too"): _STALE,
+    ("px4-nuttx", "append", "fail_to_remove_too"): _STALE,
+}
+"""Cells that fail on today's code at one of their requests, with the reason."""
 
 
 # --- one meeting
@@ -120,7 +124,7 @@ async def meet(
     watch = Watch(here, names_that_stay(operation, event.model if isinstance(event, Others) else None))
     async with mounted(here, place, 3) as tree:
         caller = trio.CancelScope()
-        scene = Scene(here, tree, operation, caller, watch.on_effect)
+        scene = Scene(here, tree, operation, caller, watch.on_effect, [watch.on_end])
         if event in EARLY:
             event(scene, count)
         await tree.list(D)
@@ -132,10 +136,12 @@ async def meet(
             if event not in EARLY:
                 event(scene, count)
             done = await attempt(scene)
-        here.faults.call_off()
         assert done or event not in UNNOTICED
-        if done:
+        if scene.others is not None and not scene.others.outside:
+            await scene.over.wait()
+        if done and (scene.others is None or scene.over.is_set()):
             require(visible(here), expected(scene, watch, done=True))
+        here.faults.call_off()
         requests = here.faults.requests[began:]
         if event is power_off:
             here.link.cut()  # or leaving would tidy up
@@ -232,8 +238,9 @@ def can(profile: str, operation: Call, event: Event) -> bool:
 DAILY = [profile for profile in sorted(PROFILES) if profile not in ALIKE]
 
 
-def cells(profiles: Iterable[str], *, in_turn: bool = False) -> list[Any]:
-    """Return what can be done on each server, with each event. in_turn: some events on one server only."""
+def cells(profiles: Iterable[str], *, in_turn: bool = False, known: bool = False) -> list[Any]:
+    """Return what can be done on each server, with each event. in_turn: some events on one server only.
+    known: cells that fail today are to fail."""
     found = []
     for operation, event in product(OPERATIONS, (*EVENTS, *IN_TURN)):
         able = [profile for profile in profiles if can(profile, operation, event)]
@@ -241,8 +248,8 @@ def cells(profiles: Iterable[str], *, in_turn: bool = False) -> list[Any]:
             able = [able[crc32(f"{operation.__name__} {event.__name__}".encode()) % len(able)]]
         for profile in able:
             key = (profile, operation.__name__, event.__name__)
-            reason = KNOWN.get(key)
-            marks = () if reason is None else pytest.mark.xfail(strict=True, reason=reason)
+            fails = known and key in KNOWN
+            marks = pytest.mark.xfail(strict=True, reason=KNOWN[key]) if fails else ()
             found.append(pytest.param(profile, operation, event, id="-".join(key), marks=marks))
     return found
 
@@ -255,7 +262,7 @@ async def test_all_or_nothing_and_no_lie(profile: str, operation: Call, event: E
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("profile", "operation", "event"), cells(sorted(PROFILES)))
+@pytest.mark.parametrize(("profile", "operation", "event"), cells(sorted(PROFILES), known=True))
 async def test_at_every_request(profile: str, operation: Call, event: Event, tmp_path: Path) -> None:
     requests: list[int] = []
     for count in counted(1):

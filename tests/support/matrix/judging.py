@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import permutations, product
+from zlib import crc32
 
 import trio
 
@@ -12,11 +13,13 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import HEADER_SIZE, Opcode
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind
 from tests.support.faults import STATION
 from tests.support.matrix.operations import (
     BEFORE,
     FILE,
+    IN_PLACE,
     NAME,
     NEW,
     OLD,
@@ -40,7 +43,7 @@ from tests.support.matrix.operations import (
 from tests.support.matrix.scene import IN_TIME, Scene, on_card
 from tests.support.rigs import Rig
 
-NAMELESS = 11.0
+NAMELESS = 11.5
 """Seconds for which a name may lack its file while the vehicle is heard. The first heartbeat comes after one
 second at most."""
 
@@ -52,7 +55,7 @@ SATISFIED = (unlink, rename_over, rename_over_open)
 """A refusal because the file is gone may be that of a copy of the request. So if others removed the file
 between our look and our request, the call succeeds, as one does whose first answer was lost."""
 
-_OPCODE, _SIZE = 3, 4
+_OPCODE, _SIZE, _OFFSET = 3, 4, slice(8, 12)
 _LISTINGS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
 _OF_A_FILE = (Opcode.OPEN_FILE_RO, Opcode.CALC_FILE_CRC32)
 
@@ -71,8 +74,8 @@ class Watch:
     names: files that are to stay there under these names.
 
     Attributes:
-        raced: whether others changed the directory right after a rename of ours, so that it looks as if the
-            rename had failed, or between our last look and a rename.
+        raced: whether others changed the directory between our last look and a rename, or after that and
+            before the call ended: the file is compared again then, and sent again if it is not there.
         nameless: the longest time in seconds for which one of the names had no file.
     """
 
@@ -82,7 +85,7 @@ class Watch:
         self._here = here
         self._paths = [here.root + D + b"/" + name for name in names]
         self._changed = False
-        self._last = 0
+        self._placing = False
         self._missing_since: float | None = None
         self._handle, self._outgoing = here.server.handle, here.server.outgoing
         here.server.handle = self._on_request  # type: ignore[method-assign]
@@ -91,17 +94,22 @@ class Watch:
     def on_effect(self) -> None:
         """Note that others changed the directory now."""
         self._changed = True
-        if self._last == Opcode.RENAME:
+        if self._placing:
             self.raced = True
 
+    def on_end(self) -> None:
+        """Note that the operation ended."""
+        self._placing = False
+
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
-        if source != STATION:
-            self._last = wire[_OPCODE]
+        if source != STATION and wire[_OPCODE] == Opcode.RENAME:
+            self._placing = True
         if self._changed and self.raced is None and source != STATION:
             asked = wire[HEADER_SIZE : HEADER_SIZE + wire[_SIZE]].rstrip(b"\0")
-            if wire[_OPCODE] in _LISTINGS or (
-                wire[_OPCODE] in _OF_A_FILE and asked == self._here.root + FILE
-            ):
+            lists = wire[_OPCODE] in _LISTINGS and wire[_OFFSET] == bytes(
+                4
+            )  # another page is of an older look
+            if lists or (wire[_OPCODE] in _OF_A_FILE and asked == self._here.root + FILE):
                 self.raced = False
             elif wire[_OPCODE] == Opcode.RENAME:
                 self.raced = True
@@ -155,6 +163,10 @@ def expected(scene: Scene, watch: Watch, done: bool) -> list[State]:
     found = ends(*plays)
     if others is not None and others.outside and (watch.raced or scene.operation in REPLACING):
         found.append(after(scene.operation))  # what others did is replaced
+    removes = others is not None and others.outside and NAME not in (others.model(BEFORE) or {})
+    lies_aside = PROFILES[scene.here.profile].storage is not Storage.POSIX and scene.operation in IN_PLACE
+    if removes and lies_aside:
+        found.append(BEFORE)  # the old file got its name back when others removed the new one
     if scene.operation in (append, append_in_doubt) and others is not None and not others.outside:
         # It asks for the size, then writes. In a mount the kernel's lock keeps others out meanwhile.
         found.append(BEFORE | {NAME: bytes(len(OLD)) + NEW})
@@ -181,9 +193,9 @@ def require(found: State, ends: Sequence[State]) -> None:
 
 
 def summary(state: State) -> dict[str, str]:
-    """Name the contents of a directory by their length and first bytes."""
+    """Name the contents of a directory by their length and checksum."""
     return {
-        name.decode(): "directory" if data is None else f"{len(data)}:{data[:2].hex()}"
+        name.decode(): "directory" if data is None else f"{len(data)}:{crc32(data):x}"
         for name, data in sorted(state.items())
     }
 

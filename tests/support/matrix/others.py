@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Awaitable, Callable
 from functools import partial
 
 import trio
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES, Family, Storage
 from tests.support.faults import STATION
@@ -28,6 +29,10 @@ PATIENCE = 60
 
 class Gone(MavftpfsError):
     """The file was not there."""
+
+
+class Interrupted(MavftpfsError):
+    """The program ended before its call did."""
 
 
 class OtherClient:
@@ -199,6 +204,20 @@ async def remove_too(scene: Scene) -> None:
     await scene.tree.unlink(FILE)
 
 
+async def fail_to_remove_too(scene: Scene) -> None:
+    """Remove the file, which the vehicle refuses. What is on its way goes on."""
+    scene.here.faults.refuse(Opcode.REMOVE_FILE, NakCode.FAIL_ERRNO, errno.EACCES, times=10)
+    await scene.tree.unlink(FILE)
+
+
+async def give_up_removing_too(scene: Scene) -> None:
+    """Begin to remove the file, and be interrupted at once."""
+    with trio.move_on_after(0.001) as scope:
+        await scene.tree.unlink(FILE)
+    if scope.cancelled_caught:
+        raise Interrupted
+
+
 def _clients() -> list[Others]:
     return [
         Others(f"{verb}_{'heard' if heard else 'unheard'}", model, act(heard), outside=True)
@@ -218,4 +237,6 @@ OTHERS = [
     Others("rename_too", taking(NAME, b"moved"), rename_too),
     Others("empty_too", rewriting(lambda _: b""), empty_too),
     Others("remove_too", taking(NAME), remove_too),
+    Others("fail_to_remove_too", keeping, fail_to_remove_too),
+    Others("give_up_removing_too", taking(NAME), give_up_removing_too),
 ]
