@@ -67,6 +67,7 @@ from tests.support.matrix.operations import (
     FAILING,
     IN_PLACE,
     KEEPING_NEW,
+    NAME,
     NEW,
     OPERATIONS,
     RENAMES,
@@ -214,9 +215,16 @@ async def sampled(profile: str, operation: Call, event: Event, place: Path) -> i
 
 def can_others(profile: str, operation: Call, event: Others) -> bool:
     """Return whether others can do it. Where an open empties files, nobody appends, and another computer has
-    to keep the only session for five minutes, which we take from it if we cannot hear it. A file that another
-    program renames, empties or removes is delivered, or is to be nothing, before the write fails."""
-    if PROFILES[profile].write_only_truncates and event.__name__ in ("lengthened_heard", "beside_unheard"):
+    to keep the only session for five minutes, which we take from it if we cannot hear it. Nobody can append
+    in several requests to a name that goes meanwhile. What is taken back includes what another program
+    emptied. A file that another program renames, empties or removes is delivered, or is to be nothing, before
+    the write fails."""
+    name = event.__name__
+    if PROFILES[profile].write_only_truncates and name in ("lengthened_heard", "beside_unheard"):
+        return False
+    if name == "lengthened_heard" and NAME not in after(operation):
+        return False
+    if name == "empty_too" and operation is take_back:
         return False
     return event.outside or event.model is keeping or operation not in FAILING
 

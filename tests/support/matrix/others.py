@@ -85,7 +85,12 @@ class OtherClient:
 
     async def remove(self, path: bytes) -> None:
         """Remove a file, unless it is gone."""
-        await self.insist(partial(self.ask, Opcode.REMOVE_FILE, path))
+
+        async def attempt() -> bool:
+            there = path[len(self._here.root) :] in self._here.files()
+            return not there or await self.ask(Opcode.REMOVE_FILE, path)
+
+        await self.insist(attempt)
 
     async def insist(self, attempt: Callable[[], Awaitable[bool]]) -> None:
         """Try until it is done: somebody else may have the session."""
