@@ -27,6 +27,7 @@ from mavftpfs.api.opened import Opened
 from mavftpfs.api.params import Number, Params, get_values, set_values
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
+from mavftpfs.api.wanted import Patterns, Since, selection_of, verify_of
 from mavftpfs.client import download, names, upload
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetcher
@@ -34,7 +35,6 @@ from mavftpfs.client.files import File, Files, Session, Target, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import Verify
-from mavftpfs.client.selection import Selection
 from mavftpfs.client.several import IN_PYTHON
 from mavftpfs.client.source import target_of
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
@@ -460,21 +460,26 @@ class Drone:
         local: str | os.PathLike[str] = ".",
         *,
         recursive: bool = False,
+        include: Patterns = (),
+        exclude: Patterns = (),
         verify: Verify = "auto",
     ) -> list[Path]:
         """Fetch a file, or with `recursive` a directory, proven; return the local files.
 
         A file goes into `local` if that is a directory, else it gets that name. A directory goes into
-        `local`.
+        `local`. include, exclude: a pattern or several, as of `mavftpfs get`.
 
         Raises:
-            OSError: something did not come; the text says how much did.
+            OSError: something did not come; the text says how much did. UsageError: an argument is wrong.
         """
+        selection = selection_of(include=include, exclude=exclude)
 
         async def work(downloads: download.Downloads) -> None:
             wanted = await self._existing(path)
             try:
-                await downloads.get([wanted], Path(local), into=False, recursive=recursive)
+                await downloads.get(
+                    [wanted], Path(local), into=False, recursive=recursive, selection=selection
+                )
             except IsADirectory as exc:
                 raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True") from exc
 
@@ -488,19 +493,23 @@ class Drone:
         *,
         place: PathLike | None = None,
         newest: int | None = None,
-        since: float | None = None,
+        since: Since | None = None,
+        include: Patterns = (),
+        exclude: Patterns = (),
         verify: Verify = "auto",
     ) -> list[Path]:
         """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here.
 
-        place: their directory on the vehicle; None to find it. newest: at most so many; since: not older,
-        seconds since 1970 UTC.
+        place: their directory on the vehicle; None to find it. newest: at most so many; since: not older: a
+        date as of `--since` (`"2h"`, `"2026-05-01"`), a datetime, or seconds since 1970 UTC. include,
+        exclude: a pattern or several.
 
         Raises:
-            OSError: a log did not come; the text says how many did.
+            OSError: a log did not come; the text says how many did. UsageError: an argument is wrong.
         """
         where = None if place is None else remote(place)
-        wish = download.Wish(Path(local), where, Selection(newest, since))
+        selection = selection_of(newest=newest, since=since, include=include, exclude=exclude)
+        wish = download.Wish(Path(local), where, selection)
         outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
         return [fetched.wanted.local for fetched in outcome.fetched]
 
@@ -508,7 +517,7 @@ class Drone:
         self, verify: Verify, work: Callable[[download.Downloads], Awaitable[None]]
     ) -> download.Outcome:
         outcome = download.Outcome()
-        fetcher = Fetcher(self._session, Progress(), verify)
+        fetcher = Fetcher(self._session, Progress(), verify_of(verify))
         await work(download.Downloads(fetcher, outcome, _ignore, _ignore))
         for path, error in outcome.failed.items():
             count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)

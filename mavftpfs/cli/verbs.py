@@ -6,7 +6,6 @@ import argparse
 import json
 import logging
 import os
-import re
 import shutil
 import signal
 import sys
@@ -14,7 +13,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -33,7 +32,7 @@ from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
-from mavftpfs.client.selection import Selection
+from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
 from mavftpfs.mount import daemon
@@ -160,7 +159,7 @@ def sync(args: Args) -> int:
     component, place = None, None
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
-    since = None if args.since is None else parse_date(args.since, datetime.now())
+    since = None if args.since is None else parse_date(args.since, datetime.now(), "--since")
     selection = Selection(args.newest, since, tuple(args.include), tuple(args.exclude))
     wish = download.Wish(Path(args.local), place, selection, args.dry_run)
     if args.watch:
@@ -322,32 +321,6 @@ def _print_comparison(outcome: download.Outcome) -> None:
     parts = [f"{same} the same", f"{len(outcome.differing)} differ"]
     parts += [f"{unproven} not proven"] if unproven else []
     print(f"{', '.join(parts)}, {len(outcome.wanted)} not here, from {_name(outcome.place)}")
-
-
-_AGO = re.compile(r"(\d{1,6})(min|h|d|w)", re.ASCII)
-_UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
-
-
-def parse_date(text: str, now: datetime) -> float:
-    """Return seconds UTC of a date, or a date and time, which is local if it names no zone; of `today`,
-    `yesterday`, or a time ago (`90min`, `2h`, `3d`, `1w`).
-
-    Raises:
-        UsageError: it is none.
-    """
-    midnight = datetime(now.year, now.month, now.day)
-    ago = _AGO.fullmatch(text)
-    try:
-        if text in ("today", "yesterday"):
-            return (midnight - timedelta(days=text == "yesterday")).timestamp()
-        if ago is not None:
-            return now.timestamp() - timedelta(**{_UNITS[ago[2]]: int(ago[1])}).total_seconds()
-        return datetime.fromisoformat(text).timestamp()
-    except (ValueError, OverflowError, OSError):
-        raise UsageError(
-            f"--since {text!r} is no date; write for example 2026-05-01, 2026-05-01T14:30, today, "
-            "yesterday, 2h or 3d"
-        ) from None
 
 
 # -- put and names --------------------------------------------------------------------------------

@@ -7,10 +7,11 @@ import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 
 from mavftpfs.client.fetch import Wanted
+from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.readable import readable_size
 
 NO_LOG = b"LASTLOG.TXT"
@@ -18,6 +19,9 @@ NO_LOG = b"LASTLOG.TXT"
 
 _DATE = re.compile(rb"(?<!\d)(20\d\d)-(\d\d)-(\d\d)(?:[/_T -](\d\d)[_:.-](\d\d)[_:.-](\d\d))?(?!\d)")
 _DAY_END = (23, 59, 59)
+
+_AGO = re.compile(r"(\d{1,6})(min|h|d|w)", re.ASCII)
+_UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +118,25 @@ def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
     """Return a key by which `log10` comes after `log9`."""
     parts = re.split(rb"(\d+)", name)
     return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)
+
+
+def parse_date(text: str, now: datetime, name: str) -> float:
+    """Return seconds UTC of a date, or a date and time, which is local if it names no zone; of `today`,
+    `yesterday`, or a time ago (`90min`, `2h`, `3d`, `1w`).
+
+    Raises:
+        UsageError: the text is no date; name: the option or argument that the error names.
+    """
+    midnight = datetime(now.year, now.month, now.day)
+    ago = _AGO.fullmatch(text)
+    try:
+        if text in ("today", "yesterday"):
+            return (midnight - timedelta(days=text == "yesterday")).timestamp()
+        if ago is not None:
+            return now.timestamp() - timedelta(**{_UNITS[ago[2]]: int(ago[1])}).total_seconds()
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise UsageError(
+            f"{name} {text!r} is no date; write for example 2026-05-01, 2026-05-01T14:30, today, "
+            "yesterday, 2h or 3d"
+        ) from None

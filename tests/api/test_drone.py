@@ -10,6 +10,7 @@ import socket
 import threading
 from array import array
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import mavftpfs
 from mavftpfs.api.errors import os_error
 from mavftpfs.api.params import Params
 from mavftpfs.client.mounted import MountedFiles
+from mavftpfs.client.selection import latest_in
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import VehicleLost
@@ -249,6 +251,51 @@ def test_sync(shared: mavftpfs.Drone, card: Path, tmp_path: Path) -> None:
     assert shared.sync(tmp_path / "logs", place=card.name) == [tmp_path / "logs" / "1.ulg"]
     assert shared.sync(tmp_path / "logs", place=card.name) == []
     assert (tmp_path / "logs" / "1.ulg").read_bytes() == DATA
+
+
+def test_sync_takes_the_dates_and_patterns_of_the_command(
+    shared: mavftpfs.Drone, card: Path, tmp_path: Path
+) -> None:
+    for name in ("2020-01-01.ulg", "2026-05-01.ulg", "2026-05-02.ulg", "2026-05-02.txt"):
+        (card / name).write_bytes(DATA)
+        os.utime(card / name, (1, latest_in(os.fsencode(name)) or 1))
+    for number, (choice, names) in enumerate(
+        {
+            "2h": ({"since": "2h"}, set()),
+            "date": ({"since": "2026-05-02", "exclude": "*.txt"}, {"2026-05-02.ulg"}),
+            "datetime": ({"since": datetime(2026, 5, 2), "include": ["*.ulg"]}, {"2026-05-02.ulg"}),
+            "newest": ({"newest": 1, "include": ("*01.ulg", "*02.ulg")}, {"2026-05-02.ulg"}),
+        }.values()
+    ):
+        found = shared.sync(tmp_path / str(number), place=card.name, **choice)  # type: ignore[arg-type]
+        assert {path.name for path in found} == names
+    (got,) = shared.get(card.name, tmp_path / "got", recursive=True, include="*.txt")
+    assert got.name == "2026-05-02.txt"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"since": "soon"},
+        {"since": float("nan")},
+        {"since": [1]},
+        {"newest": "1"},
+        {"newest": 0},
+        {"include": 1},
+        {"exclude": [b"*"]},
+        {"verify": "yes"},
+    ],
+    ids=str,
+)
+def test_a_wrong_choice_is_refused_before_anything_is_sent(
+    shared: mavftpfs.Drone, tmp_path: Path, wrong: dict[str, Any]
+) -> None:
+    (name,) = wrong
+    with pytest.raises(mavftpfs.UsageError, match=f"^{name}"):
+        shared.sync(tmp_path / "logs", place="nothing", **wrong)  # sent, this would be FileNotFoundError
+    if name in ("include", "exclude", "verify"):
+        with pytest.raises(mavftpfs.UsageError, match=f"^{name}"):
+            shared.get("nothing", tmp_path, **wrong)
 
 
 def test_threads(shared: mavftpfs.Drone, card: Path) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cli.verbs import parse_date
 from mavftpfs.client import fetch, proof
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
-from mavftpfs.client.selection import Selection, latest_in, newest_first
+from mavftpfs.client.selection import Selection, latest_in, newest_first, parse_date
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296
@@ -129,15 +128,15 @@ def test_paths_that_cannot_be(text: str) -> None:
 
 def test_dates() -> None:
     now = datetime(2026, 5, 2, 14, 30)
-    assert parse_date("2024-05-01T12:34:56+00:00", now) == MAY
-    assert parse_date("today", now) == parse_date("2026-05-02", now)
-    assert parse_date("yesterday", now) == parse_date("2026-05-01", now)
-    assert parse_date("2h", now) == parse_date("2026-05-02T12:30", now)
-    assert parse_date("90min", now) == parse_date("2026-05-02T13:00", now)
-    assert parse_date("1w", now) == now.timestamp() - 7 * 86_400
+    assert parse_date("2024-05-01T12:34:56+00:00", now, "since") == MAY
+    assert parse_date("today", now, "since") == parse_date("2026-05-02", now, "since")
+    assert parse_date("yesterday", now, "since") == parse_date("2026-05-01", now, "since")
+    assert parse_date("2h", now, "since") == parse_date("2026-05-02T12:30", now, "since")
+    assert parse_date("90min", now, "since") == parse_date("2026-05-02T13:00", now, "since")
+    assert parse_date("1w", now, "since") == now.timestamp() - 7 * 86_400
 
 
 @pytest.mark.parametrize("text", ["soon", "2", "h", "-2h", "2m"])
 def test_words_that_are_no_date(text: str) -> None:
     with pytest.raises(UsageError, match="2026-05-01"):
-        parse_date(text, datetime.now())
+        parse_date(text, datetime.now(), "since")

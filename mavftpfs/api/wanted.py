@@ -1,0 +1,72 @@
+"""Which files a program wants, checked before anything is sent. Layer: api."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime
+from math import isfinite
+from typing import get_args
+
+from mavftpfs.client.proof import Verify
+from mavftpfs.client.selection import Selection, parse_date
+from mavftpfs.shared.errors import UsageError
+
+Patterns = str | Iterable[str]
+"""A pattern, or several."""
+
+Since = float | str | datetime
+"""Seconds since 1970 UTC, a date as `mavftpfs sync --since` takes it, or a datetime (local if it names no
+zone)."""
+
+
+def selection_of(
+    *,
+    newest: int | None = None,
+    since: Since | None = None,
+    include: Patterns = (),
+    exclude: Patterns = (),
+) -> Selection:
+    """Return what the arguments of a call choose.
+
+    Raises:
+        UsageError: an argument is none of what it may be; the text names it.
+    """
+    if newest is not None and (not isinstance(newest, int) or isinstance(newest, bool) or newest < 1):
+        raise UsageError(f"newest={newest!r} is no number of logs")
+    return Selection(newest, _seconds(since), _patterns("include", include), _patterns("exclude", exclude))
+
+
+def verify_of(verify: str) -> Verify:
+    """Return how files are to be proven.
+
+    Raises:
+        UsageError: there is no such way.
+    """
+    for known in get_args(Verify):
+        if verify == known:
+            return known  # type: ignore[no-any-return]
+    raise UsageError(f"verify={verify!r} is none of {', '.join(map(repr, get_args(Verify)))}")
+
+
+def _seconds(since: Since | None) -> float | None:
+    if since is None:
+        return None
+    if isinstance(since, str):
+        return parse_date(since, datetime.now(), "since")
+    try:
+        seconds = since.timestamp() if isinstance(since, datetime) else float(since)
+    except (TypeError, ValueError, OverflowError, OSError):
+        seconds = float("nan")
+    if isinstance(since, bool) or not isfinite(seconds):
+        raise UsageError(
+            f"since={since!r} is no time: give seconds since 1970, a datetime, or a date as text"
+        )
+    return seconds
+
+
+def _patterns(name: str, given: Patterns) -> tuple[str, ...]:
+    patterns = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    for pattern in patterns:
+        if not isinstance(pattern, str):
+            raise UsageError(f"{name}={given!r}: a pattern is text, such as '*.ulg'")
+    return patterns
