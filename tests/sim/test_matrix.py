@@ -93,6 +93,9 @@ CHANGING = {
 DOUBLING = LinkSettings(delay=0.01, duplicate=0.01)
 """A link that delivers one frame in a hundred twice."""
 
+FAR = LinkSettings(delay=0.02)
+"""A link on which calls that run beside each other meet: an answer takes its time."""
+
 _STALE = "a refused removal interrupts the end of a replacement, and the file is STALE"
 KNOWN: dict[tuple[str, str, str], str] = {
     ("px4-nuttx", "change", "fail_to_remove_too"): _STALE,
@@ -115,9 +118,11 @@ async def mounted(here: Rig, place: Path, seed: int) -> AsyncIterator[Tree]:
 
 
 async def meet(
-    profile: str, operation: Call, event: Event, count: int, place: Path, link: LinkSettings = GOOD_LINK
+    profile: str, operation: Call, event: Event, count: int, place: Path, link: LinkSettings | None = None
 ) -> list[int]:
     """Have the event come at request `count` of an operation; return the opcodes of its requests."""
+    if link is None:
+        link = FAR if isinstance(event, Others) else GOOD_LINK
     here = Rig(profile, {D + b"/" + name: data for name, data in BEFORE.items() if data is not None}, link)
     here.put_directory(D + b"/sub")
     if isinstance(event, Others) and event.outside:

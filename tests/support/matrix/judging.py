@@ -164,8 +164,9 @@ def expected(scene: Scene, watch: Watch, done: bool) -> list[State]:
     if others is not None and others.outside and (watch.raced or scene.operation in REPLACING):
         found.append(after(scene.operation))  # what others did is replaced
     removes = others is not None and others.outside and NAME not in (others.model(BEFORE) or {})
-    lies_aside = PROFILES[scene.here.profile].storage is not Storage.POSIX and scene.operation in IN_PLACE
-    if removes and lies_aside:
+    if removes and scene.operation in IN_PLACE:
+        found.append(after(scene.operation))  # when it was to be placed, the name was free
+    if removes and scene.operation in IN_PLACE and PROFILES[scene.here.profile].storage is not Storage.POSIX:
         found.append(BEFORE)  # the old file got its name back when others removed the new one
     if scene.operation in (append, append_in_doubt) and others is not None and not others.outside:
         # It asks for the size, then writes. In a mount the kernel's lock keeps others out meanwhile.
