@@ -37,7 +37,7 @@ from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, NotDelivered, UsageError, exit_code_for
 from mavftpfs.shared.private import make_private_directory
 from mavftpfs.shared.readable import printable, readable_size
 
@@ -373,12 +373,20 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"
         if not bar.name:
             return line
-        left = "the vehicle has what it had" if bar.untouched else "look what is there before you use it"
-        return f"{line}; {bar.name} was on its way: {left}"
+        return f"{line}; {bar.name} was on its way: {_left_there(untouched=bar.untouched)}"
 
-    with _on_interrupt(stopped), shown(bar):
-        with_session(args, work, component, writing=True)
+    try:
+        with _on_interrupt(stopped), shown(bar):
+            with_session(args, work, component, writing=True)
+    except NotDelivered as exc:
+        exc.args = (f"{exc}; {_left_there(untouched=exc.there is False)}",)
+        raise
     return ExitCode.OK
+
+
+def _left_there(*, untouched: bool) -> str:
+    """Return the words about the place of a file that was not put."""
+    return "the vehicle has what it had" if untouched else "look what is there before you use it"
 
 
 def rm(args: Args) -> int:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import re
 import secrets
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -97,17 +97,19 @@ async def put_paths(
         not there. UsageError: of what is local, or two files would get one name. All that before anything is
         sent. NotDelivered: a file did not get to the vehicle; the files that were told before are there.
     """
-    inside = await is_directory(session.files, path)
-    if not inside and len(batches) > 1:
-        raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
-    if into and not inside and not batches[0][0].is_dir():
-        await require_directory(session.files, path)
+    with _naming(session, path, progress):
+        inside = await is_directory(session.files, path)
+        if not inside and len(batches) > 1:
+            raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
+        if into and not inside and not batches[0][0].is_dir():
+            await require_directory(session.files, path)
     plan = _placed(batches, path, inside=inside)
     sizes = [one.stat().st_size for one in plan.values() if not one.is_dir()]
     progress.plan(len(sizes), sum(sizes))
     for remote, one in plan.items():
         if one.is_dir():
-            await make_directory(session.files, remote, may_exist=True)
+            with _naming(session, remote, progress):
+                await make_directory(session.files, remote, may_exist=True)
         else:
             await _put_and_tell(session, one, remote, progress, tell)
 
@@ -145,7 +147,9 @@ async def put_alone(
     Raises:
         IsADirectory: the path is a directory, or is written as one.
     """
-    if into or await is_directory(session.files, path):
+    with _naming(session, path, progress):
+        inside = into or await is_directory(session.files, path)
+    if inside:
         raise IsADirectory(
             f"{name_text(path)}{'/' * into} is a directory; name the file that stdin is to become"
         )
@@ -185,16 +189,34 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
     except OSError as exc:
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
-        name = name_text(session.on_vehicle(remote))
-        reason = _with_final_name(str(exc), remote).removeprefix(f"{name_text(remote)}: ")
-        done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
-        told = f"{name} was not delivered: {reason}{done}"
+        told = _undelivered(session, remote, exc, progress)
         if isinstance(exc, NotFound | NotADirectory):
             raise type(exc)(told) from exc
         there = exc.there if isinstance(exc, NotDelivered) else False  # nothing was written yet
         raise NotDelivered(told, there=there) from exc
     progress.end(planned)
     return size
+
+
+@contextmanager
+def _naming(session: Session, remote: bytes, progress: Progress) -> Iterator[None]:
+    """Name the path in the error if the vehicle or the link fails in the body, which writes no file.
+
+    Raises:
+        NotDelivered: as for a file that was begun, because scripts should not see a difference.
+    """
+    try:
+        yield
+    except (RequestTimeout, LinkError) as exc:
+        raise NotDelivered(_undelivered(session, remote, exc, progress), there=False) from exc
+
+
+def _undelivered(session: Session, remote: bytes, error: MavftpfsError, progress: Progress) -> str:
+    """Return which file was not delivered, why, and how many were."""
+    name = name_text(session.on_vehicle(remote))
+    reason = _with_final_name(str(error), remote).removeprefix(f"{name_text(remote)}: ")
+    done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
+    return f"{name} was not delivered: {reason}{done}"
 
 
 async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:

@@ -397,6 +397,6 @@ class Engine:
             if op.timer <= now:
                 op.on_timer(now)
             if (op in late or op.progress_at + op.patience <= now) and not op.done:
-                op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
+                op.fail(RequestTimeout(f"no answer within {round(op.patience, 1):g} s"))
             if op.done:
                 self.remove(op)

@@ -159,9 +159,12 @@ class Store:
                         raise
         if operation is None:
             left = max(1.0, self._op_deadline - (self._clock() - started)) if tried else inf
-            operation = await self._server.ask(
-                partial(ListDirectory, wire, patience=left, known_end=known_end)
-            )
+            try:
+                operation = await self._server.ask(
+                    partial(ListDirectory, wire, patience=left, known_end=known_end)
+                )
+            except RequestTimeout as exc:  # `left` is only the rest of what users know as op_deadline
+                raise RequestTimeout(f"no answer within {self._op_deadline:g} s") from exc
             if tried and tried[-1].error is None:
                 traits.time_silences += tried[-1].sent  # it may have had to wait for its turn all the time
             if refused or traits.time_silences >= TIME_SILENCES:

@@ -29,6 +29,7 @@ from mavftpfs.shared.errors import (
     ReadOnly,
     RequestTimeout,
     UsageError,
+    VehicleLost,
     exit_code_for,
 )
 from mavftpfs.shared.model import EntryKind, split
@@ -151,6 +152,16 @@ async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> No
         await put(tree, local, to=b"/d", recursive=True)
     assert exit_code_for(caught.value) is ExitCode.UNDELIVERED
     assert all(file.closed for file in tree.opened)
+
+
+@pytest.mark.parametrize("to", [b"/d/x", b"/d"])
+async def test_a_link_that_is_gone_before_anything_is_sent_is_undelivered_too(local: Path, to: bytes) -> None:
+    tree = Card({b"/d/x": b"old"}, {b"/d"})
+    tree.failing["stat", to] = VehicleLost("silent")
+    with pytest.raises(NotDelivered, match=f"{to.decode()} was not delivered: silent") as caught:
+        await put(tree, local, to=to, recursive=True)
+    assert caught.value.there is False
+    assert tree.files == {b"/d/x": b"old"}
 
 
 async def test_a_missing_directory_is_that_and_no_undelivered_file(local: Path) -> None:
