@@ -57,6 +57,8 @@ def mount(args: argparse.Namespace) -> int:
         return work(_report_failure)
     if args.foreground or args.debug:
         return work(_report_in_foreground)
+    for line in options.client.gone:  # in the background only the log would have it
+        say(line)
     return daemon.in_background(work)
 
 

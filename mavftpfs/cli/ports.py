@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
+from mavftpfs.cli.commands import say
 from mavftpfs.client.status import said_of_double
 from mavftpfs.link.hublink import PROTOCOL, Facts, pack_facts, unpack_facts
 from mavftpfs.link.ports import connect, names_in_use, port_name
@@ -40,7 +41,8 @@ def hub(args: argparse.Namespace) -> int:
 
 def statuses(source: str | None) -> list[Status]:
     """Return the status of each hub; only that of SOURCE, if it is given."""
-    return [facts for _, facts in _hubs(source, {"status": True})]
+    replies = [_ask(name, {"status": True}) for name in _names(source)]
+    return [facts for facts in replies if facts is not None]
 
 
 def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
@@ -53,8 +55,16 @@ def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    """Stop hubs, after saying what that cuts off."""
-    found = list(_hubs(args.source, {"status": True}))
+    """Stop hubs, after saying what that cuts off; leave those of other users, and say so.
+
+    Raises:
+        UsageError: programs would be cut off, or all hubs are those of other users.
+    """
+    found, refused = _ours(args.source)
+    if refused and not found:
+        raise refused[0]
+    for error in refused:
+        say(str(error))
     cut = [facts for _, facts in found if facts["clients"] or _live(facts)]
     for facts in cut:
         for line in status_lines(facts):
@@ -66,6 +76,19 @@ def _stop(args: argparse.Namespace) -> int:
     if not found:
         print(NOTHING)
     return ExitCode.OK
+
+
+def _ours(source: str | None) -> tuple[list[tuple[str, Status]], list[UsageError]]:
+    """Return the hubs that this user may stop, and the refusals of the others."""
+    found, refused = [], []
+    for name in _names(source):
+        try:
+            reply = _ask(name, {"status": True, "may_stop": True})
+        except UsageError as exc:
+            refused.append(exc)
+        else:
+            found += [(name, reply)] if reply is not None else []
+    return found, refused
 
 
 def _live(facts: Status) -> list[Status]:
@@ -93,12 +116,9 @@ def status_lines(facts: Status) -> Iterator[str]:
         yield f"  {said_of_double(double['system'], double['address'])}"
 
 
-def _hubs(source: str | None, request: Facts) -> Iterator[tuple[str, Status]]:
-    """Yield the name of each port that a hub has, and what the hub replies; that of one SOURCE, or all."""
-    for name in names_in_use() if source is None else [port_name(parse_source(source))]:
-        reply = _ask(name, request)
-        if reply is not None:
-            yield name, reply
+def _names(source: str | None) -> list[str]:
+    """Return the name of the port of one SOURCE, or of all ports that programs of ours have."""
+    return names_in_use() if source is None else [port_name(parse_source(source))]
 
 
 def _ask(name: str, request: Facts) -> Status | None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from mavftpfs.link.uri import LinkSpec, parse_endpoint
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_endpoint
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -234,6 +234,9 @@ GONE: Mapping[str, Gone] = {
 log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 0.3."""
 
 
+_NO_BAUD = "option baud is gone, and means nothing here: SOURCE is no serial port"
+
+
 def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
     """Return whether an option is gone; if so, note a line about it in `values`.
 
@@ -247,9 +250,13 @@ def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
         raise UsageError(f"option {name} is gone: {gone.now}")
     if gone.becomes:
         values[gone.becomes] = parsed(gone.parse, name, text)
-    how = "is still understood" if gone.becomes else "is ignored"
-    values["gone"] = (*values.get("gone", ()), f"option {name} is gone, and {how}: {gone.now}")
+    values["gone"] = (*values.get("gone", ()), _gone_line(name, gone))
     return True
+
+
+def _gone_line(name: str, gone: Gone) -> str:
+    how = "is still understood" if gone.becomes else "is ignored"
+    return f"option {name} is gone, and {how}: {gone.now}"
 
 
 def options_of(keywords: Mapping[str, object]) -> Options:
@@ -289,13 +296,17 @@ def _as_text(name: str, value: object) -> str:
 
 
 def at_source(spec: LinkSpec, options: Options) -> tuple[LinkSpec, Options]:
-    """Return SOURCE and the options, with the `#subtree` of SOURCE as root.
+    """Return SOURCE and the options, with the `#subtree` of SOURCE as root, and baud= at a serial port.
 
     Raises:
         UsageError: root= is given, too.
     """
-    if options.baud is not None:
+    if options.baud is not None and spec.kind is LinkKind.SERIAL:
         spec = replace(spec, baud=options.baud)
+    elif options.baud is not None:
+        advice = _gone_line("baud", GONE["baud"])
+        gone = [_NO_BAUD if line == advice else line for line in options.gone]
+        options = replace(options, gone=tuple(gone))
     if spec.subtree == ROOT:
         return spec, options
     if options.root != ROOT:

@@ -187,7 +187,7 @@ class Hub:
                 client = await self._join(sock, request, nursery)
                 if client is not None:
                     await self._serve(client)
-            elif "stop" in request and not is_ours(sock):
+            elif request.keys() & {"stop", "may_stop"} and not is_ours(sock):
                 tell(sock, {"refused": _OTHERS.format(self.spec.description)})
             elif "status" in request or "stop" in request:
                 tell(sock, self.status())

@@ -157,6 +157,8 @@ def test_another_user_is_told_in_a_line(
     assert str(mount.path) in by_nobody(mount, "status").stdout
     assert "README.txt" in by_nobody(mount, "ls", mount.source).stdout.splitlines()  # they share the port
     assert f"mounted on {mount.path}" in by_nobody(mount, "scan", mount.source).stdout
+    refused = by_nobody(mount, "hub", "--stop", mount.source, code=ExitCode.USAGE)
+    assert (refused.stdout, "the hub of another user has this port" in refused.stderr) == ("", True)
 
 
 @pytest.mark.needs("root")

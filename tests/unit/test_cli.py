@@ -218,6 +218,13 @@ def test_words_of_0_2_that_belong_to_source_are_translated() -> None:
     assert len(options.client.gone) == 2
 
 
+def test_a_baud_rate_means_nothing_where_no_serial_port_is() -> None:
+    options, _ = commands.connection_of(argparse.Namespace(source=SOURCE, options=["window=4,baud=57600"]))
+    window, baud = options.client.gone
+    assert window.startswith("option window is gone")
+    assert baud == "option baud is gone, and means nothing here: SOURCE is no serial port"
+
+
 def test_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     args = argparse.Namespace(source="/dev/ttyX", options=["tlog=a/b.log"])
     options, _ = commands.connection_of(args)
