@@ -37,7 +37,15 @@ from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, NotDelivered, UsageError, exit_code_for
+from mavftpfs.shared.errors import (
+    ExitCode,
+    LinkError,
+    MavftpfsError,
+    NotDelivered,
+    RequestTimeout,
+    UsageError,
+    exit_code_for,
+)
 from mavftpfs.shared.private import make_private_directory
 from mavftpfs.shared.readable import printable, readable_size
 
@@ -379,9 +387,18 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
         with _on_interrupt(stopped), shown(bar):
             with_session(args, work, component, writing=True)
     except NotDelivered as exc:
+        if not _link_failed(exc):
+            raise  # a refusal says enough
         exc.args = (f"{exc}; {_left_there(untouched=exc.there is False)}",)
         raise
     return ExitCode.OK
+
+
+def _link_failed(error: BaseException | None) -> bool:
+    """Return whether an error comes from a link or vehicle that did not answer."""
+    return error is not None and (
+        isinstance(error, LinkError | RequestTimeout) or _link_failed(error.__cause__)
+    )
 
 
 def _left_there(*, untouched: bool) -> str:
@@ -517,7 +534,7 @@ def crc(args: Args) -> int:
         print(f"{number:08x}  {_name(path)}")
 
     async def work(session: Session) -> None:
-        await names.checksum_paths(session, await names.all_matching(session.files, wanted), tell)
+        await names.checksum_paths(session, wanted, tell, say)
 
     with_session(args, work, component)
     return ExitCode.OK

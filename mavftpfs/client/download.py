@@ -22,7 +22,7 @@ from mavftpfs.client.fetch import (
     part_of,
 )
 from mavftpfs.client.files import Found, Session, Unlisted, walk
-from mavftpfs.client.names import fixed_part, matching
+from mavftpfs.client.names import fixed_part, matching, matching_files
 from mavftpfs.client.proof import BY_CRC32, Proof, Verify, ask_crc32, local_crc32, proof_needed
 from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.shared.errors import (
@@ -208,7 +208,7 @@ class Downloads:
         found: list[Wanted] = []
         for path in paths:
             try:
-                names = await matching(self.fetcher.session.files, path)
+                names = await self._matching(path, recursive=recursive)
                 alone = alone and names == [path]
                 plain = names == [path]
                 top = split(path)[0] if plain else fixed_part(path)
@@ -239,6 +239,10 @@ class Downloads:
             self.fail(unreadable, error)
         return _made(session, place, found, selection)
 
+    async def _matching(self, path: bytes, *, recursive: bool = False) -> list[bytes]:
+        files = self.fetcher.session.files
+        return await (matching(files, path) if recursive else matching_files(files, path, self.complain))
+
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
         """Hand on the bytes of files, one behind the other.
 
@@ -247,7 +251,7 @@ class Downloads:
         """
         for path in paths:
             try:
-                for name in await matching(self.fetcher.session.files, path):
+                for name in await self._matching(path):
                     await self.fetcher.write_to(name, take)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=len(paths) == 1)

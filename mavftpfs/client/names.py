@@ -91,6 +91,23 @@ async def all_matching(files: Files, paths: Sequence[bytes]) -> list[bytes]:
     return list(dict.fromkeys(found))
 
 
+async def matching_files(files: Files, path: bytes, tell: Callable[[str], None]) -> list[bytes]:
+    """Return what `matching` returns, without the directories that a pattern matches; `tell` of each.
+
+    Raises:
+        IsADirectory: a pattern matches only directories. Else as `matching`.
+    """
+    found = await matching(files, path)
+    if found == [path]:
+        return found
+    directories = [name for name in found if await is_directory(files, name)]
+    if directories == found:
+        raise IsADirectory(f"{name_text(path)} matches only directories")
+    for name in directories:
+        tell(f"{name_text(name)} is a directory, and was left out")
+    return [name for name in found if name not in directories]
+
+
 async def _exists(files: Files, path: bytes) -> bool:
     try:
         await files.stat(path)
@@ -163,9 +180,9 @@ def _entry(path: bytes, name: bytes, found: Stat) -> Entry:
 
 
 def lines(listings: Sequence[Listing], look: Look) -> Iterator[str]:
-    """Yield the lines of several paths as ls prints them: files first, then directories with headings."""
+    """Yield the lines of several paths as ls prints them: paths of files, then directories with headings."""
     files = [entry for directory, entries in listings if directory is None for entry in entries]
-    yield from (_line(entry, look) for entry in files)
+    yield from (_line(entry, look, entry["path"]) for entry in files)
     apart = bool(files)
     for directory, entries in listings:
         if directory is None:
@@ -174,12 +191,12 @@ def lines(listings: Sequence[Listing], look: Look) -> Iterator[str]:
             if apart:
                 yield ""
             yield f"{_shown(directory, look)}:"
-        yield from (_line(entry, look) for entry in entries)
+        yield from (_line(entry, look, entry["name"]) for entry in entries)
         apart = True
 
 
-def _line(entry: Entry, look: Look) -> str:
-    name = _shown(entry["name"], look)
+def _line(entry: Entry, look: Look, called: str) -> str:
+    name = _shown(called, look)
     if look.colours:
         name = _coloured(name, entry)
     if entry["kind"] == "directory":
@@ -208,14 +225,18 @@ def _shown(name: str, look: Look) -> str:
 
 
 async def checksum_paths(
-    session: Session, paths: Sequence[bytes], tell: Callable[[bytes, int], None]
+    session: Session,
+    paths: Sequence[bytes],
+    tell: Callable[[bytes, int], None],
+    complain: Callable[[str], None],
 ) -> None:
-    """Have the vehicle compute CRC32s; `tell(path, crc)` for each.
+    """Have the vehicle compute CRC32s of files and of those that patterns match; `tell(path, crc)` for each.
 
     Raises:
-        IsADirectory. Else as Files.stat and crc32.
+        IsADirectory. Else as matching_files, Files.stat and crc32.
     """
-    for path in paths:
+    found = [name for path in paths for name in await matching_files(session.files, path, complain)]
+    for path in dict.fromkeys(found):
         if (await session.files.stat(path)).kind is not EntryKind.FILE:
             raise IsADirectory(f"{name_text(path)} is a directory")
         tell(path, await session.files.crc32(path))

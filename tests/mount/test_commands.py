@@ -33,7 +33,7 @@ def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
     out, _ = mavftpfs("ls", vehicle.source, "/sizes", "/sizes/478.bin", "/deep")
     sizes = sorted(path.name for path in (small_tree / "sizes").iterdir())
     deep = sorted(path.name + "/" * path.is_dir() for path in (small_tree / "deep").iterdir())
-    assert out.splitlines() == ["478.bin", "", "/sizes:", *sizes, "", "/deep:", *deep]
+    assert out.splitlines() == ["/sizes/478.bin", "", "/sizes:", *sizes, "", "/deep:", *deep]
     out, _ = mavftpfs("ls", "-l", vehicle.source, "mftp://comp=1:/sizes")
     detailed = {line.split()[-1]: int(line.split()[0]) for line in out.splitlines()}
     assert detailed == {path.name: path.stat().st_size for path in (small_tree / "sizes").iterdir()}
@@ -237,8 +237,9 @@ def place(request: pytest.FixtureRequest, field: Field) -> Place:
 
 def test_patterns(place: Place) -> None:
     source = place.source
-    assert command("ls", source, "/log/*.ulg")[0].splitlines() == ["1.ulg", "2.ulg", "[1].ulg"]
-    assert command("ls", source, "/l*/o*", "/l*/b*")[0].splitlines() == ["b.txt", "", "/log/old:"]
+    logs = ["/log/1.ulg", "/log/2.ulg", "/log/[1].ulg"]
+    assert command("ls", source, "/log/*.ulg")[0].splitlines() == logs
+    assert command("ls", source, "/l*/o*", "/l*/b*")[0].splitlines() == ["/log/b.txt", "", "/log/old:"]
     assert command("cat", source, "/log/[12].ulg") == ("1.ulg2.ulg", "")
     assert command("cat", source, "/log/[1].ulg") == ("[1].ulg", "")
     sums = command("crc", source, "/log/?.ulg")[0].splitlines()
@@ -247,6 +248,18 @@ def test_patterns(place: Place) -> None:
         said = command(verb, source, "/log/b*", "/log/*.zip", code=1)[1]
         assert said == "mavftpfs: nothing matches /log/*.zip\n"
     assert "b.txt" in place.names()
+
+
+def test_directories_that_a_pattern_matches_are_left_out(place: Place, tmp_path: Path) -> None:
+    note = "mavftpfs: /log/old is a directory, and was left out\n"
+    out, said = command("crc", place.source, "/log/[bo]*")
+    assert ([line.split()[1] for line in out.splitlines()], said) == (["/log/b.txt"], note)
+    assert command("cat", place.source, "/log/[bo]*") == ("b.txt", note)
+    assert command("get", place.source, "/log/[bo]*", "--to", f"{tmp_path}/got/")[1] == note
+    assert [path.name for path in (tmp_path / "got").iterdir()] == ["b.txt"]
+    for verb in ("crc", "cat", "get"):
+        said = command(verb, place.source, "/log/o*", code=1)[1]
+        assert said == "mavftpfs: /log/o* matches only directories\n"
 
 
 def test_rm_takes_patterns(place: Place) -> None:
@@ -279,7 +292,7 @@ def test_a_file_inside_a_mount_is_a_source(
     assert command("cat", first) == ("a.txt", "")
     assert command("cat", first, second) == ("a.txtb.txt", "")
     assert command("cat", mount / "log", "/a.txt") == ("a.txt", "")
-    assert command("ls", first, second)[0] == "a.txt\nb.txt\n"
+    assert command("ls", first, second)[0] == "/log/a.txt\n/log/b.txt\n"
     assert command("ls", mount / "log")[0] == "a.txt\nb.txt\n"
     assert [line.split()[1] for line in command("crc", first, second)[0].splitlines()] == [
         "/log/a.txt",
