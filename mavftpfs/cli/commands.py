@@ -25,7 +25,7 @@ from mavftpfs.mount import daemon, places
 from mavftpfs.mount.members import Member
 from mavftpfs.mount.options import LOCAL_PATHS, MountOptions, parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
-from mavftpfs.shared.readable import readable, readable_time
+from mavftpfs.shared.readable import count_files, readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
 """Seconds for `umount`: held bytes have to be sent first, perhaps over a radio."""
@@ -218,7 +218,7 @@ def _umount_unasked(place: str, *, lazy: bool) -> int:
     mountpoint.unmount(place, lazy=lazy)
     if held:
         say(
-            f"{report.count_files(held)} not on the vehicle yet: the mount delivers by itself now, and its "
+            f"{count_files(held)} not on the vehicle yet: the mount delivers by itself now, and its "
             "log says what becomes of it (it cannot be asked: its socket was removed)"
         )
         return ExitCode.UNDELIVERED
@@ -303,8 +303,8 @@ def left_by_killed_mounts_line() -> str:
         return ""
     places = ", ".join(sorted({str(data.parent) for data in left}))
     return (
-        f"{len(left)} file(s) did not reach the vehicle when a mount was killed; they lie in {places} "
-        "until it is mounted again, which moves them to a recovery directory"
+        f"{count_files(len(left))} did not reach the vehicle when a mount was killed; mounting the vehicle "
+        f"again moves {'it' if len(left) == 1 else 'them'} from {places} to a recovery directory"
     )
 
 

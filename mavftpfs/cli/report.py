@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mavftpfs.client.status import Status, is_read_only, second_vehicle
-from mavftpfs.shared.readable import printable, readable_size, readable_time
+from mavftpfs.shared.readable import count_files, printable, readable_size, readable_time
 
 WATCH_PERIOD = 1.0
 NOTHING = "no vehicle is mounted"
@@ -162,11 +162,6 @@ def _waits_for(status: Status) -> str:
 def time_left(seconds: float) -> str:
     """Return how much longer it takes, at least a second."""
     return f"{readable_time(max(1.0, seconds))} left"
-
-
-def count_files(count: int) -> str:
-    """Return `1 file`, `2 files`."""
-    return f"{count} file" if count == 1 else f"{count} files"
 
 
 def delivery_line(status: Status) -> str:

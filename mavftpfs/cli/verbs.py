@@ -23,15 +23,15 @@ import trio
 
 from mavftpfs.cli import watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line, say
-from mavftpfs.cli.report import count_files
 from mavftpfs.cli.showing import shown
 from mavftpfs.client import download, names, upload
-from mavftpfs.client import recover as recovering
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
+from mavftpfs.client.recover import put_back
+from mavftpfs.client.recovered import Recovered, chosen, recovered_below
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
@@ -47,7 +47,7 @@ from mavftpfs.shared.errors import (
     exit_code_for,
 )
 from mavftpfs.shared.private import make_private_directory
-from mavftpfs.shared.readable import printable, readable_size
+from mavftpfs.shared.readable import count_files, printable, readable_size
 
 ResultT = TypeVar("ResultT")
 Args = argparse.Namespace
@@ -453,9 +453,9 @@ def recover(args: Args) -> int:
     """List what did not reach a vehicle, or put it where it belonged."""
     base = recovered_directory()
     if args.source is None:
-        _list_recovered(recovering.recovered_below(base))
+        _list_recovered(recovered_below(base))
         return ExitCode.OK
-    wanted = recovering.recovered_below(base) if args.all else recovering.chosen(args.names, base)
+    wanted = recovered_below(base) if args.all else chosen(args.names, base)
     if args.all and not wanted:
         _list_recovered(wanted)
         return ExitCode.OK
@@ -463,25 +463,25 @@ def recover(args: Args) -> int:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
     bar = Progress()
 
-    def tell(copy: recovering.Recovered, there_already: bool) -> None:
+    def tell(copy: Recovered, there_already: bool) -> None:
         how = "was there already" if there_already else "is on the vehicle now, verified"
         print(f"{_name(copy.path or b'')} {how}; the copy here is removed", flush=True)
 
-    async def work(session: Session) -> list[recovering.Recovered]:
+    async def work(session: Session) -> list[Recovered]:
         async with noting_losses(session, bar):
-            return await recovering.put_back(session, wanted, bar, tell)
+            return await put_back(session, wanted, bar, tell)
 
     with shown(bar):
         others = with_session(args, work, writing=True)
     for vehicle, count in Counter(copy.vehicle for copy in others).items():
         say(
-            f"{count} file(s) of {vehicle} stay here: this is another vehicle; give theirs as SOURCE, or put "
-            "them on this one by: mavftpfs put SOURCE FILE PATH"
+            f"{count_files(count)} of {vehicle} not sent: this is another vehicle; give that one as SOURCE, "
+            "or use: mavftpfs put SOURCE FILE PATH"
         )
     return ExitCode.INCOMPLETE if others else ExitCode.OK
 
 
-def _list_recovered(found: Sequence[recovering.Recovered]) -> None:
+def _list_recovered(found: Sequence[Recovered]) -> None:
     """Print the recovered files by directory, and what still lies where a killed mount left it."""
     directory = None
     for copy in found:

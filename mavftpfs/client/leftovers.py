@@ -13,7 +13,9 @@ from pathlib import Path
 from random import SystemRandom
 
 from mavftpfs.cache.recovery import SpoolDirectory, left_in
+from mavftpfs.client.recovered import recovered_in
 from mavftpfs.link.messages import Address
+from mavftpfs.shared.readable import count_files
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -36,9 +38,13 @@ def recovery_directory(source: str) -> Path:
     return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
 
 
-def put_back_by(source: str, directory: Path) -> str:
-    """Return the words that tell people what to do with a recovery directory."""
-    return f"put them back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
+def what_to_do(source: str, directory: Path) -> str:
+    """Return the words that tell people what to do with a recovery directory: `recover` refuses parts."""
+    found = recovered_in(directory)
+    them = "it" if len(found) == 1 else "them"
+    if all(copy.hindrance for copy in found):
+        return f"list {them} by: mavftpfs recover"
+    return f"put {them} back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
 
 
 def spool_base(vehicle: Address | None) -> Path:
@@ -86,8 +92,9 @@ def rescue(spool: SpoolDirectory, source: str) -> str:
     else:
         if not found:
             return ""
+        place = f"it is in {directory}" if len(found) == 1 else f"they are in {directory}"
         message = (
-            f"{len(found)} file(s) of an earlier mount did not reach their vehicle; they are in {directory}; "
-            + put_back_by(source, directory)
+            f"{count_files(len(found))} of an earlier mount did not reach the vehicle; {place}; "
+            + what_to_do(source, directory)
         )
     return message

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.leftovers import put_back_by, recovery_directory
+from mavftpfs.client.leftovers import recovery_directory, what_to_do
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.readable import count_files
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -22,9 +23,9 @@ def keep_the_rest(tree: Tree, directory: Path) -> str:
     left = [*tree.undelivered(), *broken]
     if not left:
         return ""
-    lost = f"{len(left)} file(s) did not reach the vehicle"
+    lost, one = f"{count_files(len(left))} did not reach the vehicle", len(left) == 1
     if broken:
-        lost += f", {len(broken)} of them because a write failed"
+        lost += ", because a write failed" if one else f", {len(broken)} of them because a write failed"
     try:
         kept = tree.recover_to(directory)
     except OSError as exc:
@@ -32,7 +33,7 @@ def keep_the_rest(tree: Tree, directory: Path) -> str:
     except MavftpfsError as exc:
         return f"{lost}, and could not be moved to {directory}: {exc}"
     if len(kept) == len(left):
-        return f"{lost}; they are kept in {directory}"
+        return f"{lost}; {'it is' if one else 'they are'} kept in {directory}"
     return (
         f"{lost}; only {len(kept)} could be kept, in {directory}; "
         "the log says why, and the next mount looks for the others"
@@ -45,13 +46,12 @@ async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> N
     try:
         waiting = tree.undelivered()
         if waiting:
-            log.warning("delivering %d file(s) to the vehicle before ending", len(waiting))
+            log.warning("delivering %s to the vehicle before ending", count_files(len(waiting)))
             await tree.drain(DRAIN_LIMIT)
     finally:
         directory = recovery_directory(source)
-        put_back = put_back_by(source, directory) if tree.undelivered() else "list them by: mavftpfs recover"
         message = keep_the_rest(tree, directory)
         if message:
-            message += f"; {put_back}" if directory.exists() else ""
+            message += f"; {what_to_do(source, directory)}" if directory.exists() else ""
             log.error("%s", message)
             tell(message)

@@ -46,6 +46,11 @@ def readable_size(count: float) -> str:
     return f"{count:.1f} GB"
 
 
+def count_files(count: int) -> str:
+    """Return `1 file`, `2 files`."""
+    return f"{count} file" if count == 1 else f"{count} files"
+
+
 def readable_time(seconds: float) -> str:
     """Return a duration as people say it: 40 ms, 12 s, 3 min 20 s, 2 h 5 min."""
     if seconds < 1:

@@ -22,7 +22,9 @@ from tests.support.vehicles import Process, SimVehicle
 
 MAVFTPFS = (sys.executable, "-m", "mavftpfs")
 QUICK = ("op_deadline=6",)
-RECOVERED = re.compile(r"did not reach the\w* vehicle; they are (?:kept )?in (.+?); put them back by: ")
+RECOVERED = re.compile(
+    r"did not reach the vehicle; (?:it is|they are) (?:kept )?in (.+?); put (?:it|them) back by: "
+)
 
 WRITER = """
 import errno, os, sys, time
@@ -138,7 +140,10 @@ def test_arming_in_mid_copy_refuses_and_puts_no_part_on_the_card(field: Field, s
     assert sorted(os.listdir(card / "APM")) == ["new.txt", "old.txt", "whole.txt"]
     (copy,) = state.glob("*/APM__flight.bin")
     assert copy.read_bytes() == BLOCK * (taken // len(BLOCK))
-    assert f"1 of them because a write failed; they are kept in {copy.parent}" in said_last
+    assert (
+        f"1 file did not reach the vehicle, because a write failed; it is kept in {copy.parent}" in said_last
+    )
+    assert "; list it by: mavftpfs recover\n" in said_last
     assert "the part that was written before" in command("recover")[0]
 
 
@@ -239,9 +244,9 @@ def test_what_a_killed_daemon_held_is_named_by_umount_and_by_the_next_mount_in_t
     mount.kill()
     _, refused = mavftpfs(vehicle.source, mount.path, code=3)
     assert "is a dead mount whose program is gone" in refused
-    assert "1 file(s) did not reach the vehicle when a mount was killed" in refused
+    assert "1 file did not reach the vehicle when a mount was killed" in refused
     _, told = command("umount", mount.path, code=4)
-    assert "1 file(s) did not reach the vehicle" in told
+    assert "1 file did not reach the vehicle" in told
     assert not mounted_at(mount.path)
     vehicle.resume()
     _, failed = mavftpfs(f"{vehicle.source}#/none", mount.path, code=1)
@@ -393,6 +398,18 @@ def test_what_changed_since_is_not_replaced_and_what_is_there_is_not_sent(field:
     assert list(state.iterdir()) == []
 
 
+def test_a_description_goes_with_the_file_that_a_person_removed(state: Path) -> None:
+    described: dict[str, object] = {"path": "/f", "system": 1, "uid": None, "whole": True}
+    directory = keep(state, gone=described, **{"mine.json": described})
+    (directory / "gone").unlink()
+    (directory / "alone.json").write_text("{}")
+    listed = command("recover")[0]
+    assert "gone" not in listed
+    assert "  mine.json for /f on vehicle 1, 9 B" in listed
+    assert "  alone.json for ?, 2 B" in listed, "a user's own file, whose description was lost"
+    assert {path.name for path in directory.iterdir()} == {"mine.json", "mine.json.json", "alone.json"}
+
+
 @pytest.mark.holds("promise 3")
 def test_a_file_of_another_vehicle_stays_here(field: Field, data: Path, state: Path) -> None:
     """Files whose vehicle was not written down may go to any."""
@@ -408,7 +425,7 @@ def test_a_file_of_another_vehicle_stays_here(field: Field, data: Path, state: P
     card = field.local("card")
     other = field.sim(card, options=("--system", "2")).source
     keep(state, unknown={"path": "/unknown", "whole": True})
-    stays = f"mavftpfs: 1 file(s) of vehicle 1 (id {facts['uid']}) stay here: this is another vehicle; "
+    stays = f"mavftpfs: 1 file of vehicle 1 (id {facts['uid']}) not sent: this is another vehicle; "
     for words in (("--all",), (directory,), (kept,)):
         assert stays in command("recover", other, *words, code=ExitCode.INCOMPLETE)[1]
     assert [path.name for path in card.iterdir()] == ["unknown"]

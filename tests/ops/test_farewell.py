@@ -36,6 +36,9 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     class Keeping(FakeTree):
         def recover_to(self, directory: Path) -> Sequence[Path]:
             directory.mkdir(parents=True)
+            for path in super().recover_to(directory):
+                path.write_bytes(b"kept")
+                Path(f"{path}.json").write_text('{"path": "/x", "whole": true}')
             return super().recover_to(directory)
 
     tree = Keeping(left=[b"/a", b"/b"])
@@ -44,7 +47,7 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     assert name == "recover_to"
     place = os.fsdecode(directory)
     assert line == (
-        f"2 file(s) did not reach the vehicle; they are kept in {place}; "
+        f"2 files did not reach the vehicle; they are kept in {place}; "
         f"put them back by: mavftpfs recover udpin:0.0.0.0:14550 {place}"
     )
     assert Path(place).parent == state / "mavftpfs" / "recovered"
@@ -58,7 +61,7 @@ async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
 
     (line,) = await end_of(Full(left=[b"/a"]))
     assert "put them back" not in line
-    assert "1 file(s) did not reach the vehicle" in line
+    assert "1 file did not reach the vehicle" in line
     assert "No space left" in line
 
 
@@ -82,8 +85,27 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     (dead.path / "000001.json").write_text('{"path": "/f"}')
     dead.close()
     spool = SpoolDirectory(state / "base", random.Random(2))
-    assert leftovers.rescue(spool, "tcp:x:1").startswith("1 file(s) of an earlier mount did not reach")
+    assert leftovers.rescue(spool, "tcp:x:1").startswith(
+        "1 file of an earlier mount did not reach the vehicle; it is in "
+    )
     assert leftovers.rescue(spool, "tcp:x:1") == ""
+    spool.close()
+
+
+@pytest.mark.parametrize(
+    ("facts", "told"),
+    [
+        ('{"path": "/f", "whole": true}', "put it back by: mavftpfs recover tcp:x:1 "),
+        ('{"path": "/f", "whole": true, "broken": true}', "list it by: mavftpfs recover"),
+    ],
+)
+def test_a_part_is_listed_because_recover_does_not_put_it_back(state: Path, facts: str, told: str) -> None:
+    dead = SpoolDirectory(state / "base", random.Random(1))
+    (dead.path / "000001.data").write_bytes(b"held")
+    (dead.path / "000001.json").write_text(facts)
+    dead.close()
+    spool = SpoolDirectory(state / "base", random.Random(2))
+    assert f"; {told}" in leftovers.rescue(spool, "tcp:x:1")
     spool.close()
 
 

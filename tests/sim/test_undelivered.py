@@ -545,7 +545,7 @@ async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_
             await write_file(tree, name, name * 100)
     os.truncate(min(spool.path.glob("*.data")), 10)
     message = keep_the_rest(tree, tmp_path / "kept")
-    assert f"2 file(s) did not reach the vehicle; only 1 could be kept, in {tmp_path / 'kept'}" in message
+    assert f"2 files did not reach the vehicle; only 1 could be kept, in {tmp_path / 'kept'}" in message
     assert (tmp_path / "kept/d__b").read_bytes() == b"/d/b" * 100
     assert json.loads((tmp_path / "kept/d__b.json").read_text())["path"] == "/d/b"
     assert tree.undelivered() == [b"/d/a"], "it stays in the spool"

@@ -68,7 +68,7 @@ async def delivering_and_signalled(mount: Mount) -> None:
         with trio.fail_after(60):
             await trio.sleep_forever()
     finally:
-        mount.note_end(ExitCode.UNDELIVERED, "1 file(s) did not reach the vehicle")
+        mount.note_end(ExitCode.UNDELIVERED, "1 file did not reach the vehicle")
 
 
 async def link_fails(mount: Mount) -> None:
@@ -120,7 +120,7 @@ async def test_what_a_user_should_know_is_in_the_log_too(caplog: pytest.LogCaptu
 @pytest.mark.holds("promise 3")
 async def test_an_error_hides_not_that_bytes_were_left() -> None:
     async def left(mount: Mount) -> None:
-        mount.note_end(ExitCode.UNDELIVERED, "1 file(s) did not reach the vehicle")
+        mount.note_end(ExitCode.UNDELIVERED, "1 file did not reach the vehicle")
 
     assert await Mount(mounted, left, link_fails).run() == ExitCode.UNDELIVERED
 
