@@ -205,7 +205,10 @@ class Deliverer:
         context.retry_later()
         self._throttle.waiting.unpark_all()
         log.warning(
-            "a write to %r failed (%s): nothing of it is put on the card; the part is kept here", path, error
+            "a write to %r failed (%s): the vehicle does not get this version; copy the file again (umount "
+            "moves the part that was written to a recovery directory; `mavftpfs recover` lists it)",
+            path,
+            error,
         )
         self._persist(node, draft)
         draft.content.leave_budget()

@@ -31,7 +31,16 @@ from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle, WriteLimit
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
-from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
+from mavftpfs.shared import readonly
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    Armed,
+    IsADirectory,
+    MavftpfsError,
+    NoSpace,
+    NotFound,
+    SpoolFailed,
+)
 from mavftpfs.shared.model import EntryKind, require_listable
 from mavftpfs.shared.readable import readable
 from mavftpfs.shared.sameness import Known
@@ -301,7 +310,7 @@ class Writeback:
             "unacked_max": self._limit.bytes(),
             "write_rate": self._throttle.speed,
             "files_undelivered": len(self.undelivered()),
-            "broken": {path.decode(errors="replace"): readable(str(node.error)) for path, node in broken},
+            "broken": {path.decode(errors="replace"): _reason_then(node.error) for path, node in broken},
             "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
@@ -360,3 +369,8 @@ class Writeback:
     def _is_left_to_us(is_new: bool, node: Node) -> bool:
         """Return whether a file is to be delivered unasked."""
         return not node.writers and (is_new or may_pass(node))
+
+
+def _reason_then(error: Exception | None) -> str:
+    """Return why a write failed, told later: the vehicle may be disarmed meanwhile."""
+    return readonly.WAS_ARMED if isinstance(error, Armed) else readable(str(error))

@@ -196,9 +196,11 @@ async def _diff_vehicles(args: Args, target: Target) -> int:
                 say(f"vehicle {name} is left out: {exc}")
                 code = ExitCode.INCOMPLETE
     if len(found) < 2:
-        raise UsageError(
-            f"{len(found)} of the vehicles can be compared, two are needed; see: mavftpfs status"
-        )
+        told = f"{len(found)} of the vehicles can be compared, two are needed; see: mavftpfs status"
+        if not code:
+            raise UsageError(told)
+        say(told)
+        return code
     rows = client.compare_vehicles(list(found.values()))
     if args.json:
         facts = [{"name": row.name, **dict(zip(found, row.values, strict=True))} for row in rows]

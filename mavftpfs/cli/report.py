@@ -139,7 +139,7 @@ def _transfer_line(transfer: Status) -> Line:
 def _held_lines(status: Status) -> Iterator[Line]:
     held, files = status["held"], status["held"]["files"]
     for path, error in held.get("broken", {}).items():
-        yield Line("  write failed ", path, f": {error}; the part is kept here, and not put on the card")
+        yield Line("  write failed ", path, f": {error}; copy the file again ({_part_goes()})")
     if not files:
         if not (status.get("read_only") or held.get("broken")):
             yield Line("  nothing is held back: all that was written is on the vehicle")
@@ -149,6 +149,13 @@ def _held_lines(status: Status) -> Iterator[Line]:
     for path, error in held["errors"].items():
         if path not in shown:
             yield Line("  failed ", path, f": {error}")
+
+
+def _part_goes() -> str:
+    """Return where the part of a file goes of which a write failed."""
+    from mavftpfs.client.leftovers import recovered_directory
+
+    return f"umount moves the part that was written to {recovered_directory()}"
 
 
 def _waits_for(status: Status) -> str:

@@ -6,6 +6,9 @@ from mavftpfs.shared.readable import name_text
 
 ARMED = "the vehicle is armed: nothing is written in flight (when_armed=ro)"
 
+WAS_ARMED = "the vehicle was armed (when_armed=ro)"
+"""The same words once they are told later, of a write that failed."""
+
 NOTHING_BY_OPTION = "nothing is changed, because the option ro was given"
 
 

@@ -157,6 +157,10 @@ def test_the_parameters_of_several_vehicles_are_compared(fleet: Fleet) -> None:
     out, err = command("param", mounts.path, "--diff", code=2)
     assert out.splitlines() == table
     assert err.startswith("mavftpfs: vehicle 3 is left out: this vehicle has no parameters")
+    fleet.vehicles[2].left_alone = True
+    fleet.vehicles[2].kill()
+    wait_until("it is lost", lambda: "LOST" in command("status", mounts.path / "2")[0])
+    assert "two are needed" in command("param", mounts.path, "--diff", code=2)[1]
     assert "only one vehicle" in command("param", mounts.path / "1", "--diff", code=1)[1]
     assert "needs a FILE" in command("param", fleet.source, "--diff", code=1)[1]
 

@@ -129,8 +129,12 @@ def test_arming_in_mid_copy_refuses_and_puts_no_part_on_the_card(field: Field, s
     status = json.loads(command("status", mount.path, "--json")[0])
     assert status["vehicle"]["armed"] is True
     assert (status["held"]["files"], list(status["held"]["broken"])) == (1, ["/APM/flight.bin"])
-    assert "write failed /APM/flight.bin" in command("status", mount.path)[0]
     vehicle.react(signal.SIGUSR1)
+    wait_until("it is disarmed", lambda: "disarmed" in command("status", mount.path)[0])
+    assert (
+        "  write failed /APM/flight.bin: the vehicle was armed (when_armed=ro); copy the file again "
+        f"(umount moves the part that was written to {state})\n"
+    ) in command("status", mount.path)[0]
     whole = card / "APM/whole.txt"
     wait_until("what was accepted is delivered", lambda: whole.exists() and whole.read_text() == "whole\n")
     mount.run("sh", "-c", f"echo new > {mount.path}/APM/new.txt")
