@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -42,7 +42,7 @@ async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     if target.mount is not None:
         return _shown(await _by_mount(target.mount[0]), show)
     assert target.spec is not None
-    found = _shown([_own_entry(status) for status in await mounts_on(target.spec)], show)
+    found = _shown(_of_mounts(await mounts_on(target.spec)), show)
     try:
         async with opened(target.spec, target.options) as link:
             async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
@@ -194,6 +194,17 @@ def _own_entry(status: Mapping[str, Any]) -> Entry:
         "seen": ["the vehicle is silent"] * lost + _second(status),
         "facts": status["connection"],
     }
+
+
+def _of_mounts(statuses: Sequence[Mapping[str, Any]]) -> list[Entry]:
+    """Return what mounts tell of their vehicles: an entry for each, however many mounts it has."""
+    found: dict[tuple[Any, ...], Entry] = {}
+    for status in sorted(statuses, key=lambda status: status["link"]["state"] == "lost"):
+        entry = _own_entry(status)
+        same = found.setdefault((entry["system"], entry["component"], entry["uid"]), entry)
+        if same is not entry:
+            same["ftp"] += f" and on {status['mountpoint']}"
+    return list(found.values())
 
 
 def _second(facts: Mapping[str, Any]) -> list[str]:

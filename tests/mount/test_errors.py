@@ -63,6 +63,9 @@ def test_a_second_mount_of_a_vehicle_names_the_first(field: Field, small_tree: P
         assert f"this vehicle is mounted on {first.path}, too; " in said
         assert said.endswith(f"to have only one, run: mavftpfs umount {first.path}\n")
         assert mounted_at(second.path)
+        _, row = mavftpfs("scan", source)[0].splitlines()
+        assert row.startswith("1/1\t")
+        assert all(str(mount.path) in row for mount in (first, second))
     finally:
         mavftpfs("umount", second.path)
     first.unmount()
