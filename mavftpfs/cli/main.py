@@ -10,6 +10,7 @@ import argparse
 import difflib
 import importlib
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from typing import NoReturn
 
 import mavftpfs
 from mavftpfs.cli import commands
+from mavftpfs.client.mountpoint import enclosing_mount
 from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
@@ -125,7 +127,7 @@ def _run(words: list[str]) -> int:
     if name in _COMMANDS:
         make_parser, run = _COMMANDS[name]
         # also `ls SOURCE -l PATH`: parse_args takes no PATH... after an option that follows SOURCE
-        return run(make_parser(name).parse_intermixed_args(_without_gone_flags(name, words[1:])))
+        return run(_parsed(make_parser(name), name, _without_gone_flags(name, words[1:])))
     parser = _top_parser()
     if not words:
         print(_FIRST_STEPS, end="", file=sys.stderr)
@@ -139,6 +141,26 @@ def _run(words: list[str]) -> int:
     if not any(mark in args.source for mark in ":/") and not os.path.isdir(args.source):
         raise _no_command(args.source)
     return commands.mount(args)
+
+
+_PLAIN_ALIKE = ("rm", "mkdir", "rmdir")
+"""Commands that a mount does not need, because the system has one of the same name."""
+
+
+def _parsed(parser: Parser, name: str, words: list[str]) -> argparse.Namespace:
+    """Return a command's parsed words.
+
+    Raises:
+        UsageError: they are wrong. One path inside a mount, without SOURCE, is told what does that.
+    """
+    try:
+        return parser.parse_intermixed_args(words)
+    except UsageError as exc:
+        named = [word for word in words if not word.startswith("-")]
+        inside = enclosing_mount(named[0]) if name in _PLAIN_ALIKE and len(named) == 1 else None
+        if inside is None or not inside[1].strip("/"):
+            raise
+        raise UsageError(f"{named[0]} lies in a mount, so run: {name} {shlex.join(words)}") from exc
 
 
 _GONE_FLAGS = {

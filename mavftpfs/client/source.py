@@ -11,7 +11,7 @@ from mavftpfs.client.files import Target, mountpoint_of
 from mavftpfs.client.mounted import STATUS_PATIENCE
 from mavftpfs.client.options import Options, at_source
 from mavftpfs.client.status import several_at, told_by
-from mavftpfs.link.uri import parse_source
+from mavftpfs.link.uri import parse_source, require_expanded
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import ROOT
 
@@ -24,8 +24,9 @@ def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[s
     command `lists` that by itself.
 
     Raises:
-        UsageError: one of the paths lies elsewhere.
+        UsageError: one of the paths lies elsewhere, or the shell did not expand a `~` in SOURCE.
     """
+    require_expanded(source)
     mount = mountpoint_of(source)
     if mount is None or mount[1] == ROOT or several_at(mount[0]) is not None:
         return None

@@ -82,6 +82,7 @@ def parse_source(text: str) -> LinkSpec:
     Raises:
         UsageError: one line that says what is wrong and shows a right example.
     """
+    require_expanded(text)
     source, mark, subtree_text = text.partition("#")
     subtree = _parse_subtree(subtree_text, source) if mark else ROOT
     scheme, colon, rest = source.partition(":")
@@ -116,6 +117,16 @@ def parse_endpoint(text: str) -> LinkSpec:
     if spec.kind.listens and rest.startswith(":"):
         return replace(spec, host=LOOPBACK)
     return spec
+
+
+def require_expanded(source: str) -> None:
+    """Check that the shell has expanded a `~` at the beginning of SOURCE.
+
+    Raises:
+        UsageError: it has not.
+    """
+    if source.startswith("~/"):
+        raise UsageError(f"SOURCE {source!r}: the shell does not expand ~ in quotes; quote only the pattern")
 
 
 def _parse_subtree(text: str, source: str) -> bytes:
