@@ -376,6 +376,13 @@ class Tree:
         """Return the paths of files of which a write failed; the parts that were written are kept."""
         return [self._below(remote) for remote in self._writing.broken()]
 
+    async def break_unfinished(self) -> None:
+        """Break the files that programs were writing when the mount was taken away. For the end of a mount.
+
+        These programs get errors from now on, so what they wrote is a part, which never gets the name.
+        """
+        await self._writing.break_unfinished()
+
     async def drain(self, timeout: float) -> Sequence[bytes]:
         """Deliver everything, trying again for at most `timeout` seconds; return what remains."""
         await self._writing.drain(timeout)

@@ -18,6 +18,7 @@ import trio
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
@@ -36,6 +37,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
     IsADirectory,
+    LinkClosed,
     MavftpfsError,
     NoSpace,
     NotFound,
@@ -240,6 +242,15 @@ class Writeback:
     def broken(self) -> list[bytes]:
         """See Tree.broken."""
         return list(self._context.nodes.broken)
+
+    async def break_unfinished(self) -> None:
+        """See Tree.break_unfinished. A file that was closed in vain (its error is known) is whole."""
+        reason = LinkClosed("the mount was taken away while a program wrote it")
+        for node in list(self._context.nodes):
+            if node.writers and node.undelivered and node.error is None:
+                async with node.lock:
+                    if node.undelivered and node.draft is not None and node.draft.state is not State.STALE:
+                        await self._deliverer.break_off(node, reason)
 
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""

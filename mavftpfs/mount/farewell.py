@@ -6,6 +6,8 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
+import trio
+
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.leftovers import recovery_directory, what_to_do
 from mavftpfs.shared.errors import MavftpfsError
@@ -13,6 +15,8 @@ from mavftpfs.shared.readable import count_files
 
 log = logging.getLogger("mavftpfs.mount")
 
+BREAK_LIMIT = 5.0
+"""Seconds for calls that are under way to let go of the files that they write."""
 DRAIN_LIMIT = 300.0
 """Seconds to go on delivering after the kernel mount is gone; a second signal ends it sooner."""
 
@@ -44,6 +48,8 @@ async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> N
     """Deliver, or keep what is left; `tell` gets the line that goes with exit code 4. When cancelled,
     keep."""
     try:
+        with trio.move_on_after(BREAK_LIMIT, shield=True):
+            await tree.break_unfinished()
         waiting = tree.undelivered()
         if waiting:
             log.warning("delivering %s to the vehicle before ending", count_files(len(waiting)))

@@ -157,7 +157,8 @@ class ListDirectory(Operation):
     Only for paths known to be directories: listing a file kills a MAVSDK server.
 
     ArduPilot and MAVSDK answer EOF at the offset of a name that fits no reply, too. So behind an EOF the next
-    offset is asked for, once. If it has names, the listing goes on there, and is not complete.
+    offset is asked for, once. If it has names, the listing goes on there, and is not complete. PX4 answers an
+    empty page at such an offset; if names follow, the listing is not complete, either.
 
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
@@ -228,6 +229,8 @@ class ListDirectory(Operation):
         if page.strings == 0:
             self._on_empty_page()
             return
+        if self._empty_pages and page.entries:
+            self.complete = False  # a name that fits no page lies before these
         self._empty_pages = 0
         if self.strings == 0:
             self._first_page = reply.data

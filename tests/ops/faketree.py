@@ -202,6 +202,9 @@ class FakeTree:
     def undelivered(self) -> Sequence[bytes]:
         return self.left
 
+    async def break_unfinished(self) -> None:
+        pass
+
     async def drain(self, timeout: float) -> Sequence[bytes]:
         await self.pause("drain")
         return self.left

@@ -199,6 +199,22 @@ async def test_a_new_file_of_which_the_first_write_failed_gets_no_name(here: Rig
     assert here.files() == {FILE: OLD}
 
 
+async def test_what_a_program_was_writing_when_the_mount_went_away_gets_no_name(here: Rig) -> None:
+    tree = await mount(here)
+    await part_of(tree, FILE)
+    whole = await tree.create(FRESH, exclusive=True)
+    await whole.write(0, PART)
+    await here.lose()
+    with pytest.raises(MavftpfsError):
+        await whole.flush()
+    await here.find()
+    await tree.break_unfinished()
+    assert await tree.drain(60.0) == []
+    await tree.tidy_up()
+    assert tree.broken() == [FILE]
+    assert here.files() == {FILE: OLD, FRESH: PART}
+
+
 async def test_a_new_file_that_is_too_large_at_once_can_be_written_smaller(here: Rig) -> None:
     tree = await mount(here)
     file = await tree.create(FRESH, exclusive=True)
