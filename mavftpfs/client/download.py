@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.brought import NAME as MEMORY
@@ -157,8 +158,12 @@ class Downloads:
     async def _logs(self, wish: Wish) -> list[Wanted]:
         """Find the logs; return the wanted ones, newest first."""
         session = self.fetcher.session
-        place, logs, unlisted = await wanted_logs(session, wish, wish.local)
+        if session.mountpoint is not None:  # a log of the last flight is not in what a mount listed before
+            await session.files.refresh()
+        place, logs, unlisted, unmatched = await wanted_logs(session, wish, wish.local)
         self.outcome.place = session.on_vehicle(place)
+        if unmatched:
+            self.complain(f"--include and --exclude leave no log to fetch ({unmatched} in all)")
         for path, error in unlisted:
             self.fail(path, error)
         warning = wish.selection.warning(logs)
@@ -204,10 +209,11 @@ class Downloads:
             UsageError: two files would get one local name. NotFound: `selection` takes no file. In both cases
             nothing was fetched. Else as Fetcher.fetch where only one file is asked for, else as `sync`.
         """
-        alone = len(paths) == 1
+        alone, refreshed = len(paths) == 1, self.fetcher.session.mountpoint is None
         found: list[Wanted] = []
         for path in paths:
             try:
+                refreshed = refreshed or await self._refreshed_for(path)
                 names = await self._matching(path, recursive=recursive)
                 alone = alone and names == [path]
                 plain = names == [path]
@@ -223,6 +229,18 @@ class Downloads:
         _require_apart(found)
         self.outcome.wanted = _apart(found)
         await self._fetch_all(alone=alone and [one.remote for one in found] == [*paths])
+
+    async def _refreshed_for(self, path: bytes) -> bool:
+        """Have a mount ask the vehicle again if it does not know a path: the file may be newer than what the
+        mount listed before. Return whether the mount did."""
+        files = self.fetcher.session.files
+        try:
+            if await matching(files, path) == [path]:
+                await files.stat(path)
+        except NotFound:
+            await files.refresh()
+            return True
+        return False
 
     async def _found(self, place: Place, selection: Selection, *, recursive: bool) -> list[Wanted]:
         """Make the local directories for the files of a path, and return the files."""
@@ -378,8 +396,19 @@ def _require_no_file(local: Path) -> None:
         raise UsageError(f"{local} is a file; the logs go into a directory")
 
 
-async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes, list[Wanted], Unlisted]:
-    """Return where the logs are, the wanted ones, newest first, and the directories that could not be listed.
+class Logs(NamedTuple):
+    """The vehicle's logs. place: their directory; wanted: the newest first; unlisted: the directories that
+    could not be listed; unmatched: how many logs there are, if the patterns match none of them, otherwise
+    0."""
+
+    place: bytes
+    wanted: list[Wanted]
+    unlisted: Unlisted
+    unmatched: int
+
+
+async def wanted_logs(session: Session, wish: Wish, local: Path) -> Logs:
+    """List the logs, and choose.
 
     local: the directory into which they are to go.
 
@@ -398,11 +427,11 @@ async def wanted_logs(session: Session, wish: Wish, local: Path) -> tuple[bytes,
     logs = [
         _wanted(join(place, below), local / os.fsdecode(below), below, stat, keep_old=True)
         for below, stat in found
-        if stat.kind is EntryKind.FILE
-        and below != MEMORY.encode()  # local logs that were copied to the card
-        and wish.selection.takes(below)
+        if stat.kind is EntryKind.FILE and below != MEMORY.encode()  # local logs that were copied to the card
     ]
-    return place, _apart(wish.selection.of_logs(logs)), unlisted
+    takes = wish.selection.takes
+    taken = [log for log in logs if takes(log.remote.removeprefix(join(place, b"")))]
+    return Logs(place, _apart(wish.selection.of_logs(taken)), unlisted, 0 if taken else len(logs))
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:

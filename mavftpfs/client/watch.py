@@ -246,7 +246,7 @@ class Watch:
         try:
             with local_disk(self._local):
                 self._memory = Memory(self._local)
-            _, logs, unlisted = await wanted_logs(session, self._wish.logs, local)
+            _, logs, unlisted, _ = await wanted_logs(session, self._wish.logs, local)
             logs = [log for log in logs if not is_no_log(log)]
             new = [log for log in logs if not await self._is_known(name, log, session)]
             warning = self._wish.logs.selection.warning(new)

@@ -175,6 +175,33 @@ def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: P
     assert local_files(local) == {"big.bin"}
 
 
+def test_patterns_that_leave_nothing_are_said(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    logs_of(vehicle.root / "log")
+    out, err = run("sync", vehicle.source, tmp_path / "logs", "--include", "*.nope")
+    assert out.startswith("0 new (0 B), 0 here already")
+    assert err == "mavftpfs: --include and --exclude leave no log to fetch (3 in all)\n"
+    assert run("sync", vehicle.source, tmp_path / "logs", "--include", "*.ulg")[1] == ""
+    assert run("sync", vehicle.source, tmp_path / "logs", "--since", "2h")[1] == ""
+
+
+def test_new_files_are_found_through_a_mount_that_listed_before(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    logs = logs_of(vehicle.root / "log")
+    mount = field.mount(vehicle.source)
+    mount.run("ls", mount.path / "log/2024-05-02")
+    write_log(vehicle.root / "log/2024-05-02/12_00_00.ulg", 1000, 7, 7)
+    assert sync(mount.path, tmp_path / "logs").startswith(f"{len(logs) + 1} new")
+    missing = mount.path / "log/2024-05-02/13_00_00.ulg"
+    assert "does not exist" in run("get", missing, "--to", tmp_path / "got", code=1)[1]
+    write_log(vehicle.root / "log/2024-05-02/13_00_00.ulg", 1000, 8, 8)
+    run("get", missing, "--to", tmp_path / "got")
+    assert (tmp_path / "got").stat().st_size == 1000
+    write_log(vehicle.root / "log/2024-05-02/14_00_00.ulg", 1000, 9, 9)
+    run("get", mount.path, "/log/*/14*", "--to", tmp_path / "matched")
+    assert (tmp_path / "matched/2024-05-02/14_00_00.ulg").stat().st_size == 1000
+
+
 def test_verbs_use_the_mount_that_is_up(field: Field, tmp_path: Path) -> None:
     card = field.local("card")
     logs = logs_of(card / "APM/LOGS")
