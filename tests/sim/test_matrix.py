@@ -245,7 +245,7 @@ def can(profile: str, operation: Call, event: Event) -> bool:
     if not in_place(profile):
         return True
     in_steps = (*RENAMES, *IN_PLACE) if event is power_off else RENAMES
-    # A part lies under the name until the vehicle is back: sim/test_failed_writes.py holds what becomes of it.
+    # A part lies under the name until the vehicle is back: see sim/test_failed_writes.py.
     return event in EVENTS and operation not in (*in_steps, *FAILING, take_back)
 
 
