@@ -229,8 +229,10 @@ class Deliverer:
     async def remove_parts(self, path: bytes | None = None) -> None:
         """Remove from the card what broken files left there. path: only of this one.
 
+        If the vehicle refuses, the part stays on the card, and the log names it.
+
         Raises:
-            As VehicleStore, after a refusal nothing: what could not be removed is tried again later.
+            As VehicleStore, but no FtpNak: what is left is tried again later.
         """
         for part in [part for part in self.parts if path in (None, part)]:
             try:

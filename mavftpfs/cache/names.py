@@ -219,12 +219,19 @@ class Names:
         Raises:
             As VehicleStore, but no FtpNak: after a refusal the trait may be as unknown as before.
         """
+        for _ in range(2):  # a REMOVE that arrived twice may be refused, too, but hardly twice in a row
+            if await self._try_rename(near):
+                return
+        self._context.store.traits.rename_works = False
+
+    async def _try_rename(self, near: bytes) -> bool:
+        """Make an empty file, rename and remove it; return False if it was lost on the way."""
         context, store, own = self._context, self._context.store, self._context.own
         try:
             first = place = own.beside(near, Kind.NEW)
             second = own.beside(first, Kind.NEW)
         except PathTooLong:
-            return
+            return True
         own.in_use |= {first, second}
         try:
             await store.create_empty(first)
@@ -238,11 +245,11 @@ class Names:
                 store.traits.rename_works = True
         except FtpNak as nak:
             log.debug("an empty file beside %r was refused: %s", near, nak)
-            if place == second and await context.directories.ask_entry(second) is None:
-                store.traits.rename_works = False
+            return place != second or await context.directories.ask_entry(second) is not None
         finally:
             own.in_use -= {first, second}
             context.directories.expire(split(near)[0])  # the next listing cleans up what is left
+        return True
 
     async def purge(self, path: bytes) -> None:
         """Before a name goes, remove what earlier replacements left: it would bring the name back.

@@ -249,7 +249,7 @@ class Writeback:
         for node in list(self._context.nodes):
             if node.writers and node.undelivered and node.error is None:
                 async with node.lock:
-                    if node.undelivered and node.draft is not None and node.draft.state is not State.STALE:
+                    if node.draft is not None and node.draft.state in (State.DIRTY, State.SENDING):
                         await self._deliverer.break_off(node, reason)
 
     async def drain(self, timeout: float) -> None:

@@ -137,6 +137,25 @@ async def test_a_server_that_says_that_it_renames_and_does_not(
             assert here.data(FILE) == OLD
 
 
+@pytest.mark.holds("fault duplicate")
+async def test_a_removal_that_arrives_twice_does_not_pass_for_a_card_that_cannot_rename() -> None:
+    """It removes the empty file that was renamed to find out. Only the second answer comes, a refusal."""
+    asked: list[int] = []
+    for _ in range(2):
+        async with rig("mavsdk") as here:
+            here.put_directory(b"/d")
+            tree = here.mount()
+            await tree.list(b"/d")
+            if asked:
+                here.faults.repeat(asked.index(Opcode.REMOVE_FILE) + 1)
+                here.faults.lose_reply_to(Opcode.REMOVE_FILE)
+            began = len(here.faults.requests)
+            await write_file(tree, FRESH, content(70_000))
+            assert here.connection.store.traits.rename_works
+            asked = here.faults.requests[began:]
+    assert asked.count(Opcode.REMOVE_FILE) > 2
+
+
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
 async def test_a_refusal_for_another_reason_says_nothing_of_replacing(here: Rig, number: int) -> None:
     tree, traits = here.mount(), here.connection.store.traits

@@ -97,14 +97,9 @@ FAR = LinkSettings(delay=0.02)
 """A link on which calls that run beside each other meet: an answer takes its time."""
 
 _STALE = "a refused removal interrupts the end of a replacement, and the file is STALE"
-_IN_PLACE = (
-    "the refusal of the doubled first rename passes for that of a card that cannot rename, so the part lies "
-    "under the name until it is removed"
-)
 KNOWN: dict[tuple[str, str, str], str] = {
     ("px4-nuttx", "change", "fail_to_remove_too"): _STALE,
     ("px4-nuttx", "append", "fail_to_remove_too"): _STALE,
-    ("mavsdk", "fail_to_create", "answer_the_second"): _IN_PLACE,
 }
 """Cells that fail on today's code at one of their requests, with the reason."""
 

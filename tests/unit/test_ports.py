@@ -17,7 +17,8 @@ from mavftpfs.shared.errors import LinkClosed
 from tests.support.vehicles import HOST, free_udp_port
 
 NOBODY = 65534
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+as_root = pytest.mark.needs("root")
+"""Only root can be another user."""
 
 
 def serial(path: Path) -> LinkSpec:
