@@ -34,7 +34,7 @@ def block(heading: str) -> list[str]:
     return [line.partition("  #")[0].strip() for line in re.findall(r"^    (\S.*)$", section, re.MULTILINE)]
 
 
-MOUNTING = [line for line in block("Mounting") if line.startswith("mavftpfs") and line.endswith(" ~/drone")]
+MOUNTING = [line for line in block("Mount") if line.startswith("mavftpfs") and line.endswith(" ~/drone")]
 MOUNTS = [line for line in MOUNTING if line.split()[1] in SOURCES]
 
 
@@ -87,7 +87,7 @@ def with_vehicle(line: str, home: Home, field: Field, profile: str) -> str:
 
 @pytest.mark.parametrize("line", MOUNTS)
 def test_mounting(line: str, home: Home, field: Field) -> None:
-    for command in block("Mounting"):
+    for command in block("Mount"):
         if command in MOUNTS:
             if command == line:
                 home.run(with_vehicle(command, home, field, "px4"))
@@ -103,7 +103,7 @@ def test_all_ways_to_mount_are_tried() -> None:
 
 @pytest.mark.parametrize("number", range(3))
 def test_copying_the_logs(number: int, home: Home, field: Field) -> None:
-    line = block("Copying the logs")[number]
+    line = block("Copy the logs")[number]
     if line.split()[-2].startswith("~/drone"):
         home.mountpoint.mkdir()
         home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
@@ -119,7 +119,7 @@ def test_copying_the_logs(number: int, home: Home, field: Field) -> None:
 def test_editing(home: Home, field: Field) -> None:
     home.mountpoint.mkdir()
     home.run(with_vehicle(MOUNTS[0], home, field, "ardupilot"))
-    vim, cp, cat = block("Editing")
+    vim, cp, cat = block("Edit")
     home.run(vim.replace("vim ", "vim -es -V1 -u NONE -c 's/1/2/' -c wq "))
     assert (home.card / "APM/scripts/hover.lua").read_text() == "return 2\n"
     home.run(cp)
