@@ -2,7 +2,8 @@
 
 What must hold, whatever happens and whenever:
 - A call that succeeds did all of it: the card shows that at once.
-- A call that fails did all or nothing, and what a failed close holds is delivered when the event is over.
+- A call that fails did all or nothing. If its writes were taken, their bytes are delivered when the event is
+  over, or kept here.
   Where others changed the file meanwhile it stays here, and is kept in the end.
 - If others change the directory, too, the card has what a local disk has if each call is carried out as a
   whole, one after the other. A change of others is lost only if it came after the last look at the file.
@@ -78,6 +79,7 @@ from tests.support.matrix.operations import (
     allowed,
     append_in_doubt,
     in_place,
+    is_taken,
     keeping,
     take_back,
 )
@@ -171,7 +173,10 @@ async def attempt(scene: Scene) -> bool:
     try:
         with in_time():
             seen = await scene.operation(scene.tree)
-    except MavftpfsError:
+    except BaseException as error:
+        scene.taken = is_taken(error)
+        if not isinstance(error, MavftpfsError):
+            raise
         return False
     finally:
         for end in scene.at_end:
@@ -183,15 +188,17 @@ async def attempt(scene: Scene) -> bool:
 async def deliver_and_settle(scene: Scene, watch: Watch, done: bool, place: Path) -> None:
     """Have everything delivered that can be, and judge what is there then, and what is kept here."""
     tree = scene.tree
-    held = tree.undelivered()
+    held = scene.taken or bool(tree.undelivered())
     left = await tree.drain(300.0)
     if left:
         assert scene.others is not None, f"{left} cannot be delivered"
         assert scene.others.outside, f"{left} cannot be delivered"
         assert not done, f"a close said that {left} was delivered"
     judge_views(scene, None)
-    await settle(tree, scene.here, expected(scene, watch, done or (bool(held) and not left)), left)
-    if left and scene.operation in KEEPING_NEW:
+    broken = scene.taken and bool(tree.broken())
+    arrived = done or (held and not left and not broken)
+    await settle(tree, scene.here, expected(scene, watch, arrived), left)
+    if (left or broken) and scene.operation in KEEPING_NEW:
         kept = [path.read_bytes() for path in tree.recover_to(place / "kept")]
         assert any(NEW[:100] in data for data in kept), "what was accepted is lost"
 

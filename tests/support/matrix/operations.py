@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
 import trio
@@ -32,12 +32,31 @@ BEFORE: State = {NAME: OLD, b"other": OTHER, b"sub": None}
 # --- what programs do
 
 
+_TAKEN = "all writes of the program were taken"
+
+
+@contextmanager
+def taken() -> Iterator[None]:
+    """Mark what ends the body: before it, all writes of the program were taken."""
+    try:
+        yield
+    except BaseException as error:
+        error.add_note(_TAKEN)
+        raise
+
+
+def is_taken(error: BaseException) -> bool:
+    """Return whether a call ended like this after all its writes were taken."""
+    return _TAKEN in getattr(error, "__notes__", ())
+
+
 async def write(tree: Tree, path: bytes, offset: int, data: bytes, *, truncate: bool = False) -> None:
     """Open, write, close: what a program does that checks its close()."""
     file = await tree.open(path, write=True, truncate=truncate)
     try:
         await file.write(offset, data)
-        await file.flush()
+        with taken():
+            await file.flush()
     finally:
         await file.release()
 
@@ -63,7 +82,8 @@ async def create(tree: Tree) -> None:
     try:
         await file.flush()  # as a shell does before a program writes
         await file.write(0, NEW)
-        await file.flush()
+        with taken():
+            await file.flush()
     finally:
         await file.release()
 
@@ -88,7 +108,8 @@ async def append(tree: Tree) -> None:
     file = await tree.open(FILE, write=True)
     try:
         await file.write(file.size, NEW)
-        await file.flush()
+        with taken():
+            await file.flush()
     finally:
         await file.release()
 
@@ -103,7 +124,8 @@ async def sync(tree: Tree) -> None:
     file = await tree.open(FILE, write=True, truncate=True)
     try:
         await file.write(0, NEW)
-        await file.fsync()
+        with taken():
+            await file.fsync()
     finally:
         await file.release()
 

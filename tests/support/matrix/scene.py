@@ -39,6 +39,7 @@ class Scene:
         succeeded: whether they did what they began. over: set when they end.
         effect: to be called when their change happened on the card.
         saw: what another program read.
+        taken: whether all writes of the program were taken before its call failed.
     """
 
     here: Rig
@@ -51,6 +52,7 @@ class Scene:
     succeeded: bool = False
     over: trio.Event = field(default_factory=trio.Event)
     saw: bytes | None = None
+    taken: bool = False
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
         """Do something after some virtual seconds."""
