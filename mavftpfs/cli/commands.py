@@ -23,7 +23,7 @@ from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, 
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon, places
 from mavftpfs.mount.members import Member
-from mavftpfs.mount.options import LOCAL_PATHS, MountOptions, parse_options
+from mavftpfs.mount.options import TABLE, MountOptions, parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
@@ -78,7 +78,7 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
 def absolute_paths(options: MountOptions) -> MountOptions:
     """Return the options with local paths absolute: the background process works in `/`."""
     client = options.client
-    found = {name: getattr(client, name, None) for name in LOCAL_PATHS}
+    found = {name: getattr(client, name, None) for name in TABLE.local_files}
     client = replace(client, **{name: os.path.abspath(path) for name, path in found.items() if path})
     return replace(options, client=client)
 
@@ -116,7 +116,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
     own: list[tuple[str, bool]] = []
     for word in split_words(args.options):
         option, equals, value = word.partition("=")
-        if equals and option in LOCAL_PATHS:
+        if equals and option in TABLE.local_files:
             word = f"{option}={os.path.abspath(value)}"  # now: a process in the background works in `/`
         if option not in ("all", "forward"):
             escaped = word.replace("\\", "\\\\").replace(",", "\\,")

@@ -13,6 +13,7 @@ import os
 import shlex
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -47,8 +48,12 @@ tcpin:host:port, /dev/ttyACM0, /dev/ttyUSB0,57600, or the same as a URL;
 `#/remote/dir` behind it names a subtree."""
 
 
+_WIDTH = 79
+"""Columns of the list of options."""
+
+
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line and exits with our code for it."""
+    """A parser whose errors are UsageErrors, which `main` prints in one line."""
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; try: {self.prog} --help")
@@ -216,13 +221,13 @@ def _mount_parser(name: str) -> Parser:
 
 
 def _add_mount_arguments(parser: Parser) -> None:
-    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle")
-    parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="an existing directory")
+    parser.add_argument("source", metavar="SOURCE", help="link to the vehicle, see below")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="existing directory")
     _add_options(parser)
     parser.add_argument("-f", "--foreground", action="store_true", help="stay in the foreground")
     parser.add_argument("--member", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument(
-        "-d", "--debug", action="store_true", help="foreground, and print every payload, decoded"
+        "-d", "--debug", action="store_true", help="stay in the foreground, and print every payload, decoded"
     )
 
 
@@ -238,25 +243,30 @@ def _sources_and_options() -> str:
             _SOURCES,
             "",
             "mount options, as -o ro,cache_size=1G:",
-            *(f"  {name:<19}{text}" for name, text in option_help().items()),
+            *(_row(name, text) for name, text in option_help().items()),
         ]
     )
+
+
+def _row(name: str, text: str) -> str:
+    """Return the lines of an option in the list of all."""
+    return textwrap.fill(f"{name:<18}{text}", _WIDTH, initial_indent="  ", subsequent_indent=" " * 20)
 
 
 def _source_parser(name: str, description: str, *, short_help: bool = True) -> Parser:
     parser = Parser(f"mavftpfs {name}", description=description, epilog=_SOURCES, add_help=False)
     help_words = ("-h", "--help") if short_help else ("--help",)
-    parser.add_argument(*help_words, action="help", help="show this and exit")
+    parser.add_argument(*help_words, action="help", help="show this help and exit")
     parser.add_argument(
-        "source", metavar="SOURCE", help="how to reach the vehicle, or a directory in a mount"
+        "source", metavar="SOURCE", help="link to the vehicle, see below, or a directory in a mount"
     )
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
 
 
-_PATH = "a path on the vehicle, or an mftp:// URL"
-_PATTERN = "a path on the vehicle, a pattern in quotes ('/log/*.ulg'), or an mftp:// URL"
+_PATH = "path on the vehicle, or an mftp:// URL"
+_PATTERN = "path on the vehicle, a pattern in quotes ('/log/*.ulg'), or an mftp:// URL"
 
 
 def _paths_parser(
@@ -276,43 +286,48 @@ def _scan_parser(name: str) -> Parser:
 def _ls_parser(name: str) -> Parser:
     # -h means the same as in ls.
     parser = _paths_parser(name, "List directories of the vehicle.", _PATTERN, least="*", short_help=False)
-    parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times (UTC)")
-    parser.add_argument("-h", dest="units", action="store_true", help="with -l: sizes as 1.2 MB")
-    parser.add_argument("-R", dest="recursive", action="store_true", help="directories below too")
+    parser.add_argument("-l", dest="detailed", action="store_true", help="show sizes and times (UTC)")
+    parser.add_argument("-h", dest="units", action="store_true", help="show sizes as 1.2 MB (with -l)")
+    parser.add_argument("-R", dest="recursive", action="store_true", help="list the directories below, too")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
 
 def _sync_parser(name: str) -> Parser:
-    parser = _source_parser(name, "Bring the vehicle's logs into a local directory, the newest first.")
-    parser.add_argument("local", metavar="LOCAL", help="the local directory; it is made if need be")
+    parser = _source_parser(name, "Download the vehicle's new logs, the newest first.")
+    parser.add_argument("local", metavar="LOCAL", help="local directory, made if it is missing")
     parser.add_argument(
-        "--from", dest="place", metavar="PATH", help="the vehicle's log directory; default: found by itself"
+        "--from", dest="place", metavar="PATH", help="log directory of the vehicle (default: found by itself)"
     )
-    parser.add_argument("--newest", metavar="N", type=_count, help="only the N newest logs")
+    parser.add_argument(
+        "--newest", metavar="N", type=_count, help="fetch only the N newest logs (default: all)"
+    )
     parser.add_argument(
         "--since",
         metavar="DATE",
-        help="only logs since then: 2026-05-01, 2026-05-01T14:30, today, yesterday, 2h, 3d",
+        help="fetch only logs since DATE: 2026-05-01, 2026-05-01T14:30, today, yesterday, 2h, 3d "
+        "(default: all)",
     )
     _add_patterns(parser, "the log directory")
     instead = parser.add_mutually_exclusive_group()
-    instead.add_argument("-n", "--dry-run", action="store_true", help="only say what would be fetched")
+    instead.add_argument(
+        "-n", "--dry-run", action="store_true", help="say what would be fetched, and fetch nothing"
+    )
     instead.add_argument(
         "--check",
         action="store_true",
-        help="only compare what is here by CRC32 with the vehicle; exit code 1 if something differs",
+        help="compare what is here by CRC32, and fetch nothing; exit code 1 if something differs",
     )
     instead.add_argument(
         "--watch",
         action="store_true",
-        help="stay, and bring the new logs after each flight, of each vehicle",
+        help="stay, and fetch the new logs of each vehicle after each flight",
     )
     parser.add_argument(
         "--exec",
         dest="command",
         metavar="COMMAND",
-        help="with --watch: run it for each log that came, with the file as its last argument",
+        help="run COMMAND for each log that was fetched, with the file as its last argument (with --watch)",
     )
     _add_verify(parser)
     return parser
@@ -331,14 +346,15 @@ def _add_patterns(parser: Parser, source: str) -> None:
         metavar="PATTERN",
         action="append",
         default=[],
-        help=f"only files whose name, or path below {source}, matches; * also matches /; may be repeated",
+        help=f"fetch only files whose name, or path below {source}, matches; * also matches /; may be "
+        "repeated (default: all)",
     )
     parser.add_argument(
         "--exclude",
         metavar="PATTERN",
         action="append",
         default=[],
-        help="no files that match; may be repeated",
+        help="leave out files that match; may be repeated (default: none)",
     )
 
 
@@ -347,13 +363,13 @@ def _add_verify(parser: Parser) -> None:
         "--verify",
         choices=("auto", "all", "none"),
         default="auto",
-        help="compare with the vehicle's CRC32: auto is up to 16 MB; all: sync also what is here already; "
-        "what was resumed is always compared",
+        help="compare with the vehicle's CRC32: auto is up to 16 MB; all: in sync also what is here already; "
+        "what was resumed is always compared (default: auto)",
     )
 
 
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Fetch files, and verify them.", _PATTERN, least="*")
+    parser = _paths_parser(name, "Download files, and verify them.", _PATTERN, least="*")
     parser.epilog = (
         "PATH may be a pattern, as '/log/*/*.ulg': its matches go into LOCAL with their directories from the "
         f"first * on. {_SOURCES}"
@@ -362,9 +378,10 @@ def _get_parser(name: str) -> Parser:
         "--to",
         metavar="LOCAL",
         default=".",
-        help="directory (made if it ends in /, or for several), new name of one file, or - for stdout",
+        help="local directory (made if it ends in /, or for several files), new name of one file, or - for "
+        "stdout (default: .)",
     )
-    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    parser.add_argument("-r", dest="recursive", action="store_true", help="download directories, too")
     _add_patterns(parser, "PATH")
     _add_verify(parser)
     return parser
@@ -377,29 +394,34 @@ def _cat_parser(name: str) -> Parser:
 
 
 def _put_parser(name: str) -> Parser:
-    parser = _source_parser(name, "Put local files on the vehicle, and verify them by size and CRC32.")
+    parser = _source_parser(name, "Upload local files, and verify them by size and CRC32.")
     parser.add_argument(
-        "locals", metavar="LOCAL", nargs="+", type=Path, help="a local file or directory, or - for stdin"
+        "locals", metavar="LOCAL", nargs="+", type=Path, help="local file or directory, or - for stdin"
     )
     parser.add_argument(
         "path",
         metavar="PATH",
-        help="a directory of the vehicle, or the new name of one LOCAL or stdin; PATH/ is a directory",
+        help="directory of the vehicle, or the new name of one LOCAL or of stdin; PATH/ is a directory",
     )
-    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    parser.add_argument("-r", dest="recursive", action="store_true", help="upload directories, too")
     return parser
 
 
 def _rm_parser(name: str) -> Parser:
     parser = _paths_parser(name, "Remove files of the vehicle.", _PATTERN)
-    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too, with all below")
+    parser.add_argument(
+        "-r", dest="recursive", action="store_true", help="remove directories, too, with all below"
+    )
     return parser
 
 
 def _mkdir_parser(name: str) -> Parser:
     parser = _paths_parser(name, "Make directories on the vehicle.")
     parser.add_argument(
-        "-p", dest="parents", action="store_true", help="those above too; existing ones are fine"
+        "-p",
+        dest="parents",
+        action="store_true",
+        help="make the directories above, too; existing ones are fine",
     )
     return parser
 
@@ -410,12 +432,12 @@ def _rmdir_parser(name: str) -> Parser:
 
 def _mv_parser(name: str) -> Parser:
     parser = _paths_parser(name, "Rename files and directories of the vehicle, or move them.")
-    parser.add_argument("target", metavar="NEW", help="a directory of the vehicle, or the new name")
+    parser.add_argument("target", metavar="NEW", help="directory of the vehicle, or the new name")
     return parser
 
 
 def _crc_parser(name: str) -> Parser:
-    return _paths_parser(name, "Have the vehicle compute the CRC32 of files.", _PATTERN, least="*")
+    return _paths_parser(name, "Print the CRC32s that the vehicle computes.", _PATTERN, least="*")
 
 
 def _param_parser(name: str) -> Parser:
@@ -425,29 +447,33 @@ def _param_parser(name: str) -> Parser:
         metavar="NAME",
         nargs="*",
         default=[],
-        help="print these (a pattern, as 'BATT*'); NAME=VALUE: set",
+        help="name to print, or a pattern, as 'BATT*' (default: all); NAME=VALUE: set it",
     )
-    parser.add_argument("--changed", action="store_true", help="only what differs from its default")
-    parser.add_argument("--load", metavar="FILE", help="set what a file says and does not hold")
-    parser.add_argument("--skip-unknown", action="store_true", help="with --load: leave out unknown names")
-    parser.add_argument("--save", metavar="FILE", help="save all, for QGroundControl if it ends in .params")
+    parser.add_argument("--changed", action="store_true", help="print only what differs from its default")
+    parser.add_argument("--load", metavar="FILE", help="set the parameters that differ from FILE")
+    parser.add_argument(
+        "--skip-unknown",
+        action="store_true",
+        help="leave out names that the vehicle does not know (with --load)",
+    )
+    parser.add_argument("--save", metavar="FILE", help="save all, for QGroundControl if FILE ends in .params")
     parser.add_argument(
         "--diff",
         metavar="FILE",
         nargs="?",
         const="",
-        help="show where a file differs, or without FILE the vehicles of a mount with -o all; exit code 1 if "
-        "something differs",
+        help="show what differs from FILE, or without FILE between the vehicles of a mount with -o all; exit "
+        "code 1 if something differs",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("-y", "--yes", action="store_true", help="do not ask")
+    parser.add_argument("-y", "--yes", action="store_true", help="set without asking")
     return parser
 
 
 def _umount_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Unmount, upload what is pending, close the session.")
-    parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="where a vehicle is mounted")
-    parser.add_argument("-l", "--lazy", action="store_true", help="also if it is in use")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="directory where a vehicle is mounted")
+    parser.add_argument("-l", "--lazy", action="store_true", help="unmount even if it is in use")
     return parser
 
 
@@ -457,19 +483,19 @@ def _status_parser(name: str) -> Parser:
         "mountpoint",
         metavar="MOUNTPOINT",
         nargs="?",
-        help="or a path in a mount; default: all mounts that you may ask",
+        help="mountpoint, or a path inside (default: all mounts that you may ask)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--watch", action="store_true", help="again each second")
-    parser.add_argument("-v", "--verbose", action="store_true", help="everything the mount tells")
+    parser.add_argument("--watch", action="store_true", help="show it again each second")
+    parser.add_argument("-v", "--verbose", action="store_true", help="show everything that the mount reports")
     return parser
 
 
 def _hub_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Show what shares a port, or stop that.", epilog=_SOURCES)
-    parser.add_argument("source", metavar="SOURCE", nargs="?", help="only this port; default: all")
-    parser.add_argument("--stop", action="store_true", help="end it; says first what that would cut")
-    parser.add_argument("--force", action="store_true", help="with --stop: also what is in use")
+    parser.add_argument("source", metavar="SOURCE", nargs="?", help="port to show (default: all)")
+    parser.add_argument("--stop", action="store_true", help="end the hub, or say what that would cut")
+    parser.add_argument("--force", action="store_true", help="end it even if it is in use (with --stop)")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     return parser
 
@@ -480,26 +506,28 @@ def _recover_parser(name: str) -> Parser:
         description="List what mounts could not deliver, or put it back on the vehicle.",
         epilog=_SOURCES,
     )
-    parser.add_argument("source", metavar="SOURCE", nargs="?", help="put back to there; default: list")
-    parser.add_argument("names", metavar="FILE", nargs="*", help="a file or directory of the list")
-    parser.add_argument("--all", action="store_true", help="all files of the list")
+    parser.add_argument(
+        "source", metavar="SOURCE", nargs="?", help="vehicle to put the files back on (default: list them)"
+    )
+    parser.add_argument("names", metavar="FILE", nargs="*", help="file or directory of the list")
+    parser.add_argument("--all", action="store_true", help="put back all files of the list")
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
 
 
 def _demo_parser(name: str) -> Parser:
-    return Parser(f"mavftpfs {name}", description="A short tour with a simulated drone.")
+    return Parser(f"mavftpfs {name}", description="Take a short tour with a simulated drone.")
 
 
 def _install_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
-        description="Put man pages, completions, units and the udev rule into place.",
+        description="Install man pages, completions, units and the udev rule.",
     )
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--print", action="store_true", help="show what would be written")
-    what.add_argument("--remove", action="store_true", help="take it away again")
+    what.add_argument("--print", action="store_true", help="show what would be written, and write nothing")
+    what.add_argument("--remove", action="store_true", help="remove these files")
     return parser
 
 

@@ -1,14 +1,13 @@
-"""The options for a vehicle's files: one table, one frozen record. Layer: client; pure.
+"""The table of options: name, type, default and help, each in one place. Layer: client; pure.
 
-A mount, the commands and the library share it. Both `-o` text and the library's keywords are parsed by it, so
-both take and refuse the same names and values. Options of the kernel's side of a mount are in
-`mount.options`.
+The fields of `Options` are the rows; `mount.options` adds those of the kernel's side of a mount. `-o` text,
+the library's keywords, `--help`, the man page, completions and the guide's reference come from the table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_endpoint
@@ -17,6 +16,159 @@ from mavftpfs.shared.model import ROOT, normalise
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
 _DAY = 86400.0
+_SIZE_MAX = 1 << 40
+
+NumberT = TypeVar("NumberT", int, float)
+
+# -- types ----------------------------------------------------------------------------------------
+
+Parser = Callable[[str], Any]
+"""Parses the text of a value; raises ValueError, which says what it should have been."""
+
+
+class Type(NamedTuple):
+    """What values an option takes. written: returns a value as `parse` takes it.
+
+    words: the only texts that are values, if there are few. is_file: values are paths on this computer.
+    """
+
+    parse: Parser
+    written: Callable[[Any], str] = str
+    words: tuple[str, ...] = ()
+    is_file: bool = False
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit()
+
+
+def _with_unit(value: float) -> str:
+    """Return a size as it may be written."""
+    units = [(unit, factor) for unit, factor in _UNITS.items() if value and value % factor == 0]
+    unit, factor = max(units, key=lambda pair: pair[1], default=("", 1))
+    return f"{value // factor:.0f}{unit}"
+
+
+def _within(value: NumberT, low: NumberT, high: NumberT, shown: Callable[[NumberT], str] = str) -> NumberT:
+    if not low <= value <= high:
+        raise ValueError(f"must be within {shown(low)} and {shown(high)}")
+    return value
+
+
+def size(low: int, high: int) -> Type:
+    """Return the type of sizes: a number with K, M or G (powers of 1024), within [low, high]."""
+
+    def parse(text: str) -> int:
+        unit = text[-1:].upper()
+        digits = text[:-1] if unit in _UNITS and unit else text
+        if not _is_number(digits):
+            raise ValueError("must be a whole number of bytes, perhaps with K, M or G behind it")
+        return _within(int(digits) * _UNITS.get(unit, 1), low, high, shown=_with_unit)
+
+    return Type(parse, _with_unit)
+
+
+def number(low: int, high: int) -> Type:
+    """Return the type of whole numbers within [low, high]."""
+
+    def parse(text: str) -> int:
+        if not _is_number(text):
+            raise ValueError("must be a whole number")
+        return _within(int(text), low, high)
+
+    return Type(parse)
+
+
+def or_auto(kind: Type) -> Type:
+    """Return a type that also takes `auto`, which stands for None."""
+
+    def parse(text: str) -> Any:
+        try:
+            return None if text == "auto" else kind.parse(text)
+        except ValueError as exc:
+            raise ValueError(f"{exc}, or auto") from None
+
+    return Type(parse, lambda value: "auto" if value is None else kind.written(value))
+
+
+def seconds(low: float, high: float) -> Type:
+    """Return the type of seconds within [low, high]."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise ValueError("must be a number of seconds") from None
+        return _within(value, low, high, shown="{:g}".format)
+
+    return Type(parse, "{:g}".format)
+
+
+def choice(*words: str) -> Type:
+    """Return the type that takes one of a few words."""
+
+    def parse(text: str) -> str:
+        if text not in words:
+            raise ValueError(f"must be one of {', '.join(words)}")
+        return text
+
+    return Type(parse, words=words)
+
+
+def _not_empty(text: str) -> str:
+    if not text:
+        raise ValueError("must not be empty")
+    return text
+
+
+def remote_path(text: str) -> bytes:
+    """Parse a directory on the vehicle."""
+    return normalise(_not_empty(text).encode("utf-8", "surrogateescape"))
+
+
+def endpoint(text: str) -> str:
+    """Parse an endpoint of `forward=`; return it in one spelling."""
+    return parse_endpoint(_not_empty(text)).description
+
+
+LOCAL_FILE = Type(_not_empty, is_file=True)
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """A row of the table. default: as people read it. type: None for an option without a value.
+
+    words: the words of an option without a value, and what each sets the field to. many: the option may be
+    given several times, and all values count.
+    """
+
+    field: str
+    help: str
+    default: str
+    type: Type | None = None
+    words: tuple[tuple[str, bool], ...] = ()
+    many: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """How the option is written: `ro` and `rw`, or `chunk=`."""
+        return (f"{self.field}=",) if self.type is not None else tuple(word for word, _ in self.words)
+
+
+def valued(default: Any, kind: Type, help: str, *, shown: str = "", many: bool = False) -> Any:
+    """Return the field of an option with a value. shown: the default as people read it, if `kind` cannot
+    write it."""
+    row = {"type": kind, "help": help, "default": shown or kind.written(default), "many": many}
+    return field(default=default, metadata=row)
+
+
+def switch(words: Mapping[str, bool], help: str) -> Any:
+    """Return the field of an option without a value, whose default is False."""
+    default = next((word for word, value in words.items() if not value), "off")
+    return field(default=False, metadata={"words": tuple(words.items()), "help": help, "default": default})
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,161 +180,105 @@ class Options:
     `cache.options.CacheOptions` those of the caches.
     """
 
-    read_only: bool = False
+    read_only: bool = switch({"ro": True, "rw": False}, "change nothing (ro), or allow changes (rw)")
     root: bytes = ROOT
     baud: int | None = None
-    target_system: int = 0
-    target_component: int = 0
-    source_system: int = 254
-    signing_key: str | None = None
-    op_deadline: float = 30.0
-    connect_timeout: float = 30.0
-    read_mode: Literal["window", "burst"] = "window"
-    chunk: int | None = None
-    bwlimit: int | None = None
-    dir_timeout: float | None = None
-    cache_size: int = 64 << 20
-    verify_max: int = 4 << 20
-    when_armed: Literal["ro", "ok"] = "ro"
-    inplace: bool = False
+    target_system: int = valued(0, number(0, 255), "vehicle, by system id; 0: the first autopilot heard")
+    target_component: int = valued(0, number(0, 255), "component of the vehicle, by id; 0: the first heard")
+    source_system: int = valued(254, number(1, 255), "system id of mavftpfs on the link")
+    forward: tuple[str, ...] = valued(
+        (),
+        Type(endpoint),
+        "endpoint to pass all frames to and from, written like SOURCE; may be repeated",
+        shown="none",
+        many=True,
+    )
+    signing_key: str | None = valued(
+        None,
+        LOCAL_FILE,
+        "file with the MAVLink 2 signing key, mode 0600: 32 bytes, 64 hex digits or a passphrase",
+        shown="none",
+    )
+    connect_timeout: float = valued(30.0, seconds(1, 3600), "seconds to wait for a heartbeat and a listing")
+    op_deadline: float = valued(30.0, seconds(1, 3600), "seconds without progress after which a call fails")
+    bwlimit: int | None = valued(
+        None,
+        size(100, _SIZE_MAX),
+        "bytes per second of the link to use for files, about; requests and replies together",
+        shown="none",
+    )
+    read_mode: Literal["window", "burst"] = valued(
+        "window",
+        choice("window", "burst"),
+        "window: many requests in flight; burst: the vehicle sends by itself",
+    )
+    chunk: int | None = valued(
+        None,
+        or_auto(number(16, 239)),
+        "bytes of a file in a packet, 16 to 239; auto: 239, or 64 where full packets do not pass",
+    )
+    dir_timeout: float | None = valued(
+        None,
+        seconds(0, _DAY),
+        "seconds to believe a listing; 0: ask the vehicle each time",
+        shown="20, longer if the listing was slow",
+    )
+    cache_size: int = valued(64 << 20, size(1 << 20, _SIZE_MAX), "memory for file data")
+    when_armed: Literal["ro", "ok"] = valued(
+        "ro", choice("ro", "ok"), "ro: an armed vehicle is read-only; ok: write in flight, too"
+    )
+    verify_max: int = valued(
+        4 << 20, size(0, _SIZE_MAX), "size up to which written files are compared by CRC32, not only by size"
+    )
+    inplace: bool = switch(
+        {"inplace": True},
+        "empty and rewrite files where the card cannot rename; an interruption leaves a part of the new file",
+    )
     local: bool = True
-    tlog: str | None = None
-    forward: tuple[str, ...] = ()
+    tlog: str | None = valued(None, LOCAL_FILE, "file for a raw MAVLink log of the link", shown="none")
     gone: tuple[str, ...] = field(default=(), compare=False)
     """A line for people about each word of 0.2 that was given and is gone."""
 
 
-Parser = Callable[[str], Any]
-"""Parses the text of a value; raises ValueError, which says what it should have been."""
+def options_in(record: type[Any]) -> tuple[Option, ...]:
+    """Return the rows that the fields of a dataclass are."""
+    return tuple(Option(one.name, **one.metadata) for one in fields(record) if one.metadata)
 
 
-def size(low: int, high: int) -> Parser:
-    """Return a parser of sizes: a number with K, M or G (powers of 1024), within [low, high]."""
+class Table:
+    """Rows, by the words that name them.
 
-    def parse(text: str) -> int:
-        unit = text[-1:].upper()
-        digits = text[:-1] if unit in _UNITS and unit else text
-        if not _is_number(digits):
-            raise ValueError("must be a whole number of bytes, perhaps with K, M or G behind it")
-        return _within(int(digits) * _UNITS.get(unit, 1), low, high, shown=_with_unit)
+    Attributes:
+        values: name -> the row of an option with a value.
+        words: word without a value -> the field that it sets, and to what.
+    """
 
-    return parse
+    def __init__(self, rows: Iterable[Option]) -> None:
+        self.rows = tuple(rows)
+        self.values = {row.field: row for row in self.rows if row.type is not None}
+        self.words = {word: (row.field, value) for row in self.rows for word, value in row.words}
 
+    @property
+    def local_files(self) -> list[str]:
+        """The options whose values are paths on this computer."""
+        return [name for name, row in self.values.items() if row.type is not None and row.type.is_file]
 
-def number(low: int, high: int) -> Parser:
-    """Return a parser of whole numbers within [low, high]."""
+    def parsed(self, name: str, text: str, earlier: Mapping[str, Any]) -> Any:
+        """Return the value of an option, appended to its earlier values if all of them count.
 
-    def parse(text: str) -> int:
-        if not _is_number(text):
-            raise ValueError("must be a whole number")
-        return _within(int(text), low, high)
-
-    return parse
-
-
-def or_auto(parse: Parser) -> Parser:
-    """Return a parser that also takes `auto`, and says so."""
-
-    def parse_or_auto(text: str) -> Any:
-        try:
-            return None if text == "auto" else parse(text)
-        except ValueError as exc:
-            raise ValueError(f"{exc}, or auto") from None
-
-    return parse_or_auto
+        Raises:
+            UsageError: a bad value; the message names the option.
+        """
+        row = self.values[name]
+        assert row.type is not None
+        value = _parsed(row.type.parse, name, text)
+        return tuple(dict.fromkeys((*earlier.get(name, ()), value))) if row.many else value
 
 
-def seconds(low: float, high: float) -> Parser:
-    """Return a parser of seconds within [low, high]."""
-
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            raise ValueError("must be a number of seconds") from None
-        return _within(value, low, high, shown="{:g}".format)
-
-    return parse
+TABLE = Table(options_in(Options))
 
 
-class Choice:
-    """A parser that takes one of a few words."""
-
-    def __init__(self, *words: str) -> None:
-        self.words = words
-
-    def __call__(self, text: str) -> str:
-        """See Parser."""
-        if text not in self.words:
-            raise ValueError(f"must be one of {', '.join(self.words)}")
-        return text
-
-
-def text_value(text: str) -> str:
-    """Take any text that is not empty."""
-    if not text:
-        raise ValueError("must not be empty")
-    return text
-
-
-def remote_path(text: str) -> bytes:
-    """Parse a directory on the vehicle."""
-    return normalise(text_value(text).encode("utf-8", "surrogateescape"))
-
-
-def endpoint(text: str) -> str:
-    """Parse where frames are forwarded to; return it in one spelling."""
-    return parse_endpoint(text_value(text)).description
-
-
-_SIZE_MAX = 1 << 40
-
-
-class Value(NamedTuple):
-    """An option with a value: its parser, and its help with the default. many: it may be given several times,
-    and all count."""
-
-    parse: Parser
-    help: str
-    many: bool = False
-
-
-Values = Mapping[str, Value]
-
-VALUES: Values = {
-    "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
-    "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
-    "source_system": Value(number(1, 255), "system id of mavftpfs on the link: 254"),
-    "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
-    "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
-    "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
-    "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
-    "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
-    "read_mode": Value(Choice("window", "burst"), "window or burst"),
-    "chunk": Value(or_auto(number(16, 239)), "bytes of a file in a packet, 16 to 239: auto"),
-    "bwlimit": Value(size(100, _SIZE_MAX), "use about so many bytes per second of the link"),
-    "verify_max": Value(size(0, _SIZE_MAX), "largest written file whose CRC32 is asked for: 4M"),
-    "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
-    "tlog": Value(text_value, "raw MAVLink log there"),
-    "forward": Value(endpoint, "pass all frames on to there and back; several count", many=True),
-}
-
-
-class Flag(NamedTuple):
-    """A word without a value: the field that it sets, the field's value, and its help."""
-
-    field: str
-    becomes: bool
-    help: str
-
-
-Flags = Mapping[str, Flag]
-
-FLAGS: Flags = {
-    "ro": Flag("read_only", True, "nothing is changed"),
-    "rw": Flag("read_only", False, "the default"),
-    "inplace": Flag("inplace", True, "replace files in place where the card cannot rename"),
-}
+# -- words of 0.2 -----------------------------------------------------------------------------------
 
 
 class Gone(NamedTuple):
@@ -221,7 +317,7 @@ GONE: Mapping[str, Gone] = {
         "a file that the vehicle is writing is never changed (EBUSY); leave the word out", refused=True
     ),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
-    "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000)),
+    "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000).parse),
     "verify=auto": Gone("that is how written files are checked"),
     "verify=size": Gone("write verify_max=0", "verify_max", lambda text: 0),
     "verify=none": Gone("the size is always compared; write verify_max=0", "verify_max", lambda text: 0),
@@ -249,7 +345,7 @@ def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
     if gone.refused:
         raise UsageError(f"option {name} is gone: {gone.now}")
     if gone.becomes:
-        values[gone.becomes] = parsed(gone.parse, name, text)
+        values[gone.becomes] = _parsed(gone.parse, name, text)
     values["gone"] = (*values.get("gone", ()), _gone_line(name, gone))
     return True
 
@@ -257,6 +353,9 @@ def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
 def _gone_line(name: str, gone: Gone) -> str:
     how = "is still understood" if gone.becomes else "is ignored"
     return f"option {name} is gone, and {how}: {gone.now}"
+
+
+# -- keywords and words ---------------------------------------------------------------------------
 
 
 def options_of(keywords: Mapping[str, object]) -> Options:
@@ -271,14 +370,15 @@ def options_of(keywords: Mapping[str, object]) -> Options:
     for name, value in keywords.items():
         if value is None or (value is False and name in GONE):
             continue
-        if name in FLAGS:
+        if name in TABLE.words:
             if not isinstance(value, bool):
                 raise UsageError(f"option {name} is True or False, not {value!r}")
-            values[FLAGS[name].field] = FLAGS[name].becomes is value
-        elif name in VALUES and VALUES[name].many and isinstance(value, list | tuple):
-            values[name] = tuple(parsed(VALUES[name].parse, name, _as_text(name, one)) for one in value)
-        elif name in VALUES:
-            values[name] = collected(VALUES, values, name, _as_text(name, value))
+            place, becomes = TABLE.words[name]
+            values[place] = becomes is value
+        elif name in TABLE.values:
+            several = TABLE.values[name].many and isinstance(value, list | tuple)
+            for one in value if several and isinstance(value, list | tuple) else (value,):
+                values[name] = TABLE.parsed(name, _as_text(name, one), values)
         elif not take_gone(values, name, "" if value is True else _as_text(name, value)):
             raise UsageError(f"unknown option {name!r}")
     return Options(**values)
@@ -314,7 +414,7 @@ def at_source(spec: LinkSpec, options: Options) -> tuple[LinkSpec, Options]:
     return spec, replace(options, root=spec.subtree)
 
 
-def parsed(parse: Parser, name: str, text: str) -> Any:
+def _parsed(parse: Parser, name: str, text: str) -> Any:
     """Return the value of an option.
 
     Raises:
@@ -324,16 +424,6 @@ def parsed(parse: Parser, name: str, text: str) -> Any:
         return parse(text)
     except (ValueError, MavftpfsError) as exc:
         raise UsageError(f"option {name}={text}: {exc}") from exc
-
-
-def collected(table: Values, values: Mapping[str, Any], name: str, text: str) -> Any:
-    """Return the value of an option, appended to its earlier values if all of them count.
-
-    Raises:
-        UsageError: as parsed.
-    """
-    value = parsed(table[name].parse, name, text)
-    return tuple(dict.fromkeys((*values.get(name, ()), value))) if table[name].many else value
 
 
 def split_words(texts: Iterable[str]) -> Iterator[str]:
@@ -355,23 +445,3 @@ def split_words(texts: Iterable[str]) -> Iterator[str]:
 def _nonempty(word: str) -> Iterator[str]:
     if word.strip():
         yield word.strip()
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit()
-
-
-def _with_unit(value: float) -> str:
-    """Return a size as it may be written."""
-    units = [(unit, factor) for unit, factor in _UNITS.items() if value and value % factor == 0]
-    unit, factor = max(units, key=lambda pair: pair[1], default=("", 1))
-    return f"{value // factor:.0f}{unit}"
-
-
-NumberT = TypeVar("NumberT", int, float)
-
-
-def _within(value: NumberT, low: NumberT, high: NumberT, shown: Callable[[NumberT], str] = str) -> NumberT:
-    if not low <= value <= high:
-        raise ValueError(f"must be within {shown(low)} and {shown(high)}")
-    return value

@@ -1,9 +1,9 @@
-"""A mount's options: the client's, and what only the kernel's side needs. Layer: mount; pure.
+"""A mount's options: the client's, and those that only the kernel's side needs. Layer: mount; pure.
 
 `-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
 Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,
-and everything else that is not in a table is refused by name. The commands without a mount take the same
-words, so that a line of /etc/fstab can be given to them.
+and any other word that is not in the table is an error that names it. The commands without a mount take the
+same words, so that a line of /etc/fstab can be given to them.
 """
 
 from __future__ import annotations
@@ -14,9 +14,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from mavftpfs.client import options as client
 from mavftpfs.client.mountpoint import SUBTYPE
-from mavftpfs.client.options import Flag, Flags, Options, Value, Values, collected, number, take_gone
+from mavftpfs.client.options import (
+    Options,
+    Table,
+    Type,
+    number,
+    options_in,
+    split_words,
+    switch,
+    take_gone,
+    valued,
+)
 from mavftpfs.shared.errors import UsageError
 
 KERNEL_WORDS = frozenset({"dev", "nodev", "suid", "nosuid", "exec", "noexec", "sync", "async", "dirsync"})
@@ -49,19 +58,33 @@ IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
 IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 
+def _octal(text: str) -> int:
+    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
+        raise ValueError("must be an octal number of at most 777, as 022")
+    return int(text, 8)
+
+
+_MASK = Type(_octal)
+_ID = number(0, 2**32 - 2)
+
+
 @dataclass(frozen=True, slots=True)
 class MountOptions:
-    """The options of `-o`. Octal bits; None = not given. client: options that do not concern the kernel. all:
-    a mount for each vehicle that is heard, below the mountpoint."""
+    """The options of `-o`. None = not given. client: options that do not concern the kernel."""
 
     client: Options = field(default_factory=Options)
-    allow_other: bool = False
-    uid: int | None = None
-    gid: int | None = None
-    umask: int | None = None
-    fmask: int | None = None
-    dmask: int | None = None
-    all: bool = False
+    allow_other: bool = switch(
+        {"allow_other": True},
+        "let other users in; needs user_allow_other in /etc/fuse.conf, unless root mounts",
+    )
+    uid: int | None = valued(None, _ID, "owner of the files; the kernel checks permissions", shown="you")
+    gid: int | None = valued(None, _ID, "group of the files", shown="your group")
+    umask: int | None = valued(None, _MASK, "permissions to take away, in octal", shown="your umask")
+    fmask: int | None = valued(None, _MASK, "permissions to take away from files", shown="umask=")
+    dmask: int | None = valued(None, _MASK, "permissions to take away from directories", shown="umask=")
+    all: bool = switch(
+        {"all": True}, "mount each vehicle that is heard, below the mountpoint by its system id"
+    )
     kernel_words: tuple[str, ...] = ()
 
     def file_mode(self, default_umask: int) -> int:
@@ -78,33 +101,9 @@ class MountOptions:
         return bits & ~0o222 if self.client.read_only else bits
 
 
-def mask(text: str) -> int:
-    """Parse an octal permission mask."""
-    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
-        raise ValueError("must be an octal number of at most 777, as 022")
-    return int(text, 8)
-
-
-OWN_VALUES: Values = {
-    "uid": Value(number(0, 2**32 - 2), "whose the files are: you"),
-    "gid": Value(number(0, 2**32 - 2), "whose group's: yours"),
-    "umask": Value(mask, "octal; your umask"),
-    "fmask": Value(mask, "umask of files only"),
-    "dmask": Value(mask, "umask of directories only"),
-}
-
-OWN_FLAGS: Flags = {
-    "allow_other": Flag("allow_other", True, "other users may see it (permissions apply)"),
-    "all": Flag("all", True, "each vehicle, below the mountpoint by its system id"),
-    "default_permissions": Flag("", True, ""),
-}
-"""default_permissions is always on, and not shown."""
-
-VALUES: Values = {**OWN_VALUES, **client.VALUES}
-LOCAL_PATHS = ("signing_key", "tlog")
-"""Options whose values are paths on this computer."""
-
-FLAGS: Flags = {**client.FLAGS, **OWN_FLAGS}
+TABLE = Table((*options_in(MountOptions), *options_in(Options)))
+_ALWAYS_ON = "default_permissions"
+"""No server checks permissions, so the kernel always does."""
 
 
 def parse_options(texts: Iterable[str]) -> MountOptions:
@@ -115,7 +114,7 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
     """
     values: dict[str, Any] = {}
     words: list[str] = []
-    for word in client.split_words(texts):
+    for word in split_words(texts):
         _take(word, values, words)
     own = {name: values.pop(name) for name in MountOptions.__slots__ if name in values}
     options = MountOptions(Options(**values), kernel_words=tuple(words), **own)
@@ -126,7 +125,7 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
 
 def fuse_words(options: MountOptions, source: str) -> set[str]:
     """Return the options that go to FUSE's init."""
-    words = {f"fsname={_escape(source)}", f"subtype={SUBTYPE}", "default_permissions", *options.kernel_words}
+    words = {f"fsname={_escape(source)}", f"subtype={SUBTYPE}", _ALWAYS_ON, *options.kernel_words}
     words.add("ro" if options.client.read_only else "rw")
     if options.allow_other:
         words.add("allow_other")
@@ -134,37 +133,35 @@ def fuse_words(options: MountOptions, source: str) -> set[str]:
 
 
 def option_help() -> dict[str, str]:
-    """Return each option as it is written in help -> what it does, with its default."""
-    flags = {name: flag.help for name, flag in FLAGS.items() if flag.help}
-    return flags | {f"{name}=": value.help for name, value in VALUES.items()}
+    """Return each option as it is written -> what it does, with its default."""
+    return {", ".join(row.names): f"{row.help} (default: {row.default})" for row in TABLE.rows}
 
 
 def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
     name, equals, value = word.partition("=")
-    if word in FLAGS:
-        flag = FLAGS[word]
-        if flag.field:
-            values[flag.field] = flag.becomes
+    if word in TABLE.words:
+        place, becomes = TABLE.words[word]
+        values[place] = becomes
     elif word in KERNEL_WORDS:
         _replace_word(word, kernel_words)
-    elif name in VALUES:
+    elif name in TABLE.values:
         if not equals:
             raise UsageError(f"option {name} needs a value ({name}=...)")
-        values[name] = collected(VALUES, values, name, value)
-    elif word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES):
+        values[name] = TABLE.parsed(name, value, values)
+    elif word == _ALWAYS_ON or word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES):
         return
     elif not take_gone(values, name, value):
         raise UsageError(_refusal(name, word))
 
 
 def _refusal(name: str, word: str) -> str:
-    if name in FLAGS or name in KERNEL_WORDS or name in IGNORED_WORDS:
+    if name in TABLE.words or name in KERNEL_WORDS or name in IGNORED_WORDS:
         return f"option {name} takes no value"
     if name == "remount":
         return "option remount is not supported: unmount, and mount with the new options"
     if name == "max_read":
         return "option max_read is not supported: the FUSE binding cannot start with it"
-    near = difflib.get_close_matches(name, [*VALUES, *FLAGS], 1)
+    near = difflib.get_close_matches(name, [*TABLE.values, *TABLE.words], 1)
     return f"unknown option {word!r}" + (f"; did you mean {near[0]}?" if near else "")
 
 

@@ -38,16 +38,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Serve a directory as a simulated vehicle would."
     parser.epilog = EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("directory", metavar="DIR", help="what the vehicle's card holds")
+    parser.add_argument("directory", metavar="DIR", help="directory that is the vehicle's card")
     parser.add_argument(
         "--profile",
         metavar="NAME",
         default="px4",
         choices=sorted(PROFILES),
-        help="whose FTP server, see below (default px4)",
+        help="FTP server to be like, see below (default: px4)",
     )
-    parser.add_argument("--link", default=DEFAULT_LINK, metavar="URL", help=f"default {DEFAULT_LINK}")
-    parser.add_argument("--system", type=_system, default=1, metavar="ID", help="its system id (default 1)")
+    parser.add_argument(
+        "--link", default=DEFAULT_LINK, metavar="URL", help=f"link to serve (default: {DEFAULT_LINK})"
+    )
+    parser.add_argument("--system", type=_system, default=1, metavar="ID", help="system id (default: 1)")
     parser.add_argument(
         "--no-storage",
         dest="tells_storage",
@@ -60,11 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_data_bytes,
         default=MAX_DATA,
         metavar="N",
-        help=f"send at most N bytes of a file in a reply, as PX4 may over a radio (default {MAX_DATA})",
+        help=f"send at most N bytes of a file in a reply, as PX4 may over a radio (default: {MAX_DATA})",
     )
     parser.add_argument("--armed", action="store_true", help="be armed from the start")
     parser.add_argument(
-        "--telemetry", type=_rate, default=0.0, metavar="B/s", help="other messages (default none)"
+        "--telemetry", type=_rate, default=0.0, metavar="B/s", help="rate of other messages (default: none)"
     )
     _add_model_arguments(parser.add_argument_group("the link"))
 
@@ -87,20 +89,29 @@ def link_settings(args: argparse.Namespace) -> LinkSettings:
 
 
 def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--rate", type=_positive, metavar="B/s", help="each way; without it, no limit")
+    group.add_argument(
+        "--rate", type=_positive, metavar="B/s", help="rate of the link each way (default: no limit)"
+    )
     group.add_argument(
         "--queue",
         type=_bytes,
         default=DEFAULT_QUEUE,
         metavar="B",
-        help=f"bytes that wait for the transmitter (default {DEFAULT_QUEUE})",
+        help=f"bytes that may wait for the transmitter (default: {DEFAULT_QUEUE})",
     )
-    group.add_argument("--mtu", type=_bytes, metavar="B", help="longer frames are lost; without it, none")
+    group.add_argument("--mtu", type=_bytes, metavar="B", help="largest frame that arrives (default: any)")
     group.add_argument(
-        "--duplex", choices=[d.value for d in Duplex], default="full", help="half: directions share the rate"
+        "--duplex",
+        choices=[d.value for d in Duplex],
+        default="full",
+        help="half: both directions share the rate (default: full)",
     )
-    group.add_argument("--delay", type=_seconds, default=0.0, metavar="S", help="one way, in seconds")
-    group.add_argument("--jitter", type=_seconds, default=0.0, metavar="S", help="on top, at random")
+    group.add_argument(
+        "--delay", type=_seconds, default=0.0, metavar="S", help="seconds each way (default: 0)"
+    )
+    group.add_argument(
+        "--jitter", type=_seconds, default=0.0, metavar="S", help="seconds on top, at random (default: 0)"
+    )
     for name, text in (
         ("--loss", "share of frames lost"),
         ("--burst-loss", "share of frames lost in runs of about 8"),
@@ -108,8 +119,10 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
         ("--corrupt", "share of frames damaged"),
         ("--reorder", "share of frames held back"),
     ):
-        group.add_argument(name, type=_share, default=0.0, metavar="P", help=f"{text}, 0 to 1")
-    group.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
+        group.add_argument(name, type=_share, default=0.0, metavar="P", help=f"{text}, 0 to 1 (default: 0)")
+    group.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of everything random (default: 0)"
+    )
 
 
 def _between(low: float, high: float, what: str) -> Callable[[str], float]:

@@ -79,10 +79,7 @@ def by_fish(script: Path, folder: Path, line: str) -> str:
         (f"mavftpfs sync {SOURCE} --verify ", ["auto", "all", "none"], []),
         (f"mavftpfs put {SOURCE} no", ["note"], []),
         (f"mavftpfs {SOURCE} mn", ["mnt"], []),
-        (f"mavftpfs {SOURCE} mnt -o ro,when", ["ro,when_armed="], ["read_mode="]),
-        ("mavftpfs ls -o read_mode=", ["window", "burst"], ["when_armed"]),
-        ("mavftpfs ls -o ro,read_mode=bu", ["ro,read_mode=burst"], ["window"]),
-        ("mavftpfs mount -o tlog=no", ["tlog=note"], []),
+        ("mavftpfs mount -o ro,when", ["ro,when_armed="], ["read_mode="]),
         ("mavftpfs umount mn", ["mnt"], []),
     ],
 )

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.client.options import GONE, Options, options_of
 from mavftpfs.mount.options import (
-    FLAGS,
     IGNORED_WORDS,
     KERNEL_WORDS,
-    VALUES,
+    TABLE,
     MountOptions,
     option_help,
     parse_options,
 )
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import UsageError
+from tests.support.optiontable import option_table, told_table
 
 OWN, SHARED, PASSED_ON = (
     {field.name: field.default for part in parts for field in fields(part)}
@@ -34,10 +34,17 @@ ELSEWHERE = {"root", "baud", "local"}
 """Fields that SOURCE, words of 0.2 and the library set."""
 
 
-def test_the_table_fills_fields_and_no_others() -> None:
-    named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
+def test_each_field_is_a_row_of_the_table() -> None:
+    named = {row.field for row in TABLE.rows}
     assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone", *ELSEWHERE}
-    assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
+    assert not {*TABLE.values, *TABLE.words} & (KERNEL_WORDS | IGNORED_WORDS)
+
+
+def test_each_value_option_takes_its_own_default() -> None:
+    for name, row in TABLE.values.items():
+        default = {**SHARED, **OWN}[name]
+        if default:
+            assert TABLE.parsed(name, row.default, {}) == default
 
 
 def test_defaults_are_those_of_the_session_and_the_caches() -> None:
@@ -166,58 +173,12 @@ def test_modes(text: str, files: int, directories: int) -> None:
     assert options.directory_mode(0o022) == directories
 
 
-def test_help_says_what_each_option_is_for() -> None:
-    shown = option_help()
-    assert set(FLAGS) - {name.strip("=") for name in shown} == {"default_permissions"}, "it is always on"
-    assert all(1 < len(text) < 60 for text in shown.values())
+def test_default_permissions_is_always_on() -> None:
     assert parse_options(["default_permissions"]) == parse_options(["", " , "]) == MountOptions()
 
 
-OPTION_ROWS = [
-    [cell.strip() for cell in line.split("|")[1:3]]
-    for line in (Path(__file__).parents[2] / "docs/guide.md")
-    .read_text()
-    .partition("## Options")[2]
-    .partition("\n## ")[0]
-    .splitlines()
-    if line.startswith("| `")
-]
-"""The guide's table: names and defaults, as written there."""
-
-
-def test_the_guide_has_a_place_for_each_option() -> None:
-    named = [name.strip("` ") for names, _ in OPTION_ROWS for name in names.split(",")]
-    assert sorted(name.partition("=")[0] for name in named) == sorted(
-        name.strip("=") for name in option_help()
-    )
-    assert {name.partition("=")[0] for name in named if "=" in name} == set(VALUES)
-
-
-def told_defaults() -> list[tuple[str, str]]:
-    """Return each default that the guide or --help names, by option."""
-    told = [
-        (name.strip("="), text.rpartition(": ")[2]) for name, text in option_help().items() if ": " in text
-    ]
-    for names, defaults in OPTION_ROWS:
-        options = [name.strip("` ").partition("=")[0] for name in names.split(",")]
-        values = [value.strip("` ").removesuffix(" s") for value in defaults.split(", ")]
-        told += zip(options, values * (len(options) if len(values) == 1 else 1), strict=False)
-    return [(name, value) for name, value in told if name in VALUES]
-
-
-def test_guide_and_help_tell_the_real_defaults() -> None:
-    checked = set()
-    for name, value in told_defaults():
-        with suppress(ValueError):
-            parsed, default = VALUES[name].parse(value), {**SHARED, **OWN}[name]
-            if default is not None or value == "auto":
-                assert (name, parsed) == (name, default)
-                checked.add(name)
-    assert {
-        "cache_size",
-        "verify_max",
-        "chunk",
-    } <= checked
+def test_the_guide_has_the_table() -> None:
+    assert told_table() == option_table(), "run: python -m tests.support.optiontable"
 
 
 # --- words of 0.2 ----------------------------------------------------------------------------------
