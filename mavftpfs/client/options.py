@@ -312,7 +312,7 @@ GONE: Mapping[str, Gone] = {
     "window": Gone("mavftpfs finds out how many requests the link carries"),
     "trace": Gone("-d prints every request and reply, and tlog=FILE records the link"),
     "rmw_max": Gone("a change that needs more than two minutes of the link is refused (EFBIG)"),
-    "local": Gone("the list of names that stay in memory is fixed; see the guide, Writing"),
+    "local": Gone("the list of names that stay in memory is fixed; see the guide, Edit and upload"),
     "force": Gone(
         "a file that the vehicle is writing is never changed (EBUSY); leave the word out", refused=True
     ),

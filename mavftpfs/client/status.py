@@ -1,7 +1,7 @@
 """What mounts tell of themselves, and how they are asked for it. Layer: client.
 
 A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys
-are those of `status --json`, which docs/guide.md describes. It is asked over its control socket. If that
+are those of `status --json`, which docs/json.md describes. It is asked over its control socket. If that
 cannot be reached (it is another user's), the extended attribute of the mount's root says the same to users
 that may read the mount; root may ask all mounts. Of a mount that cannot be asked only `mountpoint`, `source`,
 `state` and `problem` are known.

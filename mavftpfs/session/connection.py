@@ -177,7 +177,7 @@ class Connection:
         self.news.append(listener)
 
     def status(self) -> dict[str, dict[str, Any]]:
-        """Return JSON-able facts: `vehicle` and `link` (docs/guide.md, `status --json`), and details."""
+        """Return JSON-able facts: `vehicle` and `link` (docs/json.md, `status --json`), and details."""
         now, stats, link = self.clock(), self.engine.stats, self.link
         heartbeat, server = self.vehicle.heartbeat, self.scheduler.server.session
         details = {

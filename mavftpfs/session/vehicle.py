@@ -236,7 +236,7 @@ class Vehicle:
         return None if self.version is None else bool(self.version.capabilities & MAV_PROTOCOL_CAPABILITY_FTP)
 
     def status(self, now: float) -> dict[str, Any]:
-        """Return JSON-able facts: those of `vehicle` in docs/guide.md, `status --json`."""
+        """Return JSON-able facts: those of `vehicle` in docs/json.md, `status --json`."""
         heartbeat, version = self.heartbeat, self.version
         return {
             "system": None if self.address is None else self.address.system,

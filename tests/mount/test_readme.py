@@ -142,24 +142,24 @@ def test_parameters(home: Home, field: Field) -> None:
 
 
 def told_keys(command: str) -> set[str]:
-    """Return the names of keys in the guide's paragraph or table on `COMMAND --json`, without examples."""
-    guide = (PROJECT / "docs/guide.md").read_text().partition("\n## JSON\n")[2]
-    part = guide.partition(f"`{command} --json")[2]
-    part = re.split(r"\n\n`\w+ --json", part)[0]
+    """Return the names of keys in the page's paragraph or table on `COMMAND --json`, without examples."""
+    page = (PROJECT / "docs/json.md").read_text()
+    part = page.partition(f"`{command} --json")[2]
+    part = re.split(r"\n\n(?:`\w+ --json|## )", part)[0]
     rows = re.findall(r"^\| (`[^|]*`) \|", part, re.MULTILINE)
     text = "".join(rows) if rows else re.sub(r"\([^)]*\)", "", part.partition(".")[0])
     return set(re.findall(r"`(\w+)`", text))
 
 
 def inner_keys(group: str) -> set[str]:
-    """Return the keys that the guide names for one group of `status --json`."""
-    guide = (PROJECT / "docs/guide.md").read_text()
-    row = re.search(rf"^\| `{group}` \| (.*) \|$", guide, re.MULTILINE)
+    """Return the keys that the page names for one group of `status --json`."""
+    page = (PROJECT / "docs/json.md").read_text()
+    row = re.search(rf"^\| `{group}` \| (.*) \|$", page, re.MULTILINE)
     assert row is not None
     return set(re.findall(r"`(\w+)`", re.sub(r"\([^)]*\)", "", row[1])))
 
 
-def test_the_guide_names_the_keys_of_json(home: Home, field: Field) -> None:
+def test_the_page_names_the_keys_of_json(home: Home, field: Field) -> None:
     home.mountpoint.mkdir()
     home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
     status = json.loads(home.run("mavftpfs status --json ~/drone"))

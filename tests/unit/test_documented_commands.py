@@ -29,7 +29,7 @@ def shown() -> Iterator[str]:
     for page in PAGES:
         text = (PROJECT / page).read_text()
         for line in (*BLOCK_LINE.findall(text), *TABLE_ROW.findall(text)):
-            command = line.partition("  #")[0].strip().removeprefix("sudo ")
+            command = line.partition("  #")[0].strip().removeprefix("sudo ").removesuffix(" &&")
             if command.startswith("mavftpfs "):
                 yield command
 
