@@ -6,9 +6,7 @@ import argparse
 import logging
 import os
 import select
-import shutil
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -16,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from mavftpfs.cli import report
+from mavftpfs.cli.drawing import changing_line
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
 from mavftpfs.client.options import at_source, split_words
@@ -180,12 +179,10 @@ def umount(args: argparse.Namespace) -> int:
 def _umount(place: str, *, lazy: bool) -> int:
     try:
         socket = find_socket(place)
-        progress = _Delivery(socket)
         request = {"command": "umount", "lazy": lazy}
-        try:
-            reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE, meanwhile=progress.show)
-        finally:
-            progress.end()
+        with changing_line(say, SAY_AGAIN) as show:
+            progress = _Delivery(socket, show)
+            reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE, meanwhile=progress.look)
     except control.NobodyThere as exc:
         vehicles = vehicles_below(place)
         if not vehicles and not is_ours(place):
@@ -226,47 +223,28 @@ def _umount_unasked(place: str, *, lazy: bool) -> int:
 
 
 class _Delivery:
-    """Says on stderr what a mount that ends waits for."""
+    """What a mount that ends waits for. show: shows a line in place of the last one."""
 
-    def __init__(self, socket: Path) -> None:
+    def __init__(self, socket: Path, show: Callable[[str], None]) -> None:
         self._socket = socket
-        self._said_at: float | None = None
+        self._show = show
         self._explained = False
-        self._in_place = sys.stderr.isatty()
 
-    def show(self) -> None:
-        """Ask the mount what it delivers, and say so; called about each second."""
+    def look(self) -> None:
+        """Ask the mount what it delivers, and show it; called about each second."""
         try:
             status = control.ask(self._socket, {"command": "status"}, timeout=PATIENCE)["status"]
         except control.NobodyThere:
             return  # it ends just now
         except control.ControlError as exc:
-            self._say(f"{exc}; if it is stopped, `fg` continues it; fusermount3 -uz unmounts without it")
+            self._show(f"{exc}; if it is stopped, `fg` continues it; fusermount3 -uz unmounts without it")
             return
         # A mount that is still in use has held bytes, too, but does not end.
         line = report.delivery_line(status) if status["state"] == "unmounting" else ""
-        if not line:
-            return
-        if not self._explained:
+        if line and not self._explained:
             self._explain(status["pid"])
-        self._say(line)
-
-    def _say(self, line: str) -> None:
-        """Say a line in the place of the last one; where that is a file, not too often."""
-        now = time.monotonic()
-        if self._in_place:
-            shown = line[: shutil.get_terminal_size().columns - 1]
-            print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
-        elif self._said_at is not None and now < self._said_at + SAY_AGAIN:
-            return
-        else:
-            say(line)
-        self._said_at = now
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._in_place and self._said_at is not None:
-            print(file=sys.stderr)
+        if line:
+            self._show(line)
 
     def _explain(self, pid: int) -> None:
         self._explained = True
@@ -341,6 +319,6 @@ def status(args: argparse.Namespace) -> int:
     if args.watch:
         report.watch_status(fetch, verbose=args.verbose)
     found = fetch()
-    report.print_status(found, verbose=args.verbose)
+    print(*report.all_lines(found, verbose=args.verbose), sep="\n")
     unanswered = args.mountpoint is not None and found[0].get("problem")
     return ExitCode.MOUNT_FAILED if unanswered else ExitCode.OK

@@ -1,19 +1,22 @@
-"""The progress of transfers on a terminal: one total, and the file at work. Layer: cli; uses rich."""
+"""What is drawn on a terminal: progress, the status, a line that changes. Layer: cli; all of it by rich.
+
+rich takes a tenth of a second to import, so each function imports what it draws with.
+"""
 
 from __future__ import annotations
 
 import sys
-from contextlib import AbstractContextManager, nullcontext
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NoReturn
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from mavftpfs.shared.readable import printable, readable_size, time_left
 
-from mavftpfs.cli.report import time_left
-from mavftpfs.client.progress import Progress
-from mavftpfs.shared.readable import printable, readable_size
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from mavftpfs.client.progress import Progress
 
 _REFRESH = 5
 _ROOM = 4
@@ -55,34 +58,80 @@ def bar_width(progress: Progress, width: int) -> int:
     return max(8, min(_BAR, width - counts - _LINE - 8))
 
 
-class _Screen:
-    """What rich draws, again and again."""
+def _picture(progress: Progress, idle: str, width: int) -> RenderableType:
+    """Return one total, and the file at work."""
+    from rich.console import Group
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
 
-    def __init__(self, progress: Progress, console: Console, idle: str) -> None:
-        self._progress = progress
-        self._console = console
-        self._idle = idle
-
-    def __rich__(self) -> RenderableType:
-        progress, width = self._progress, self._console.width
-        if not progress.files:
-            return Text(self._idle)
-        line = totals(progress)
-        share = progress.done / progress.total if progress.total else 1.0
-        bar = ProgressBar(total=1.0, completed=share, width=bar_width(progress, width))
-        row = Table.grid(padding=(0, 1))
-        row.add_row(bar, Text(f"{share * 100:3.0f} %"), Text(line, no_wrap=True))
-        return Group(row, Text(current(progress, width - _ROOM), no_wrap=True))
+    if not progress.files:
+        return Text(idle)
+    share = progress.done / progress.total if progress.total else 1.0
+    bar = ProgressBar(total=1.0, completed=share, width=bar_width(progress, width))
+    row = Table.grid(padding=(0, 1))
+    row.add_row(bar, Text(f"{share * 100:3.0f} %"), Text(totals(progress), no_wrap=True))
+    return Group(row, Text(current(progress, width - _ROOM), no_wrap=True))
 
 
-def drawn(progress: Progress, idle: str) -> AbstractContextManager[object]:
-    """Draw progress on stderr during the body, if that is a terminal that can be drawn on."""
+@contextmanager
+def shown(progress: Progress, idle: str = "looking at what is there") -> Iterator[Progress]:
+    """Draw progress on stderr during the body, if that is a terminal; nothing of it stays at the end.
+
+    idle: what is drawn while nothing is planned.
+    """
+    if not sys.stderr.isatty():
+        yield progress
+        return
+    from rich.console import Console
+    from rich.live import Live
+
     console = Console(stderr=True)
-    if not console.is_terminal:
-        return nullcontext()
-    screen = _Screen(progress, console, idle)
     # What goes to stdout would come out on stderr if rich took it; only on one terminal are they the same.
-    to_terminal = sys.stdout.isatty()
-    return Live(
-        screen, console=console, refresh_per_second=_REFRESH, transient=True, redirect_stdout=to_terminal
-    )
+    with Live(
+        get_renderable=lambda: _picture(progress, idle, console.width),
+        console=console,
+        refresh_per_second=_REFRESH,
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+    ):
+        yield progress
+
+
+def watch(lines: Callable[[], Sequence[str]], period: float) -> NoReturn:
+    """Draw lines on stdout, and anew each `period` seconds, until interrupted; the last picture stays. Lines
+    that are not indented are bold."""
+    from rich.console import Group
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(auto_refresh=False) as live:
+        while True:
+            texts = [Text(line, "" if line.startswith(" ") else "bold") for line in lines()]
+            live.update(Group(*texts), refresh=True)
+            time.sleep(period)
+
+
+@contextmanager
+def changing_line(say: Callable[[str], None], pause: float) -> Iterator[Callable[[str], None]]:
+    """Return a function that shows a line on stderr, in place of the last one.
+
+    If stderr is no terminal, the function calls `say` with the line, at most each `pause` seconds.
+    """
+    if not sys.stderr.isatty():
+        said_at = float("-inf")
+
+        def say_seldom(line: str) -> None:
+            nonlocal said_at
+            if time.monotonic() >= said_at + pause:
+                said_at = time.monotonic()
+                say(line)
+
+        yield say_seldom
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=Console(stderr=True), auto_refresh=False) as live:
+        yield lambda line: live.update(Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)

@@ -18,7 +18,7 @@ import trio
 
 from mavftpfs.cli import verbs
 from mavftpfs.cli.commands import say
-from mavftpfs.cli.showing import shown
+from mavftpfs.cli.drawing import shown
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session, Target, open_mount, vehicles_below
 from mavftpfs.client.parameters import Change, Difference, Wish

@@ -23,7 +23,7 @@ import trio
 
 from mavftpfs.cli import watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line, say
-from mavftpfs.cli.showing import shown
+from mavftpfs.cli.drawing import shown
 from mavftpfs.client import download, names, upload
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher

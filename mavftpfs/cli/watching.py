@@ -16,7 +16,7 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cli.showing import shown
+from mavftpfs.cli.drawing import shown
 from mavftpfs.client.download import Wish
 from mavftpfs.client.files import Target
 from mavftpfs.client.progress import Progress

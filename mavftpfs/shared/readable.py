@@ -64,6 +64,11 @@ def readable_time(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
+def time_left(seconds: float) -> str:
+    """Return how much longer it takes, at least a second."""
+    return f"{readable_time(max(1.0, seconds))} left"
+
+
 def _as_text(quoted: re.Match[str]) -> str:
     try:
         name: bytes = ast.literal_eval(quoted[0])

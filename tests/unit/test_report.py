@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 from typing import Any
 
 import pytest
 import trio
 
-from mavftpfs.cli.report import delivery_line, panel, screen, status_lines
+from mavftpfs.cli.report import delivery_line, status_lines
 from mavftpfs.client.status import snapshot
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.shared.readable import printable, readable_size, readable_time
@@ -53,7 +52,7 @@ def status(
 
 
 def lines(*args: Any, **more: Any) -> list[str]:
-    return [line.fitted() for line in status_lines(status(*args, **more))]
+    return status_lines(status(*args, **more))
 
 
 @pytest.mark.parametrize(
@@ -157,33 +156,12 @@ def test_nobody_is_told_of_half_a_second() -> None:
 
 def test_the_rest_is_in_round_numbers_and_in_words() -> None:
     facts = {"rtt": 0.0412345678, "other_ftp_client": True, "received_bytes": 123456789}
-    shown = [line.fitted() for line in status_lines(status(facts), verbose=True)]
+    shown = status_lines(status(facts), verbose=True)
     assert "  link: rtt: 0.0412" in shown
     assert "  link: rate: 5100" in shown
     assert "  link: other ftp client: yes" in shown
     assert "  vehicle: armed: no" in shown
     assert "  link: received bytes: 123456789" in shown
-
-
-@pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 50), (40, 5), (20, 2)])
-@pytest.mark.parametrize("mounts", [1, 2, 7])
-def test_a_panel_fits_the_terminal(width: int, height: int, mounts: int) -> None:
-    cache = {"reads": [READ] * 9, "rate": 5100.0, "files_undelivered": 2, "bytes_undelivered": 4096}
-    statuses = [{**status(None, cache), "mountpoint": f"/mnt/{'x' * 30}/{n}"} for n in range(mounts)]
-    shown = panel(statuses, width, height)
-    assert len(shown) <= height
-    assert all(len(line) <= width for line in shown)
-    heads = [line for line in shown if "PX4 1/1" in line or "more mounts" in line or width == 20]
-    assert len(heads) >= min(mounts, height)
-
-
-def test_nothing_is_erased_behind_a_line_as_wide_as_the_terminal() -> None:
-    lines = panel([{**status(), "mountpoint": f"/mnt/{'x' * 80}"}], 80, 24)
-    assert len(lines[0]) == 80
-    drawn = screen(lines)
-    # The cursor stays on the last character of a full line, and an erasure (J, K) begins at the cursor.
-    first_text = drawn.index(lines[0])
-    assert not re.search(r"\x1b\[[0-2]?[JK]", drawn[first_text:])
 
 
 def test_sizes_times_and_names() -> None:
