@@ -178,6 +178,11 @@ class VehicleStore(RemoteStore, Protocol):
         """What the server was seen to do; forgotten when it restarts."""
         ...
 
+    @property
+    def epoch(self) -> int:
+        """How often what was read lately came into doubt. Proofs of before the last time are void."""
+        ...
+
     def in_doubt(self, since: float = inf) -> bool:
         """Return whether there is doubt: something in the last ten minutes, or since a time of the caches'
         clock, says that a file may have other bytes than the ACKs say. That is a late copy of a request,

@@ -243,18 +243,18 @@ class Connection:
 
     def _on_reboot(self) -> None:
         self.engine.forget_server()
-        self.scheduler.on_reboot()
+        self.scheduler.server.distrust("the vehicle restarted", reads=True)
         self._tell("reboot")
 
     def _on_another_client(self, payload: bytes, newcomer: bool) -> None:
         self.engine.flow.alone = False
-        self.scheduler.on_another_client(payload, newcomer=newcomer)
+        self.scheduler.server.on_another_client(payload, newcomer=newcomer)
 
     def _on_unexplained(self, reply: Payload, lateness: float | None) -> None:
-        self.scheduler.on_unexplained(reply, lateness)
+        self.scheduler.server.on_unexplained(reply, lateness)
 
     def _on_late(self, reply: Payload, sent_at: float) -> None:
-        self.scheduler.on_late(reply, sent_at)
+        self.scheduler.server.on_late(reply, sent_at)
 
     def _on_armed(self, armed: bool) -> None:
         self.scheduler.on_armed_changed()

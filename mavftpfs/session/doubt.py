@@ -1,16 +1,7 @@
-"""Doubt: when something was noticed, and when something that concerns reads. Layer: session; pure.
-
-Servers share session ids between clients, requests name a session and no file, and some links deliver a
-request twice, the second time late. Whatever shows that this happened raises the same doubt: an answer that
-nothing outstanding and no repetition of ours explains, another FTP client, a session that vanished under us,
-a restart of the vehicle. For ten minutes from then on the caches compare what was written.
-
-Where copies of requests were seen to come late, names rest between two changes (`LateCopies`).
-"""
+"""Late copies of requests: how long a name rests before it is changed again. Layer: session; pure."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
 
 LASTS = 600.0
@@ -86,35 +77,3 @@ class LateCopies:
 
     def _is_fresh(self, now: float) -> bool:
         return now - self._seen_at <= LASTS
-
-
-class Doubt:
-    """Whether, and since when, what was ACKed is not believed without a look.
-
-    Attributes:
-        late_copies: which names rest.
-    """
-
-    def __init__(
-        self, clock: Callable[[], float], on_raised: Callable[[str], None] = lambda reason: None
-    ) -> None:
-        """`on_raised` is called each time that what was read is in doubt, with the reason, for people."""
-        self._on_raised = on_raised
-        self.late_copies = LateCopies()
-        self._clock = clock
-        self._at = self._reads_at = -inf
-
-    def raise_it(self, reason: str, *, reads: bool = True) -> None:
-        """Something was noticed now; reads: what was read lately may be another file's, too."""
-        self._at = self._clock()
-        if reads:
-            self._reads_at = self._at
-            self._on_raised(reason)
-
-    def is_active(self, since: float = inf) -> bool:
-        """Return whether something was noticed in the last ten minutes, or after that time."""
-        return self._clock() - self._at <= LASTS or self._at > since
-
-    def reads_arose_since(self, at: float) -> bool:
-        """Return whether what was read then may be another file's."""
-        return self._reads_at >= at

@@ -81,6 +81,11 @@ def took_session(payload: bytes) -> bool:
     return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
 
 
+def asks_to_open(payload: bytes) -> bool:
+    """Return whether this is a request that opens a file, of which only the answer tells what it did."""
+    return payload[_OPCODE] in OPENING
+
+
 def _found_nothing(payload: bytes) -> bool:
     """Return whether this refuses an open because the file is not there. Another refusal may be because a
     session is taken, whatever it says (docs/servers.md 12)."""

@@ -23,10 +23,8 @@ from typing import Literal
 import trio
 
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.session.doubt import Doubt
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.others import OPENING, took_session
 from mavftpfs.session.serversession import OpenSession, ServerSession
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import renamed
@@ -226,8 +224,8 @@ class Scheduler:
     ) -> None:
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
-        self.doubt = Doubt(clock, self._on_reads_doubted)
-        self.server = ServerSession(driver, self.doubt, clock, op_deadline)
+        self.server = ServerSession(driver, clock, op_deadline)
+        self.server.on_reads_distrusted = self._on_reads_distrusted
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
         self.serving = trio.Event()
@@ -240,7 +238,6 @@ class Scheduler:
         self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
         self._used_at = clock()  # end of the last turn, or the janitor's last try
-        self._touched_at = -inf
 
     # --- turns
 
@@ -411,66 +408,16 @@ class Scheduler:
 
     # --- news
 
-    def on_another_client(self, payload: bytes, *, newcomer: bool) -> None:
-        """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
-        been missed."""
-        now, engine = self.clock(), self._driver.engine
-        session = self.server.others.hear(payload, now)
-        echoes = engine.traits.ack_carries_own_session  # then each client has an id of its own
-        if session is not None and (not echoes or session == engine.home_session):
-            self._touched_at = now
-        # A client that uses sessions may have used ours, too, by a request that was not heard.
-        reads = newcomer or now - self._touched_at <= RECENT
-        self.doubt.raise_it("another FTP client is active", reads=reads)
-        if not echoes and self.server.session is not None and took_session(payload):
-            self.server.abandon()  # what we read or write would be its file
-        self.server.wake()
-
-    def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
-        """Doubt what was written, because an answer came that no request of this session explains.
-
-        lateness: seconds since its request went out, None if that is not known. If it is the answer of an
-        older open, the server executed that open once more, and may have put its file in the place of the
-        present one (MAVSDK): then what was read is in doubt, too.
-        """
-        session = self.server.session
-        opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
-        other = opens and session is not None and session.seq != reply.seq
-        self.doubt.late_copies.saw(lateness, self.clock())
-        self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
-        if other:
-            self.server.abandon()
-
-    def on_late(self, reply: Payload, sent_at: float) -> None:
-        """An ACK came that nothing waits for any more: its request was repeated, or its operation cancelled.
-        sent_at: when it went out first. An open of an earlier file may have put that in the place of the
-        present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later one.
-        After changes of names the names rest, see LateCopies.
-        """
-        if sent_at >= self.server.file_since:
-            return  # it is the open that is closed next, or a WriteFile to the last file
-        session = self.server.session
-        if reply.req_opcode in OPENING:
-            if session is None or session.seq != reply.seq:
-                self.on_unexplained(reply, self.clock() - sent_at)
-        elif reply.req_opcode == Opcode.WRITE_FILE:
-            self.doubt.raise_it("a WriteFile came after its file was closed", reads=False)
-
-    def _on_reads_doubted(self, reason: str) -> None:
-        """What was read lately may be another file's, also of files that were closed since."""
+    def _on_reads_distrusted(self, why: str) -> None:
+        """Tell all users that what was read lately may be another file's, also of files closed since."""
         for user in [*self.users, *(user for _, user in self._gone)]:
-            user.on_suspect(reason)
+            user.on_suspect(why)
 
     def on_armed_changed(self) -> None:
-        """Uploads end while it is armed, and go on afterwards (promise 9)."""
+        """End uploads while the vehicle is armed, and go on with them afterwards (promise 9)."""
         for user in self.users:
             user.on_armed_changed()
         self.server.wake()
-
-    def on_reboot(self) -> None:
-        """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
-        self.doubt.raise_it("the vehicle restarted")
-        self.server.abandon()
 
     # --- the one task
 

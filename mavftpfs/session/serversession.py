@@ -24,11 +24,18 @@ from typing import TypeVar
 import trio
 
 from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import Operation
-from mavftpfs.session.doubt import Doubt
+from mavftpfs.session.doubt import LASTS, LateCopies
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.others import LEFT_OPEN, STAYS_ITS_OWN, OtherClients
+from mavftpfs.session.others import (
+    LEFT_OPEN,
+    OPENING,
+    STAYS_ITS_OWN,
+    OtherClients,
+    asks_to_open,
+    took_session,
+)
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
 from mavftpfs.shared.model import wire_path
 
@@ -103,31 +110,113 @@ class ServerSession:
         yet, or never, or the session is not believed any more.
         file_since: when the last open went out, and once its ACK came, when that was. What went out before
         concerns an earlier file.
+        epoch: how often what was read lately came into doubt. late_copies: which names rest.
         others: other clients of this server.
+        on_reads_distrusted: called with the reason whenever the epoch is raised.
         changed: where tasks park until something more is closed.
     """
 
     def __init__(
         self,
         driver: Driver,
-        doubt: Doubt,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
         self.driver = driver
         self.engine = driver.engine
         self.vehicle = driver.vehicle
-        self.doubt = doubt
         self.clock = clock
         self.op_deadline = op_deadline
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
         self.file_since = -inf
+        self.epoch = 0
+        self._epoch_at = self._distrusted_at = -inf
+        self.late_copies = LateCopies()
         self.others = OtherClients()
+        self.on_reads_distrusted: Callable[[str], None] = lambda why: None
         self._asked_sessions_at = -inf
         self._news = trio.Event()
         self.changed = trio.lowlevel.ParkingLot()
+
+    # --- trust
+
+    def distrust(self, why: str, *, reads: bool) -> None:
+        """Stop believing ACKs: for ten minutes the caches compare what was written.
+
+        Servers share session ids between clients, requests name a session and no file, and some links deliver
+        a request twice, the second time late. reads: what was read lately may be another file's, too. So the
+        transfer is cancelled, its file counts as perhaps open, and the epoch is raised.
+        """
+        self._distrusted_at = self.clock()
+        if reads:
+            self.epoch, self._epoch_at = self.epoch + 1, self._distrusted_at
+            self.leave()
+            self.on_reads_distrusted(why)
+
+    def in_doubt(self, since: float = inf) -> bool:
+        """Return whether ACKs were distrusted in the last ten minutes, or after that time."""
+        return self.clock() - self._distrusted_at <= LASTS or self._distrusted_at > since
+
+    def on_another_client(self, payload: bytes, *, newcomer: bool) -> None:
+        """Note another FTP client's payload. newcomer: the first one for a while, so earlier ones may have
+        been missed, and have taken the session from a reader. After a request to open, the answer or the next
+        request tells. An upload goes on: its file is compared."""
+        traits, used, session = self.engine.traits, self.others.hear(payload, self.clock()), self.session
+        # Where servers echo ids, each client has one of its own.
+        shared = not traits.ack_carries_own_session or used == self.engine.home_session
+        took = shared and took_session(payload)
+        missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
+        # If no file was opened since the last such news, nothing more is in doubt.
+        opened = session is not None or self.file_since >= self._epoch_at
+        self.distrust("another FTP client is active", reads=(took or missed) and opened)
+        self.wake()
+
+    def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
+        """Take an answer that no request of this session explains.
+
+        lateness: seconds since its request went out, None if that is not known. The ACK of another open shows
+        that the server executed that open once more, and MAVSDK's then has its file in the place of the
+        present one.
+        """
+        self.late_copies.saw(lateness, self.clock())
+        self.distrust("an answer came that no request of ours explains", reads=self._is_older_open(reply))
+
+    def on_late(self, reply: Payload, sent_at: float) -> None:
+        """Take an ACK that nothing waits for any more: its request was repeated, or its operation cancelled.
+
+        sent_at: when the request went out first. An open of an earlier file may have put that in the place of
+        the present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later
+        one. After changes of names the names rest, see LateCopies.
+        """
+        if sent_at >= self.file_since:
+            return  # the open that is closed next, or a WriteFile to the last file
+        if reply.req_opcode in OPENING:
+            if self.session is None or self.session.seq != reply.seq:
+                self.on_unexplained(reply, self.clock() - sent_at)
+        elif reply.req_opcode == Opcode.WRITE_FILE:
+            self.distrust("a WriteFile came after its file was closed", reads=False)
+
+    def _is_older_open(self, reply: Payload) -> bool:
+        """Return whether a reply ACKs an open other than that of the present file."""
+        opened = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
+        return opened and self.session is not None and self.session.seq != reply.seq
+
+    def leave(self) -> None:
+        """Stop using what is open: cancel its transfer, and close the file before the next open. The server
+        may have restarted meanwhile."""
+        if self.transfer is not None:
+            self.driver.cancel(self.transfer)
+        self._leave()
+        self.wake()
+
+    def lose(self, lost: SessionLost) -> None:
+        """Leave the session that its user found lost."""
+        if lost.by_server:
+            self.distrust(str(lost), reads=True)
+        else:
+            self.leave()
 
     def _leave(self) -> None:
         """Count what is open as perhaps open."""
@@ -171,7 +260,7 @@ class ServerSession:
             await self._open_with_remedies(path, opcode)
         finally:
             if opcode == Opcode.CREATE_FILE:
-                late, now = self.doubt.late_copies, self.clock()
+                late, now = self.late_copies, self.clock()
                 late.on_changed(path, now)
                 # Where nothing can be renamed a file is not compared once more under its final name.
                 if self.engine.traits.rename_works is False and (self.session is None or self.session.resent):
@@ -250,7 +339,7 @@ class ServerSession:
     def _may_have_opened(self, nak: FtpNak) -> bool:
         """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or
         a late copy of an older open came."""
-        return nak.retransmitted or (self.doubt.is_active() and not self._another_client_heard())
+        return nak.retransmitted or (self.in_doubt() and not self._another_client_heard())
 
     # --- closing
 
@@ -309,20 +398,6 @@ class ServerSession:
                 closed = True
             self._forget(session)
         return closed
-
-    def abandon(self) -> None:
-        """Believe no more in what is open: its transfer ends, and it is closed before the next open. This is
-        also done after a restart, which may be noticed only when a file was opened anew."""
-        if self.transfer is not None:
-            self.driver.cancel(self.transfer)
-        self._leave()
-        self.wake()
-
-    def lose(self, lost: SessionLost) -> None:
-        """Its user found it lost. Abandon it; if the server ended it, what was read is in doubt."""
-        self.abandon()
-        if lost.by_server:
-            self.doubt.raise_it(str(lost))
 
     def require_open(self, session: OpenSession) -> None:
         """Raise SessionLost unless what was opened then is still open."""
@@ -426,4 +501,4 @@ class ServerSession:
 
 
 def _lost() -> SessionLost:
-    return SessionLost("the vehicle restarted, or opened another file", by_server=True)
+    return SessionLost("the vehicle restarted, or opened another file", by_server=False)

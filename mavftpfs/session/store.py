@@ -2,9 +2,9 @@
 
 Did that change happen? A request whose answer was lost is sent again, and may be carried out twice. The
 second time it is refused, or hits the name's next file (docs/servers.md 14.4). So after such a refusal, and
-after a silence, a listing tells whether the change happened. While there is doubt (session.doubt) the network
-may also have doubled a request that we sent once. Where copies of requests came late, names rest between two
-changes (LateCopies). Only `let_rest` waits for that.
+after a silence, a listing tells whether the change happened. While ACKs are distrusted
+(`ServerSession.distrust`) the network may also have doubled a request that we sent once. Where copies of
+requests came late, names rest between two changes (LateCopies). Only `let_rest` waits for that.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Store:
 
     def __init__(self, scheduler: Scheduler) -> None:
         self.traits = scheduler.server.engine.traits
-        self.in_doubt = scheduler.doubt.is_active
+        self.in_doubt = scheduler.server.in_doubt
         self._scheduler = scheduler
         self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
@@ -128,7 +128,12 @@ class Store:
         self._op_deadline = scheduler.server.op_deadline
         self._sent = 0
         self._under_way = 0
-        self._late_copies = scheduler.doubt.late_copies
+        self._late_copies = scheduler.server.late_copies
+
+    @property
+    def epoch(self) -> int:
+        """Return how often what was read lately came into doubt (see VehicleStore)."""
+        return self._server.epoch
 
     def why_lost(self) -> str | None:
         """Return why the vehicle counts as lost (see RemoteStore)."""
@@ -210,12 +215,12 @@ class Store:
         block: int | None = self._scheduler.read_chunks.size
         while block is not None:
             async with self._opened(path) as session:
-                began = self._clock()
+                epoch = self._server.epoch
                 operation = ReadToEof(session.id, block, limit)
                 with suppress(DataUnproven):
                     await self._server.driver.run(operation)
                 self._server.require_open(session)
-            if self._scheduler.doubt.reads_arose_since(began):
+            if self._server.epoch != epoch:
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
             block = operation.shorter
         if operation.error is not None:
@@ -428,7 +433,7 @@ class Store:
         if nak.retransmitted:
             return True
         opcode = Opcode(nak.opcode)
-        looked_at = self._scheduler.doubt.is_active() or opcode == Opcode.RENAME
+        looked_at = self._server.in_doubt() or opcode == Opcode.RENAME
         return looked_at and nak.code in _SECOND.get(opcode, ())
 
     async def _after_refusal(self, nak: FtpNak, verify: Verdict) -> Outcome:

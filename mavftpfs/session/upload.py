@@ -214,7 +214,7 @@ class Upload(SessionUser):
             MavftpfsError: what it failed with.
         """
         if not isinstance(error, SessionLost):
-            self._server.abandon()
+            self._server.leave()
             self._source.roll_back()
             raise error
         self._server.lose(error)

@@ -51,7 +51,7 @@ class Answering:
             operation.session, operation.reply = 1, Payload(1, 0, Opcode.ACK, 0, opcode)
             operation.on_opened(operation)
             if answer == "taken":  # another client has it, before the caller goes on
-                self.server.abandon()
+                self.server.leave()
 
     async def be_silent(self, seconds: float) -> bool:
         await trio.sleep(seconds)
@@ -91,9 +91,9 @@ async def _do(scheduler: Scheduler, act: str, path: bytes) -> None:
         case "close maybe open":
             await server.close_maybe_open()
         case "abandon":
-            server.abandon()
+            server.leave()
         case "restart":
-            server.abandon()
+            server.leave()
             server.engine.forget_server()
         case "exclude":
             async with trio.open_nursery() as nursery:

@@ -19,7 +19,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, UNKNOWN_LATENESS, Doubt, LateCopies
+from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, UNKNOWN_LATENESS, LateCopies
 from mavftpfs.shared.errors import MavftpfsError, NotVerified, RequestTimeout, SessionLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -35,17 +35,19 @@ EVERY_PROFILE = sorted(PROFILES)
 CLEAN = LinkSettings(delay=0.02)
 
 
-def test_doubt_lasts_for_ten_minutes() -> None:
-    now = 5.0
-    doubt = Doubt(lambda: now)
-    assert not doubt.is_active()
-    doubt.raise_it("a reason")
-    now += LASTS
-    assert doubt.is_active()
-    now += 0.1
-    assert not doubt.is_active()
-    assert doubt.is_active(4.9)
-    assert not doubt.is_active(5.0)
+async def test_distrust_lasts_for_ten_minutes() -> None:
+    here = Rig("px4", {b"/d": None}, CLEAN)
+    async with here.connected() as connection:
+        store = connection.store
+        assert not store.in_doubt()
+        connection.scheduler.server.distrust("a reason", reads=False)
+        at = trio.current_time()
+        await trio.sleep(LASTS)
+        assert store.in_doubt()
+        await trio.sleep(0.1)
+        assert not store.in_doubt()
+        assert store.in_doubt(at - 0.1)
+        assert not store.in_doubt(at)
 
 
 def test_a_name_rests_where_copies_come_late() -> None:
@@ -137,13 +139,13 @@ async def test_an_answer_that_comes_twice_raises_it() -> None:
         await trio.sleep(0.1)
         assert connection.store.in_doubt()
         assert connection.store.in_doubt(began)
-        assert 6 < connection.scheduler.doubt.late_copies.rest(b"/d/one", trio.current_time()) < 8
+        assert 6 < connection.scheduler.server.late_copies.rest(b"/d/one", trio.current_time()) < 8
 
 
 @pytest.mark.holds("rule 14.12")
 async def test_what_another_client_does_decides_whether_bytes_are_in_doubt() -> None:
-    """The first that is heard of him, what may use our session, and for a while after that everything: a
-    request that took the session may have been missed."""
+    """The first that is heard of it, because earlier requests may have been missed, and what uses the session
+    that all share; once for what was read by then. An open tells by its answer."""
     data = content(200_000)
     here = Rig("px4", {b"/d/f": data}, LinkSettings(rate=5_000.0, delay=0.02))
     async with here.connected() as connection:
@@ -151,16 +153,20 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt() -> 
 
         async def doubts(opcode: Opcode, pause: float = 0.0) -> bool:
             await trio.sleep(pause)
-            before = len(sink.suspicions)
+            before, epoch = len(sink.suspicions), connection.store.epoch
             here.another_asks(opcode, b"/")
             await trio.sleep(1.0)
-            return len(sink.suspicions) > before
+            assert (len(sink.suspicions) > before) is (connection.store.epoch > epoch)
+            return connection.store.epoch > epoch
 
         assert await doubts(Opcode.LIST_DIRECTORY)
         assert not await doubts(Opcode.LIST_DIRECTORY)
         assert await doubts(Opcode.READ_FILE)
-        assert await doubts(Opcode.LIST_DIRECTORY, 5.0)
-        assert not await doubts(Opcode.LIST_DIRECTORY, 5.0)
+        assert not await doubts(Opcode.READ_FILE), "our file is not open any more"
+        assert not await doubts(Opcode.TERMINATE_SESSION)
+        assert not await doubts(Opcode.LIST_DIRECTORY, 3.0)
+        assert await doubts(Opcode.LIST_DIRECTORY, 11.0)
+        assert not await doubts(Opcode.OPEN_FILE_RO, 11.0), "the server refuses it"
         reader.close()
 
 
@@ -184,8 +190,8 @@ async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
     here = Rig(profile, {b"/d/old": content(500, 1)}, CLEAN)
     old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
     async with here.connected() as connection:
-        connection.scheduler.doubt.raise_it("as if a copy had been late")
-        connection.scheduler.doubt.late_copies.saw(1.0, trio.current_time())
+        connection.scheduler.server.distrust("as if a copy had been late", reads=True)
+        connection.scheduler.server.late_copies.saw(1.0, trio.current_time())
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
         began = trio.current_time()
         await connection.store.rename(old, new)
@@ -358,8 +364,8 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         tree = here.mount()
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
-            here.connection.scheduler.doubt.raise_it("a copy was late")
-            here.connection.scheduler.doubt.late_copies.saw(0.5, trio.current_time())
+            here.connection.scheduler.server.distrust("a copy was late", reads=True)
+            here.connection.scheduler.server.late_copies.saw(0.5, trio.current_time())
         Latecomer(here, what, after=after, nth=nth, first=first)
         wanted = content(500, 1)
         for number in (2, 3):
@@ -388,8 +394,8 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: 
         tree = here.mount()
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
-            here.connection.scheduler.doubt.raise_it("a copy was late")
-            here.connection.scheduler.doubt.late_copies.saw(0.1, trio.current_time())
+            here.connection.scheduler.server.distrust("a copy was late", reads=True)
+            here.connection.scheduler.server.late_copies.saw(0.1, trio.current_time())
         renames: list[bytes] = []
 
         def is_first(wire: bytes) -> bool:
@@ -411,8 +417,8 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
     async with rig("px4-nuttx", {b"/d/f": content(500, 1), b"/d/g": content(500, 2)}, link=CLEAN) as here:
         tree = here.mount()
         await write_file(tree, b"/d/k", b"x")
-        here.connection.scheduler.doubt.raise_it("a copy was late")
-        here.connection.scheduler.doubt.late_copies.saw(0.1, trio.current_time())
+        here.connection.scheduler.server.distrust("a copy was late", reads=True)
+        here.connection.scheduler.server.late_copies.saw(0.1, trio.current_time())
         await tree.list(b"/d")
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME, first=True)
         await tree.rename(b"/d/g", b"/d/f")
@@ -678,7 +684,7 @@ async def test_in_doubt_a_file_waits_for_its_checksum(told: str) -> None:
     async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
         tree = here.mount(op_deadline=5.0)
         here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
-        here.connection.scheduler.doubt.raise_it("an answer that came twice")
+        here.connection.scheduler.server.distrust("an answer that came twice", reads=True)
 
         def spoil() -> None:
             here.put(here.litter()[0], data[:70_000] + b"?" + data[70_001:])

@@ -216,7 +216,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         assert connection.vehicle.another_client_at is not None
         assert bool(sink.suspicions) is doubted
         await trio.sleep(11)
-        connection.scheduler.doubt.raise_it("once more")
+        connection.scheduler.server.distrust("once more", reads=True)
         assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
 
 

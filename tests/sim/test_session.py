@@ -274,7 +274,7 @@ async def test_an_open_that_plainly_fails_costs_no_silence(may_be_ours: str) -> 
         if may_be_ours == "sent twice":
             here.faults.lose_reply_to(Opcode.OPEN_FILE_RO)
         if may_be_ours == "copies come late":
-            connection.scheduler.doubt.raise_it(may_be_ours)
+            connection.scheduler.server.distrust(may_be_ours, reads=True)
         with pytest.raises(FtpNak):
             await connection.scheduler.server.open(path("ardupilot", "f"))
         opens = here.faults.times(Opcode.OPEN_FILE_RO)

@@ -451,7 +451,7 @@ async def test_what_was_abandoned_during_a_silence_is_not_sent_after_it() -> Non
         here.faults.at(Opcode.CREATE_FILE, lambda: nursery.start_soon(here.connection.driver.be_silent, 3.5))
         nursery.start_soon(upload.finish)
         await trio.sleep(2.0)
-        here.connection.scheduler.server.abandon()
+        here.connection.scheduler.server.leave()
         await trio.sleep(20.0)
         assert source.all_proven
         requests = here.faults.requests
