@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mavftpfs.api.drone import Drone, Entry, NotDelivered, UsageError, connect
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"
 
 __all__ = ["Drone", "Entry", "NotDelivered", "UsageError", "__version__", "connect"]
 

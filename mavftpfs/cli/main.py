@@ -173,7 +173,7 @@ _GONE_FLAGS = {
     ("sync", "--again"): "to fetch a log again, delete LOCAL/.mavftpfs-logs",
     ("get", "--no-resume"): "to fetch a file anew, delete it here first",
 }
-"""Flags that are gone, and harmless: scripts that have them go on to run. Drop the table after 0.3."""
+"""Flags that are gone, and harmless: scripts that have them go on to run. Drop the table after 1.0."""
 
 
 def _without_gone_flags(command: str, words: list[str]) -> list[str]:

@@ -327,7 +327,7 @@ GONE: Mapping[str, Gone] = {
     ),
 }
 """A line of /etc/fstab or a unit of 0.2 goes on to mount: harmless options are ignored or translated, and the
-log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 0.3."""
+log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 1.0."""
 
 
 _NO_BAUD = "option baud is gone, and means nothing here: SOURCE is no serial port"
