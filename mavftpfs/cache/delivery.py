@@ -31,6 +31,7 @@ from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
+    FileBusy,
     FileChanged,
     FtpNak,
     LinkError,
@@ -191,11 +192,8 @@ class Deliverer:
         assert draft is not None
         draft.on(Event.FAILED)
         node.attempt, node.error = None, error
-        if attempt is not None:
-            with trio.CancelScope(shield=True):
-                await attempt.upload.end()  # only its task ends: the link is not waited for
-            if not attempt.in_place and attempt.upload.may_exist:
-                self.parts.append(attempt.path)
+        if attempt is not None and not attempt.in_place and attempt.upload.may_exist:
+            self.parts.append(attempt.path)
         if draft.base is None and draft.sent_in_place:
             self.parts.append(path)
         context.nodes.on_broken(node)
@@ -213,6 +211,8 @@ class Deliverer:
         self._persist(node, draft)
         draft.content.leave_budget()
         self._forget_oldest_parts()
+        if attempt is not None:
+            await attempt.upload.end()
 
     def _forget_oldest_parts(self) -> None:
         """Forget the oldest broken files if they hold more than the spool may, beside the spool."""
@@ -250,8 +250,15 @@ class Deliverer:
         name. Returns whether the vehicle has all of it; None if that is not known, or if another handle
         writes it, too.
         """
+        with suppress(FileBusy):  # else it is just getting its name
+            async with node.claim(self._context.options.op_deadline):
+                return await self._withdraw(node)
+        return None
+
+    async def _withdraw(self, node: Node) -> bool | None:
+        """Take back a file whose lock the caller holds; see `withdraw`."""
         context = self._context
-        async with node.claim(), context.paths.steady(node, lasting=True):
+        async with context.paths.steady(node, lasting=True):
             draft = node.draft
             if draft is None or not (node.undelivered or node.broken):
                 return not node.removed
@@ -376,15 +383,14 @@ class Deliverer:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
         await self._context.store.let_rest(attempt.path)
         crc32 = await self._compare_and_look(node, draft, attempt)
-        node.attempt = None
         try:
-            try:
+            with self._context.store.finishing():
+                node.attempt = None
                 await attempt.upload.end()
-            except BaseException:  # the caller was cancelled: the draft is sent again
-                draft.give_up()
-                raise
+                if not attempt.in_place:
+                    await self._place(node, draft, attempt, crc32)
             if not attempt.in_place:
-                await self._commit(node, draft, attempt, crc32)
+                await self._compare_again(node, draft, attempt, Known(draft.size, crc32=crc32))
         finally:
             self._context.own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
         self._on_delivered(node, draft, crc32)
@@ -405,21 +411,22 @@ class Deliverer:
             self._require_deliverable(draft)
         in_place = traits.rename_works is False  # then it is sent under its own name
         begun_at = context.clock()
+        if in_place:
+            await self._require_untouched(node, draft)
+            await context.store.let_rest(path)
+        else:
+            path = context.own.beside(node.path, Kind.NEW)
         try:
-            if in_place:
-                await self._require_untouched(node, draft)
-            else:
-                path = context.own.beside(node.path, Kind.NEW)
-                context.own.in_use.add(path)
             sending = draft.begin(in_place=in_place, progress=partial(self._throttle.on_acked, draft))
-            upload = await context.store.open_upload(path, sending)
-        except BaseException:
+            upload = context.store.open_upload(path, sending)
+        except MavftpfsError:
             draft.give_up()
-            context.own.in_use.discard(path)
             raise
         attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at)
         if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
+        else:
+            context.own.in_use.add(path)
         return attempt
 
     async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
@@ -467,11 +474,11 @@ class Deliverer:
         ours that was not answered may have made it, and else there is nothing to lose."""
         return self._context.store.traits.rename_works is False and await self._names.size(path) == 0
 
-    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, crc32: int | None) -> None:
+    async def _place(self, node: Node, draft: Draft, attempt: Attempt, crc32: int | None) -> None:
         """Rename what was sent and verified into place. crc32: as the vehicle told it, if it did.
 
         Raises:
-            As Names.rename and replace, and as _compare_again.
+            As Names.rename and replace.
         """
         replacements, path = self._context.replacements, node.path
         sent = Known(draft.size, crc32=crc32)
@@ -483,15 +490,13 @@ class Deliverer:
                 await self._names.rename(attempt.path, path)
             else:
                 await self._names.replace(attempt.path, path)
-        except BaseException as error:
+        except MavftpfsError as error:
             draft.on(Event.NOT_PLACED)
-            unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-            if unknown or replacements.is_unfinished(path):
+            if isinstance(error, OutcomeUnknown) or replacements.is_unfinished(path):
                 replacements.on_interrupted(path).sent = sent
             else:
                 await self._names.discard(attempt.path)
             raise
-        await self._compare_again(node, draft, attempt, sent)
 
     async def _compare_again(self, node: Node, draft: Draft, attempt: Attempt, sent: Known) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.

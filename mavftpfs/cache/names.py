@@ -21,8 +21,6 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-import trio
-
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.replacements import Replacement
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
@@ -269,7 +267,7 @@ class Names:
             if reserved.target in (name, None):
                 try:
                     await self.remove_if_there(left)
-                except BaseException:
+                except MavftpfsError:
                     if ended is not None:
                         self._context.replacements.put(path, ended)
                     raise
@@ -314,12 +312,13 @@ class Names:
         aside = own.beside(target, Kind.OLD)
         own.in_use.add(aside)
         stays = False
-        try:
-            if await self._swap(source, target, aside):
-                stays = await self._discard_old(target, aside)
-        finally:
-            if not stays:
-                own.in_use.discard(aside)
+        with self._context.store.finishing():
+            try:
+                if await self._swap(source, target, aside):
+                    stays = await self._discard_old(target, aside)
+            finally:
+                if not stays:
+                    own.in_use.discard(aside)
 
     def on_unknown(self, *paths: bytes) -> None:
         """Note that it is not known what these names are after an interrupted change: the listings and files
@@ -348,7 +347,7 @@ class Names:
                     raise
                 moved = False
             await self.rename(source, target, completes=moved)
-        except (OutcomeUnknown, trio.Cancelled):
+        except OutcomeUnknown:
             if moved is not False:
                 self._note_unfinished(target, aside, placed=None if moved else False)
             raise
@@ -388,17 +387,15 @@ class Names:
         try:
             with self._context.directories.changing(*paths):
                 yield
-        except (OutcomeUnknown, trio.Cancelled):
+        except OutcomeUnknown:
             self.on_unknown(*paths)
             raise
 
     async def _undo(self, place: bytes, path: bytes) -> None:
         try:
             await self.rename(place, path, completes=True)
-        except BaseException as error:
+        except MavftpfsError as error:
             self._note_unfinished(path, place, placed=False)
-            if not isinstance(error, MavftpfsError):
-                raise
             log.debug("%r did not get its file back: %s", path, error)
 
 

@@ -93,11 +93,16 @@ class Namespace:
 
     @asynccontextmanager
     async def _claim(self, path: bytes) -> AsyncIterator[None]:
-        """Claim the file of a path, if it is open or not delivered, for a body that takes its name away."""
+        """Claim the file of a path, if it is open or not delivered, for a body that takes its name away.
+
+        Raises:
+            FileBusy: see Node.claim.
+        """
         nodes = self._context.nodes
         node = nodes.get(path)
         try:
-            async with nullcontext() if node is None else node.claim():
+            patience = self._context.options.op_deadline
+            async with nullcontext() if node is None else node.claim(patience):
                 yield
         finally:
             if node is not None:
@@ -112,7 +117,7 @@ class Namespace:
         try:
             yield
             context.nodes.on_gone(paths[0])
-        except (OutcomeUnknown, trio.Cancelled):  # perhaps it was done, and what follows it was not
+        except OutcomeUnknown:  # perhaps it was done, and what follows it was not
             self._names.on_unknown(*paths)
             for node in [n for path in paths for n in context.nodes.below(path)]:
                 if node.undelivered and node.draft is not None:

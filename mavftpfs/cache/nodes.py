@@ -19,7 +19,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.shared.errors import FileChanged, MavftpfsError, WriteFailed
+from mavftpfs.shared.errors import FileBusy, FileChanged, MavftpfsError, WriteFailed
 from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import SendBuffer
@@ -101,15 +101,23 @@ class Node:
         return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
 
     @asynccontextmanager
-    async def claim(self) -> AsyncIterator[None]:
-        """Have the lock for a body that takes the name or the content away. A delivery under way is
-        cancelled, and its caller begins it again later. If it was giving the file its name, the replacement
-        is unfinished then."""
+    async def claim(self, patience: float) -> AsyncIterator[None]:
+        """Hold the lock for a body that takes the name or the content away.
+
+        A delivery under way is cancelled, and its caller begins it again later. Exception: once the delivery
+        has begun to change the name, it is waited for.
+
+        Raises:
+            FileBusy: it did not end within `patience` seconds.
+        """
         self.claims += 1
         try:
             if self.delivery is not None:
                 self.delivery.cancel()
-            await self.lock.acquire()
+            with trio.move_on_after(patience) as scope:
+                await self.lock.acquire()
+            if scope.cancelled_caught:
+                raise FileBusy(f"{self.path!r} is just getting its name on the vehicle")
         finally:
             self.claims -= 1
         try:

@@ -6,6 +6,7 @@ All paths are normalised mount paths (shared.model). All calls raise only Mavftp
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from math import inf
 from typing import Protocol
 
@@ -208,9 +209,9 @@ class VehicleStore(RemoteStore, Protocol):
         """
         ...
 
-    async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
-        """Make a file by CreateFile and write it. Sends nothing before the source has something, or
-        `finish` is called.
+    def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
+        """Make a file by CreateFile and write it, in a task of its own. Sends nothing before the source has
+        something, or `finish` is called. The caller had the name rest (`let_rest`), unless it is new.
 
         `path` is a reserved name, or, on cards that cannot rename, the file's own: it is free, or has the
         file that is to be replaced. An upload that was interrupted goes on by OpenFileWO where that was seen
@@ -221,6 +222,19 @@ class VehicleStore(RemoteStore, Protocol):
     async def let_rest(self, path: bytes) -> None:
         """Wait until no late copy of a request can harm the next file of this name. Returns at once, unless
         copies were seen to come late, or we repeated such a request (session.doubt: LateCopies)."""
+        ...
+
+    def finishing(self) -> AbstractContextManager[None]:
+        """Finish the body, which changes names, even if its caller is cancelled. Each request below that
+        changes a name is finished like that once it begins.
+
+        Raises:
+            OutcomeUnknown: it was ended by `hurry`.
+        """
+        ...
+
+    def hurry(self) -> None:
+        """End all changes that have begun within some seconds: the process is to end."""
         ...
 
     async def create_empty(self, path: bytes) -> None:

@@ -246,7 +246,8 @@ class WriteFile(ReadFile):
                 await self._have_room(size)
             except MavftpfsError as error:
                 refused = error
-        async with node.claim() if empties else node.lock:
+        patience = self._context.options.op_deadline
+        async with node.claim(patience) if empties else node.lock:
             try:
                 node.require_not_broken()
                 if refused is not None:

@@ -65,12 +65,14 @@ class SingleMount(Life):
         self._attach = attach
         self._loop = FuseLoop()
         self._status: Callable[[], Mapping[str, Any]] = dict
+        self._attached: Attached | None = None
 
     async def serve(self, nursery: trio.Nursery) -> None:
         """See Life.serve."""
         inodes = InodeTable()
         invalidator = Invalidator(inodes)
         async with self._attach(invalidator.on_changed) as vehicle, self._goodbye(vehicle.tree):
+            self._attached = vehicle
             nursery.start_soon(vehicle.watcher.run)
             operations = Operations(
                 vehicle.tree,
@@ -133,6 +135,8 @@ class SingleMount(Life):
 
     def hurry(self) -> None:
         """See Life.hurry."""
+        if self._attached is not None:
+            self._attached.connection.store.hurry()
         self.stop()
 
     def status(self) -> Mapping[str, Any]:

@@ -9,8 +9,8 @@ requests came late, names rest between two changes (LateCopies). Only `let_rest`
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from enum import Enum
 from functools import partial
 from math import inf
@@ -69,6 +69,9 @@ CRC_TIME = 5.0
 
 COPY_RATE = 100_000.0
 """Bytes per second that the slowest card checksums; the question is not repeated before."""
+
+HURRY = 3.0
+"""Seconds that changes which have begun still get once the process is told to end at once."""
 
 VERIFY_LIMIT = 4.0
 """Seconds to spend on finding out what became of a request that was not answered. The caller was promised an
@@ -129,6 +132,8 @@ class Store:
         self._sent = 0
         self._under_way = 0
         self._late_copies = scheduler.server.late_copies
+        self._finishing: set[trio.CancelScope] = set()
+        self._hurry_until = inf
 
     @property
     def epoch(self) -> int:
@@ -309,11 +314,10 @@ class Store:
             transfer.finish()
             driver.cancel(transfer)
 
-    async def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
+    def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.let_rest(path)
         upload = Upload(path, source, self._scheduler)
         self._scheduler.add(upload, upload.run)
         return upload
@@ -363,28 +367,53 @@ class Store:
         if old.lower() != new.lower():
             self._late_copies.on_placed(new)
 
+    @contextmanager
+    def finishing(self, *, until: float = inf) -> Iterator[None]:
+        """See VehicleStore; until: when the body ends at the latest, by trio's clock."""
+        with trio.CancelScope(shield=True, deadline=min(until, self._hurry_until)) as scope:
+            self._finishing.add(scope)
+            try:
+                yield
+            finally:
+                self._finishing.discard(scope)
+        if scope.cancelled_caught:
+            raise OutcomeUnknown("the vehicle did not get round to it in time")
+
+    def hurry(self) -> None:
+        """See VehicleStore."""
+        self._hurry_until = trio.current_time() + HURRY
+        for scope in self._finishing:
+            scope.deadline = min(scope.deadline, self._hurry_until)
+
     @asynccontextmanager
     async def _changing(
         self, *paths: bytes, below: bool = False, in_flight: bool = False, at_once: bool = False
     ) -> AsyncIterator[None]:
-        """Check that writing is allowed now, and keep our own session off the paths.
+        """Check that writing is allowed now, and keep our own session off the paths. The body sends the
+        request: once begun, it is finished.
 
         below: also off all that lies below the first. in_flight: armed or not. at_once: no name rests before.
+
+        Raises:
+            RequestTimeout: the body did not begin in time.
         """
         self._vehicle.require(self._clock(), writing=not in_flight)
-        with trio.move_on_after(self._op_deadline + MOST_REST + VERIFY_LIMIT) as scope:
+        until = trio.current_time() + self._op_deadline + MOST_REST + VERIFY_LIMIT
+        with trio.CancelScope(deadline=until) as scope:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
                     await self.let_rest(path)
                 # closing our session may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
-                try:
-                    yield
-                finally:
-                    for path in paths:
-                        self._late_copies.on_changed(path, self._clock())
+                with self.finishing(until=until):
+                    try:
+                        yield
+                    finally:
+                        for path in paths:
+                            self._late_copies.on_changed(path, self._clock())
+                    return
         if scope.cancelled_caught:
-            raise OutcomeUnknown("the vehicle did not get round to it in time")
+            raise RequestTimeout("the vehicle did not get round to it in time")
 
     # --- did that change happen?
 

@@ -237,7 +237,7 @@ async def test_of_two_uploads_none_waits_for_ever() -> None:
     async with here.connected(seed=1) as connection:
         connection.store.traits.wo_truncates = False
         for number, source in enumerate(sources):
-            (await connection.store.open_upload(here.root + b"/d/%d" % number, source)).wake()
+            (connection.store.open_upload(here.root + b"/d/%d" % number, source)).wake()
         here.nursery.start_soon(read_now_and_then, here, rng)
         for _ in range(3):
             before = [source.proven.total for source in sources]
@@ -331,7 +331,7 @@ async def test_outside_the_whitelist_stays_refused() -> None:
     here = Rig("px4-nuttx", {b"/d": None})
     here.card.add_directory(b"/etc")
     async with here.connected() as connection:
-        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
+        upload = connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)

@@ -43,7 +43,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(profile: str) -> No
     async with here.connected() as connection:
         know(connection, profile)
         source = MemorySource(bytes(300_000))
-        upload = await connection.store.open_upload(path(profile, "file"), source)
+        upload = connection.store.open_upload(path(profile, "file"), source)
         await trio.sleep(1)
         await connection.store.remove(path(profile, "file"))
         assert not source.todo.empty  # it did not wait for the upload's end

@@ -18,14 +18,17 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.store import HURRY
 from mavftpfs.session.upload import Upload
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
+    FileBusy,
     FileChanged,
     FileTooLarge,
     FtpNak,
     NotSupported,
+    OutcomeUnknown,
     RequestTimeout,
     VehicleLost,
     VerificationFailed,
@@ -68,10 +71,9 @@ async def test_a_new_file_gets_its_name_when_it_is_whole(each: Rig, data: bytes)
 
 
 @pytest.mark.holds("promise 3")
-async def test_a_caller_that_is_cancelled_after_the_last_byte_leaves_a_file_that_can_be_sent(
+async def test_a_change_of_a_name_that_began_is_finished_though_its_caller_is_cancelled(
     each: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between what was compared and its rename, or the end of a delivery that needs none."""
     tree, end = each.mount(), Upload.end
     await write_file(tree, b"/d/first", NEW)  # shows whether the card can rename
     file = await tree.create(FRESH, exclusive=True)
@@ -85,10 +87,52 @@ async def test_a_caller_that_is_cancelled_after_the_last_byte_leaves_a_file_that
         monkeypatch.setattr(Upload, "end", cancelled)
         await file.flush()
     monkeypatch.undo()
-    assert caller.cancelled_caught
-    await file.flush()
-    await file.release()
     assert each.data(FRESH) == NEW
+    assert tree.undelivered() == []
+    await file.release()
+
+
+@pytest.mark.holds("promise 4")
+async def test_a_removal_waits_for_a_change_of_the_name_and_then_gives_up(
+    each: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree, end, ended = each.mount(op_deadline=8.0), Upload.end, trio.Event()
+
+    async def slow(upload: Upload) -> None:
+        await ended.wait()
+        await end(upload)
+
+    monkeypatch.setattr(Upload, "end", slow)
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, NEW)
+    each.nursery.start_soon(file.flush)
+    await trio.sleep(5.0)
+    began = trio.current_time()
+    with pytest.raises(FileBusy):
+        await tree.unlink(FRESH)
+    assert trio.current_time() - began == pytest.approx(8.0)
+    ended.set()
+    await tree.unlink(FRESH)
+    assert FRESH not in each.files()
+    await file.release()
+
+
+@pytest.mark.holds("promise 4")
+async def test_a_second_signal_ends_a_change_of_a_name_that_gets_no_answer(fat: Rig) -> None:
+    tree = fat.mount()
+    fat.faults.at(Opcode.RENAME, lambda *_: fat.link.cut())
+    with trio.CancelScope() as caller:
+        fat.nursery.start_soon(_hurry, fat, caller)
+        with pytest.raises(OutcomeUnknown):
+            await write_file(tree, FILE, NEW)
+    assert trio.current_time() == pytest.approx(5.0 + HURRY, abs=0.5)
+    assert tree.undelivered() == [FILE], "it is kept"
+
+
+async def _hurry(here: Rig, caller: trio.CancelScope) -> None:
+    await trio.sleep_until(5.0)
+    caller.cancel()
+    here.connection.store.hurry()
 
 
 async def test_whether_the_card_can_rename_is_found_out_once(each: Rig) -> None:

@@ -92,7 +92,7 @@ class Copy:
         connection.store.traits.wo_truncates = not self.keeps  # as the probe found out
         source = MemorySource(self.data)
         target = self.root + b"/new"
-        upload = await connection.store.open_upload(target, source)
+        upload = connection.store.open_upload(target, source)
         upload.wake()
         for _ in range(2):
             await connection.store.list_directory(self.root)
@@ -197,7 +197,7 @@ async def test_an_upload_goes_on_beside_endless_small_reads(profile: str, link: 
     async with copy.rig.connected() as connection, trio.open_nursery() as nursery:
         connection.store.traits.wo_truncates = False
         source = MemorySource(copy.data)
-        upload = await connection.store.open_upload(root + b"/new", source)
+        upload = connection.store.open_upload(root + b"/new", source)
         upload.wake()
 
         async def read_for_ever() -> None:

@@ -229,7 +229,7 @@ async def test_never_more_is_written_than_a_short_queue_holds(profile: str) -> N
     here.card.add_directory(b"/d")
     source = MemorySource(bytes(range(256)) * 400)
     async with here.connected() as connection:
-        upload = await connection.store.open_upload(b"/d/f", source)
+        upload = connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         await upload.end()
     assert here.card.data(b"/d/f") == source.content

@@ -158,13 +158,14 @@ def know(connection: Connection, profile: str) -> None:
 
 
 async def start(connection: Connection, profile: str, source: MemorySource, name: str = "new") -> Upload:
-    return await connection.store.open_upload(path(profile, name), source)
+    return connection.store.open_upload(path(profile, name), source)
 
 
 async def put(connection: Connection, target: bytes, data: bytes) -> None:
     """Upload a whole file."""
     source = MemorySource(data)
-    upload = await connection.store.open_upload(target, source)
+    await connection.store.let_rest(target)
+    upload = connection.store.open_upload(target, source)
     await upload.finish()
     assert source.all_proven
     await upload.end()
