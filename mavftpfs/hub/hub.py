@@ -13,13 +13,13 @@ import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import trio
 
 from mavftpfs.hub.inlet import Inlet
 from mavftpfs.hub.outbox import Line, Outbox, Waiting
-from mavftpfs.hub.routing import BEATS, Kind, Router
+from mavftpfs.hub.routing import ALL, BEATS, Kind, Router
 from mavftpfs.hub.senders import PORT, Place
 from mavftpfs.link.addresses import NetAddress, readable_address
 from mavftpfs.link.base import Link
@@ -27,14 +27,10 @@ from mavftpfs.link.frames import Frame
 from mavftpfs.link.hublink import (
     PROTOCOL,
     Facts,
-    as_address,
     hear,
-    make_tag,
-    pack_facts,
     pack_frames,
     set_buffers,
     tell,
-    unpack_facts,
     unpack_frames,
 )
 from mavftpfs.link.messages import Address
@@ -69,10 +65,13 @@ _OTHERS = (
 )
 
 
+Sent: TypeAlias = tuple[Place, Frame, NetAddress | None]
+"""A frame, the place that it came from, and the address of the port that a client sends it to."""
+
+
 @dataclass(slots=True)
 class _Client:
-    """A program of ours. number: the link id of its signatures. forward: the endpoints that it asked for.
-    is_in: it was told that it is let in, which is the first that it hears."""
+    """A program of ours. number: the link id of its signatures. forward: the endpoints that it asked for."""
 
     side: int
     sock: socket.socket
@@ -80,11 +79,11 @@ class _Client:
     number: int
     name: str
     forward: tuple[str, ...]
-    is_in: bool = False
 
-    def send(self, messages: Sequence[bytes]) -> None:
-        """Send messages. It loses those for which its socket is full, as on a port of its own."""
-        for message in messages if self.is_in else ():
+    def send(self, frames: Sequence[bytes], origin: NetAddress | None = None) -> None:
+        """Send frames that came from an address of the port; none mean that the port was reopened. The client
+        loses those for which its socket is full, as on a port of its own."""
+        for message in pack_frames(frames, origin):
             try:
                 self.sock.send(message)
             except BlockingIOError:
@@ -104,13 +103,6 @@ class _Endpoint:
     scope: trio.CancelScope = field(default_factory=trio.CancelScope)
     link: Link | None = None
     problem: str = ""
-
-    def send(self, address: NetAddress | None, frames: Sequence[bytes]) -> None:
-        """Send frames to one of its addresses."""
-        if self.link is not None:
-            if address is not None:
-                self.link.answer(address)
-            self.link.send_nowait(frames)
 
 
 class Hub:
@@ -208,10 +200,7 @@ class Hub:
             tell(sock, {"refused": str(exc)})
             return None
         tell(sock, {"own": client.own, "number": client.number})
-        client.is_in = True
-        self.router.add(client.side, Kind.CLIENT, fixed=True)
-        if hello.get("beats"):
-            self.router.focus(client.side, BEATS)
+        self.router.add(client.side, Kind.CLIENT, focus=BEATS if hello.get("beats") else ALL)
         log.info("%s joined as %d/%d", client.name or "a client", *client.own)
         return client
 
@@ -260,8 +249,7 @@ class Hub:
 
     def _forget(self, client: _Client) -> None:
         del self._clients[client.side]
-        if client.is_in:
-            self.router.remove(client.side)
+        self.router.remove(client.side)
         self._end_if_done()
 
     async def _serve(self, client: _Client) -> None:
@@ -277,31 +265,18 @@ class Hub:
         inlet = Inlet(client.side, stream=False)
         while True:
             await trio.lowlevel.wait_readable(client.sock)
-            frames: list[tuple[Place, Frame]] = []
-            ended = False
+            frames: list[Sent] = []
             for _ in range(_MESSAGES):
                 try:
                     message = client.sock.recv(_LARGEST)
                 except BlockingIOError:
                     break
                 if not message:
-                    ended = True
-                    break
-                facts = unpack_facts(message)
-                if facts is not None:
-                    self._on_wish(client, facts)
-                else:
-                    frames += inlet.feed(unpack_frames(message)[1], None)
+                    self._pass_on(frames)
+                    return
+                data, to = unpack_frames(message)
+                frames += [(place, frame, to) for place, frame in inlet.feed(data, None)]
             self._pass_on(frames)
-            if ended:
-                return
-
-    def _on_wish(self, client: _Client, facts: Facts) -> None:
-        if type(facts.get("focus")) is int:
-            self.router.focus(client.side, facts["focus"])
-        address = as_address(facts.get("answer"))
-        if address is not None:
-            self.router.answer(client.side, address)
 
     # -- endpoints
 
@@ -357,32 +332,28 @@ class Hub:
     async def _read(self, side: int, link: Link) -> None:
         """Pass on what comes from the port or an endpoint."""
         inlet = Inlet(side, stream=link.is_stream)
+        address: NetAddress | None = None
         while True:
-            pieces: list[bytes] | None = None
-            with trio.move_on_after(QUIET if inlet.waiting else float("inf")):
-                pieces = await link.receive()
-            frames: list[tuple[Place, Frame]] = []
-            if pieces is None:
-                frames = inlet.on_silence(link.sender(-1))
-            elif not pieces:
-                inlet.reset()
-                self._tell_reopened(side)
-            for index, piece in enumerate(pieces or ()):
-                frames += inlet.feed(piece, link.sender(index))
-            self._pass_on(frames)
+            found: list[tuple[Place, Frame]] = []
+            with trio.move_on_after(QUIET if inlet.waiting else float("inf")) as scope:
+                for data, address in await link.receive():
+                    if data:
+                        found += inlet.feed(data, address)
+                        continue
+                    inlet.reset()
+                    for client in self._clients.values() if side == PORT else ():
+                        client.send(())
+            if scope.cancelled_caught:
+                found = inlet.on_silence(address)
+            self._pass_on([(place, frame, None) for place, frame in found])
 
-    def _tell_reopened(self, side: int) -> None:
-        if side == PORT:
-            for client in self._clients.values():
-                client.send([pack_facts({"reopened": True})])
-
-    def _pass_on(self, frames: Sequence[tuple[Place, Frame]]) -> None:
+    def _pass_on(self, frames: Sequence[Sent]) -> None:
         """Route frames that came together, and send each destination its share at once."""
         now = trio.current_time()
         shares: dict[tuple[Place, NetAddress | None], list[bytes]] = {}
         route, push, waiting = self.router.route, self._outbox.push, False
-        for place, frame in frames:
-            for target in route(frame, place, now):
+        for place, frame, to in frames:
+            for target in route(frame, place, now, to):
                 if target.side == PORT:
                     push(place.side, Waiting(target, frame.data))
                     waiting = True
@@ -397,11 +368,10 @@ class Hub:
     def _deliver(self, target: Place, origin: NetAddress | None, frames: Sequence[bytes]) -> None:
         client = self._clients.get(target.side)
         if client is not None:
-            client.send(pack_frames(frames, make_tag(origin)))
-            return
+            client.send(frames, origin)
         for endpoint in self._endpoints.values():
-            if endpoint.side == target.side:
-                endpoint.send(target.address, frames)
+            if endpoint.side == target.side and endpoint.link is not None:
+                endpoint.link.send(frames, target.address)
 
     # -- out over the port
 
@@ -410,25 +380,19 @@ class Hub:
         outbox, port, line = self._outbox, self._port, self._line
         assert port is not None
         batch: list[bytes] = []
-        target: Place | None = None
+        address: NetAddress | None = None
         while outbox and not port.backlog and line.ready_at() <= now:
             place, frame = outbox.pop()
-            if place != target and batch:
-                self._send_out(target, batch)
+            if place.address != address and batch:
+                port.send(batch, address)
                 batch = []
-            target = place
+            address = place.address
             batch.append(frame)
             line.sent(len(frame), now)
         if batch:
-            self._send_out(target, batch)
+            port.send(batch, address)
         if outbox:
             self._work.set()
-
-    def _send_out(self, target: Place | None, frames: list[bytes]) -> None:
-        assert self._port is not None
-        if target is not None and target.address is not None:
-            self._port.answer(target.address)
-        self._port.send_nowait(frames)
 
     async def _write(self) -> None:
         """Send what had to wait for the line."""

@@ -5,9 +5,10 @@ programs of ours. Only a frame that `senders` believes goes anywhere.
 
 - A frame with a target goes where the target is. A frame for all, or for a target that was never heard, goes
   to all places of the port and of the endpoints. No frame goes to a side where its sender is.
-- A client's frames go to the address of its vehicle. Before it has one they go by the same rule, but to the
-  port alone.
-- A client gets all of its vehicle, FTP with its vehicle, and the heartbeats of others. `_concerns` says it.
+- A client's frames go to the address that it names, if somebody was heard there. Else they go by the same
+  rule, but to the port alone.
+- The vehicle of a client is the target that its frames named last. A client gets all of its vehicle, FTP with
+  its vehicle, and the heartbeats of others. `_concerns` says it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mavftpfs.link.frames import EVERYBODY, HEARTBEAT_ID, Frame, armed_by
 from mavftpfs.link.messages import Address
 
 ALL = 0
-"""The focus of a client that does not know its vehicle yet."""
+"""The focus of a client that named no vehicle yet."""
 BEATS = -1
 """The focus of a client that wants only heartbeats."""
 
@@ -40,13 +41,11 @@ class Kind(Enum):
 
 @dataclass(slots=True)
 class _Side:
-    """fixed: all frames go there to one address. focus: the system that concerns a client. answers: the
-    address of a client's vehicle."""
+    """fixed: all frames go there to one address. focus: the system that concerns a client."""
 
     kind: Kind
     fixed: bool
     focus: int = ALL
-    answers: NetAddress | None = None
 
 
 class Router:
@@ -61,35 +60,28 @@ class Router:
         self.senders = Senders()
         self.armed: dict[int, bool] = {}
         self._sides: dict[int, _Side] = {}
-        self._plans: dict[tuple[Place, Address, Address, bool], tuple[Place, ...]] = {}
+        self._plans: dict[tuple[Place, Address, Address, bool, NetAddress | None], tuple[Place, ...]] = {}
 
     # -- sides
 
-    def add(self, side: int, kind: Kind, *, fixed: bool) -> None:
-        """Add a side. fixed: its frames have one way out, whatever the address."""
-        self._sides[side] = _Side(kind, fixed)
+    def add(self, side: int, kind: Kind, *, fixed: bool = True, focus: int = ALL) -> None:
+        """Add a side. fixed: its frames have one way out, whatever the address. focus: ALL, or BEATS."""
+        self._sides[side] = _Side(kind, fixed, focus)
         self._plans.clear()
 
     def remove(self, side: int) -> None:
-        """Forget a side, and what was heard there."""
-        del self._sides[side]
+        """Forget a side, if it is known, and what was heard there."""
+        self._sides.pop(side, None)
         self.senders.remove(side)
-        self._plans.clear()
-
-    def focus(self, side: int, system: int) -> None:
-        """Only one system concerns a client from now on, or ALL, or BEATS."""
-        self._sides[side].focus = system
-        self._plans.clear()
-
-    def answer(self, side: int, address: NetAddress | None) -> None:
-        """Note the address of a client's vehicle."""
-        self._sides[side].answers = address
         self._plans.clear()
 
     # -- frames
 
-    def route(self, frame: Frame, place: Place, now: float) -> tuple[Place, ...]:
-        """Return where a frame goes that came from a place; nowhere if it is not believed."""
+    def route(
+        self, frame: Frame, place: Place, now: float, to: NetAddress | None = None
+    ) -> tuple[Place, ...]:
+        """Return where a frame goes that came from a place; nowhere if it is not believed. to: the address of
+        the port that a client named."""
         belief = self.senders.judge(frame.source, place, now, proven=frame.crc_fits)
         if belief is Belief.REFUSED:
             return ()
@@ -100,25 +92,32 @@ class Router:
             self._plans.clear()
         if frame.id == HEARTBEAT_ID:  # where it goes depends on what it says
             self._note_armed(frame, place)
-            return (*self._out(frame, place), *self._to_clients(frame, place))
-        key = (place, frame.source, frame.target, frame.id == FTP_MESSAGE_ID)
+            return (*self._out(frame, place, to), *self._to_clients(frame, place))
+        self._note_focus(frame, place)
+        key = (place, frame.source, frame.target, frame.id == FTP_MESSAGE_ID, to)
         plan = self._plans.get(key)
         if plan is None:
             if len(self._plans) >= _MOST_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = (*self._out(frame, place), *self._to_clients(frame, place))
+            plan = self._plans[key] = (*self._out(frame, place, to), *self._to_clients(frame, place))
         return plan
+
+    def _note_focus(self, frame: Frame, place: Place) -> None:
+        side, system = self._sides[place.side], frame.target.system
+        if side.kind is Kind.CLIENT and side.focus not in (BEATS, system) and system:
+            side.focus = system
+            self._plans.clear()
 
     def _note_armed(self, frame: Frame, place: Place) -> None:
         armed = armed_by(frame) if place.side == PORT and frame.crc_fits else None
         if armed is not None:
             self.armed[frame.source.system] = armed
 
-    def _out(self, frame: Frame, place: Place) -> list[Place]:
+    def _out(self, frame: Frame, place: Place, to: NetAddress | None) -> list[Place]:
         """Return the places on the port and at endpoints that a frame goes to."""
         origin = self._sides[place.side]
-        if origin.answers is not None:
-            return [self._way_to(Place(PORT, origin.answers))]
+        if to is not None and Place(PORT, to) in self.senders.places_at(PORT):
+            return [self._way_to(Place(PORT, to))]
         if origin.kind is Kind.CLIENT:
             sides = {PORT}
         else:

@@ -1,7 +1,7 @@
-"""What a link is to the layers above, and what links have in common. Layer: link.
+"""What a link is to the layers above, and what links over a descriptor have in common. Layer: link.
 
 A link moves bytes and does not interpret them. When a peer goes away and comes back, the link reopens by
-itself and counts it. LinkClosed means that it will never work again.
+itself and says so. LinkClosed means that it will never work again.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import trio
 
@@ -21,6 +21,12 @@ from mavftpfs.shared.errors import LinkClosed
 
 MAX_DATAGRAM = 1400
 """Bytes: below any usual MTU, and far below PX4's receive buffer (31 frames in one datagram were cut)."""
+
+Piece: TypeAlias = tuple[bytes, NetAddress | None]
+"""What arrived together, and the address that sent it; None where there is only one sender."""
+
+REOPENED: Piece = (b"", None)
+"""The piece that says: the link was reopened, so the rest of a half-received frame does not come."""
 
 
 @dataclass(slots=True)
@@ -36,8 +42,8 @@ class LinkStats:
 
 @dataclass(frozen=True, slots=True)
 class Seat:
-    """Our place on a shared port: our MAVLink address there, and the link id in our signatures, which keeps
-    their times apart from those of others."""
+    """This program's place on a shared port: its MAVLink address there, and the link id in its signatures,
+    which keeps their times apart from those of other programs."""
 
     own: Address
     number: int
@@ -47,7 +53,7 @@ class Link(Protocol):
     """A byte or datagram pipe.
 
     Attributes:
-        seat: our place on a shared port, None on a port of our own. It may change when the link is reopened.
+        seat: the place on a shared port, None on a port of our own. It may change when the link is reopened.
     """
 
     stats: LinkStats
@@ -70,37 +76,24 @@ class Link(Protocol):
 
     @property
     def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        """Bytes accepted by `send` and not yet handed to the kernel."""
         ...
 
-    async def receive(self) -> list[bytes]:
-        """Wait for input and return 1..256 pieces, draining what is there.
-
-        Returns an empty list when the link was reopened (the caller resets its parser).
+    async def receive(self) -> list[Piece]:
+        """Wait for input and return 1..256 pieces, with all that is there.
 
         Raises:
             LinkClosed: the link will never work again (aclose was called).
         """
         ...
 
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """Send whole MAVLink frames, several to a datagram or write where they fit in 1400 bytes.
 
-        Never blocks and never raises for a full or absent peer: what cannot be kept within a
-        bounded backlog is dropped and counted, as a radio would.
+        to: an address that `receive` returned. None: the only peer; where there may be several, the one that
+        was heard last. Never blocks, and never raises for a full or absent peer: what cannot be kept within
+        a bounded backlog is dropped and counted, as a radio would.
         """
-        ...
-
-    def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a piece that `receive` returned last; None where there is only one sender."""
-        ...
-
-    def answer(self, address: NetAddress) -> None:
-        """From now on send to this address. Only a link that hears several senders has a choice."""
-        ...
-
-    def focus(self, system: int) -> None:
-        """From now on only one system matters: a shared port leaves out frames that concern only others."""
         ...
 
     async def aclose(self) -> None:
@@ -137,151 +130,121 @@ def pack(frames: Sequence[bytes]) -> Iterable[bytes]:
         yield b"".join(batch)
 
 
-class Outbox:
-    """What a link has accepted and the kernel has not: first in, first out, with a limit on the sum.
+class Pipe(Protocol):
+    """A socket or a serial port, open and non-blocking."""
 
-    What does not fit is refused whole, so that a stream is never cut inside a frame.
-    """
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        ...
 
-    def __init__(self, limit: int) -> None:
-        self.size = 0
-        self._limit = limit
-        self._items: deque[bytes] = deque()
-
-    def offer(self, item: bytes, *, force: bool = False) -> bool:
-        """Append an item; return False, changing nothing, where it does not fit and is not forced."""
-        if not force and self.size + len(item) > self._limit:
-            return False
-        self._items.append(item)
-        self.size += len(item)
-        return True
-
-    def head(self) -> bytes | None:
-        """Return the oldest item."""
-        return self._items[0] if self._items else None
-
-    def advance(self, sent: int) -> None:
-        """Drop the first `sent` bytes of the oldest item."""
-        item = self._items.popleft()
-        self.size -= sent
-        if sent < len(item):
-            self._items.appendleft(item[sent:])
-
-    def clear(self) -> int:
-        """Drop everything; return how many items that were."""
-        count = len(self._items)
-        self._items.clear()
-        self.size = 0
-        return count
+    def close(self) -> None:
+        """Close it; harmless twice."""
+        ...
 
 
-class DescriptorLink:
-    """What links over a descriptor have in common: they wait for it, and keep what the kernel does not take.
+class PipeLink:
+    """A link over a descriptor: waits for it, and keeps what the kernel does not take.
 
     Args:
-        outbox_limit: bytes to keep for a slow peer.
+        pipe: None where it is opened later.
+        outbox_limit: bytes to keep for a slow peer. What does not fit is dropped whole, so that a stream is
+            never cut inside a frame.
+
+    Attributes:
+        backlog: see Link.
     """
 
     is_stream = False
     is_serial = False
 
-    def __init__(self, description: str, outbox_limit: int) -> None:
+    def __init__(self, description: str, pipe: Pipe | None, outbox_limit: int) -> None:
         self.stats = LinkStats()
         self.seat: Seat | None = None
         self.description = description
-        self._outbox = Outbox(outbox_limit)
-        self._work = trio.Event()
+        self.backlog = 0
+        self._pipe = pipe
         self._closed = False
+        self._limit = outbox_limit
+        self._outbox: deque[Piece] = deque()
+        self._changed = trio.lowlevel.ParkingLot()  # what waits, or whether there is a pipe
 
-    @property
-    def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
-        return self._outbox.size
-
-    async def receive(self) -> list[bytes]:
+    async def receive(self) -> list[Piece]:
         """See Link."""
         await trio.lowlevel.checkpoint_if_cancelled()
         waited = False
         while not self._closed:
-            pieces = self._drain()
-            if pieces is not None:
+            pieces = self._take()
+            if pieces:
                 if not waited:  # one checkpoint per batch, and none where data could be lost
                     await trio.lowlevel.cancel_shielded_checkpoint()
+                self.stats.received_bytes += sum(len(data) for data, _ in pieces)
                 return pieces
-            if self._closed:
-                break
             waited = True
-            with suppress(trio.ClosedResourceError, OSError):  # closed or replaced meanwhile; look again
-                await self._wait_readable()
+            if not self._closed:
+                await self._until(trio.lowlevel.wait_readable)
         raise LinkClosed(f"{self.description} is closed")
 
-    def answer(self, address: NetAddress) -> None:
-        """Nothing to choose."""
-
-    def focus(self, system: int) -> None:
-        """Nothing to leave out."""
-
-    async def run_writer(self) -> None:
+    async def run(self) -> None:
         """Send what had to wait for the kernel; runs until cancelled."""
         while True:
-            await self._work.wait()
-            self._work = trio.Event()
-            while not self._closed and (item := self._outbox.head()) is not None:
-                taken = self._write(item)
-                if taken and self._outbox.head() is item:  # a pipe that broke has emptied the outbox
-                    self._outbox.advance(taken)
-                if taken < len(item):
-                    with suppress(trio.ClosedResourceError, OSError):
-                        await self._wait_writable()
+            if not self._outbox:
+                await self._changed.park()
+                continue
+            taken = self._write(*self._outbox[0])
+            if not self._outbox:
+                continue  # the pipe broke
+            data, to = self._outbox.popleft()
+            self.backlog -= taken
+            if taken < len(data):
+                self._outbox.appendleft((data[taken:], to))
+                await self._until(trio.lowlevel.wait_writable)
 
-    def _keep(self, item: bytes, *, force: bool = False) -> None:
-        """Keep what the kernel did not take; drop and count it where there is no room."""
-        if self._outbox.offer(item, force=force):
-            self._work.set()
-        else:
-            self.stats.dropped_sends += 1
-
-    def _drain(self) -> list[bytes] | None:
-        """Return what is there: None for nothing, an empty list where the link was reopened. It may find that
-        the link is closed."""
-        raise NotImplementedError
-
-    def _write(self, item: bytes) -> int:
-        """Hand an item to the kernel; return how many bytes it took. What is lost counts as taken."""
-        raise NotImplementedError
-
-    async def _wait_readable(self) -> None:
-        """Wait until there is something to take, or the descriptor is closed."""
-        raise NotImplementedError
-
-    async def _wait_writable(self) -> None:
-        """Wait until the kernel has room, or the descriptor is closed."""
-        raise NotImplementedError
-
-
-class SocketLink(DescriptorLink):
-    """A link over one socket of whole messages, which is never replaced."""
-
-    def __init__(self, sock: socket.socket, description: str, outbox_limit: int) -> None:
-        super().__init__(description, outbox_limit)
-        self._sock = sock
+    async def wait_closed(self) -> None:
+        """Wait until the link is closed."""
+        while not self._closed:
+            await self._changed.park()
 
     async def aclose(self) -> None:
         """Close; what the kernel has not taken by now is lost."""
-        self._close()
+        self._closed = True
+        self._drop_pipe()
         await trio.lowlevel.checkpoint()
 
-    def _close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            trio.lowlevel.notify_closing(self._sock)
-            self._sock.close()
+    def _keep(self, data: bytes, to: NetAddress | None = None, *, force: bool = False) -> None:
+        """Keep what the kernel did not take; drop and count it where there is no room."""
+        if force or self.backlog + len(data) <= self._limit:
+            self._outbox.append((data, to))
+            self.backlog += len(data)
+            self._changed.unpark_all()
+        else:
+            self.stats.dropped_sends += 1
 
-    async def _wait_readable(self) -> None:
-        await trio.lowlevel.wait_readable(self._sock)
+    def _drop_pipe(self) -> None:
+        """Close the pipe, and drop what waits for it: an old request is worse than a lost one."""
+        pipe, self._pipe = self._pipe, None
+        if pipe is not None:
+            trio.lowlevel.notify_closing(pipe.fileno())
+            pipe.close()
+        self.stats.dropped_sends += len(self._outbox)
+        self._outbox.clear()
+        self.backlog = 0
+        self._changed.unpark_all()
 
-    async def _wait_writable(self) -> None:
-        await trio.lowlevel.wait_writable(self._sock)
+    async def _until(self, ready: Callable[[int], Awaitable[None]]) -> None:
+        """Wait until the pipe is ready, or gone, or until there is one."""
+        if self._pipe is None:
+            await self._changed.park()
+        else:
+            with suppress(trio.ClosedResourceError, OSError):  # it was closed meanwhile; look again
+                await ready(self._pipe.fileno())
+
+    def _take(self) -> list[Piece]:
+        """Return what is there. It may find that the pipe broke."""
+        raise NotImplementedError
+
+    def _write(self, data: bytes, to: NetAddress | None) -> int:
+        """Hand an item to the kernel; return how many bytes it took. What is lost counts as taken."""
+        raise NotImplementedError
 
 
 @asynccontextmanager

@@ -1,9 +1,9 @@
 """The link of a program to the hub that has the port. Layer: link.
 
-A Unix socket of whole messages (SOCK_SEQPACKET). Those that begin with `{` are JSON objects: the request to
-join, the hub's reply, and the few that change something later. All others are frames: `F`, the length of a
-tag, the tag, and whole MAVLink frames. The tag is the network address that they came from, as JSON, or
-nothing where the port has only one.
+A Unix socket of whole messages (SOCK_SEQPACKET). First each side sends a JSON object: the request to join,
+and the hub's reply. All others are frames: `F`, the length of a tag, the tag, and whole MAVLink frames. The
+tag is the network address where they came from or go to, as JSON; it is empty where the port has only one, or
+where the hub is to choose. From the hub, a message without frames says that the port was reopened.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import Any
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import Seat, SocketLink
+from mavftpfs.link.base import Piece, PipeLink, Seat
 from mavftpfs.link.messages import Address
 from mavftpfs.link.ports import Busy, peer_of
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Counts up when the messages change: a hub of another version may be running."""
 MAX_MESSAGE = 32 * 1024
 """Bytes of frames in a message."""
@@ -61,29 +61,25 @@ def unpack_facts(message: bytes) -> Facts | None:
     return facts if isinstance(facts, dict) else None
 
 
-def as_address(value: object) -> NetAddress | None:
-    """Return the network address that a fact is, None if it is none: host, port, and more for IPv6."""
-    match value:
-        case [str(), int(port), *rest] if port in range(1 << 16) and all(type(one) is int for one in rest):
-            return tuple(value)
-    return None
-
-
 @lru_cache(maxsize=256)  # bounded: frames may come from any number of addresses
-def make_tag(address: NetAddress | None) -> bytes:
-    """Return the tag of an address."""
+def _tag_of(address: NetAddress | None) -> bytes:
     tag = b"" if address is None else json.dumps(address).encode()
     return tag if len(tag) <= _MAX_TAG else b""
 
 
 @lru_cache(maxsize=256)
 def _address_of(tag: bytes) -> NetAddress | None:
-    """Return the address of a tag."""
-    return tuple(json.loads(tag)) if tag else None
+    """Return the address of a tag, None if it is none."""
+    with suppress(ValueError, RecursionError):
+        address = json.loads(tag)
+        if isinstance(address, list) and all(isinstance(part, str | int) for part in address):
+            return tuple(address)
+    return None
 
 
-def pack_frames(frames: Iterable[bytes], tag: bytes = b"") -> list[bytes]:
-    """Return messages that hold the frames in order."""
+def pack_frames(frames: Iterable[bytes], address: NetAddress | None = None) -> list[bytes]:
+    """Return messages that hold frames in order, which came from an address or go there."""
+    tag = _tag_of(address)
     head = _FRAMES + bytes((len(tag),)) + tag
     messages, batch, size = [], [head], 0
     for frame in frames:
@@ -92,15 +88,16 @@ def pack_frames(frames: Iterable[bytes], tag: bytes = b"") -> list[bytes]:
             batch, size = [head], 0
         batch.append(frame)
         size += len(frame)
-    if size:
-        messages.append(b"".join(batch))
+    messages.append(b"".join(batch))
     return messages
 
 
-def unpack_frames(message: bytes) -> tuple[bytes, bytes]:
-    """Return the tag of a message, and the frames."""
-    stop = 2 + message[1] if len(message) > 1 else len(message)
-    return message[2:stop], message[stop:]
+def unpack_frames(message: bytes) -> Piece:
+    """Return the frames of a message, and the address that it names; no frames if it makes no sense."""
+    if message[:1] != _FRAMES or len(message) < 2:
+        return b"", None
+    stop = 2 + message[1]
+    return message[stop:], _address_of(message[2:stop])
 
 
 def set_buffers(sock: socket.socket) -> None:
@@ -129,102 +126,48 @@ class Wish:
         return self.beats or bool(self.forward)
 
 
-class HubLink(SocketLink):
-    """Implements link.base.Link by a hub. Made by `join`; run `run_writer` beside it.
-
-    Attributes:
-        gone: the hub has ended, or we left it.
-    """
+class HubLink(PipeLink):
+    """Implements link.base.Link by a hub, until that is gone. Made by `join`; run `run` beside it."""
 
     def __init__(self, sock: socket.socket, spec: LinkSpec, welcome: Facts) -> None:
-        super().__init__(sock, spec.description, _OUTBOX_LIMIT)
+        super().__init__(spec.description, sock, _OUTBOX_LIMIT)
         self.is_serial = spec.kind is LinkKind.SERIAL
         self.seat = Seat(Address(*welcome["own"]), welcome["number"])
-        self.gone = trio.Event()
-        self._senders: list[NetAddress | None] = []
-        self._reopened = False
+        self._sock = sock
 
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """Hand frames to the hub; drop and count what cannot be kept."""
-        for message in pack_frames(frames):
-            if self._outbox.size or not self._write(message):
+        for message in pack_frames(frames, to):
+            if self._outbox or not self._write(message, None):
                 self._keep(message)
 
-    def sender(self, index: int) -> NetAddress | None:
-        """Return the network address that a piece of the last batch came from."""
-        return self._senders[index]
-
-    def answer(self, address: NetAddress) -> None:
-        """From now on the hub sends our frames to this address."""
-        self.tell({"answer": address})
-
-    def focus(self, system: int) -> None:
-        """Have the hub leave out what concerns only other systems."""
-        self.tell({"focus": system})
-
-    def tell(self, facts: Facts) -> None:
-        """Send a request that needs no answer."""
-        message = pack_facts(facts)
-        if self._outbox.size or not self._write(message):
-            self._keep(message, force=True)
-
-    def _close(self) -> None:
-        super()._close()
-        self.gone.set()
-
-    def _drain(self) -> list[bytes] | None:
-        if self._reopened:
-            self._reopened = False
-            return []
-        pieces: list[bytes] = []
-        senders: list[NetAddress | None] = []
+    def _take(self) -> list[Piece]:
+        pieces: list[Piece] = []
         for _ in range(_MAX_MESSAGES):
-            message = self._next()
-            if message is None:
+            try:
+                message = self._sock.recv(_RECEIVE_SIZE)
+            except BlockingIOError:
                 break
-            if message[:1] == _FRAMES:
-                tag, piece = unpack_frames(message)
-                pieces.append(piece)
-                senders.append(_address_of(tag))
-            elif (unpack_facts(message) or {}).get("reopened"):
-                if not pieces:
-                    return []
-                self._reopened = True  # what came before goes first
+            except OSError:
+                message = b""
+            if not message:
+                self._closed = True
+                self._drop_pipe()
                 break
-        if not pieces:
-            return None
-        self._senders = senders
-        self.stats.received_bytes += sum(map(len, pieces))
+            pieces.append(unpack_frames(message))
         return pieces
 
-    def _next(self) -> bytes | None:
-        """Return the next message, if there is one; notice that the hub is gone."""
-        if self._closed:
-            return None
+    def _write(self, data: bytes, to: NetAddress | None) -> int:
         try:
-            message = self._sock.recv(_RECEIVE_SIZE)
-        except BlockingIOError:
-            return None
-        except OSError:
-            message = b""
-        if not message:
-            self._close()
-        return message or None
-
-    def _write(self, item: bytes) -> int:
-        if self._closed:
-            self.stats.dropped_sends += 1
-            return len(item)
-        try:
-            self._sock.send(item)
+            self._sock.send(data)
         except BlockingIOError:
             return 0
-        except OSError:
-            self._close()
-            return len(item)
+        except OSError:  # the hub is gone, as the receiver notices
+            self.stats.dropped_sends += 1
+            return len(data)
         self.stats.writes += 1
-        self.stats.sent_bytes += len(item)
-        return len(item)
+        self.stats.sent_bytes += len(data)
+        return len(data)
 
 
 class Refused(LinkClosed):

@@ -13,8 +13,8 @@ from contextlib import asynccontextmanager
 import serial
 import trio
 
-from mavftpfs.link.base import background
-from mavftpfs.link.stream import Pipe, StreamLink
+from mavftpfs.link.base import Pipe, background
+from mavftpfs.link.stream import StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
 
 _LEAST_OUTBOX = 4096

@@ -13,15 +13,15 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Sequence
-from contextlib import ExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
 import trio
 
 from mavftpfs.link import ports
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import Link, LinkStats, Seat, background
+from mavftpfs.link.base import REOPENED, Link, LinkStats, Piece, Seat, background
 from mavftpfs.link.hublink import Facts, Wish, hear, join, tell
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
@@ -60,16 +60,10 @@ class SharedLink:
         self._wish = wish
         self._name = ports.port_name(spec)
         self._inner: Link | None = None
-        self._heard_by: Link | None = None
-        self._address: NetAddress | None = None
-        self._system = 0
-        self._lost_at = trio.current_time()
-        self._said = ""
         self._was_open = False
-        self._reopened = False
-        self._changed = trio.Event()
+        self._news: list[Piece] = []
         self._closed = False
-        self._task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED
+        self._changed = trio.lowlevel.ParkingLot()
 
     # -- opening, again and again
 
@@ -79,48 +73,30 @@ class SharedLink:
         Raises:
             LinkClosed: the link cannot be opened the first time.
         """
-        self._task_status = task_status
+        lost_at, said = trio.current_time(), ""
         while True:
             try:
-                await self._use_until_lost()
+                sock = ports.call(self._name, self._spec)
+                if sock is None:
+                    sock = await self._hold_port(task_status)
+                    lost_at, said = trio.current_time(), ""
+                hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
+                async with background(hub.run, hub.aclose):
+                    with self._used(hub, task_status):
+                        await hub.wait_closed()
+                lost_at, said = trio.current_time(), ""
+                log.warning("the hub of %s is gone; opening the port again", self.description)
             except LinkClosed as exc:
-                await trio.sleep(self._pause_after(exc))
+                waited = trio.current_time() - lost_at
+                if not _may_pass(exc, waited):
+                    if not self._was_open:
+                        raise
+                    if str(exc) != said:
+                        said = str(exc)
+                        log.warning("%s; trying again", exc)
+                await trio.sleep(min(max(waited / 4, _PAUSE), _LONGEST_PAUSE))
 
-    def _pause_after(self, problem: LinkClosed) -> float:
-        """Return the seconds after which a link that could not be opened is tried again.
-
-        Raises:
-            LinkClosed: this was the first time, and the problem does not pass by itself.
-        """
-        waited = trio.current_time() - self._lost_at
-        if isinstance(problem, ports.Busy):
-            may_pass = waited < PATIENCE
-        else:
-            may_pass = waited < GRACE and getattr(problem.__cause__, "errno", None) in _TAKEN
-        if not may_pass and not self._was_open:
-            raise problem
-        if not may_pass and str(problem) != self._said:
-            self._said = str(problem)
-            log.warning("%s; trying again", problem)
-        return min(max(waited / 4, _PAUSE), _LONGEST_PAUSE)
-
-    async def _use_until_lost(self) -> None:
-        """Open the link and use it until it is lost.
-
-        Raises:
-            LinkClosed: it cannot be opened.
-        """
-        sock = ports.call(self._name, self._spec)
-        if sock is None:
-            sock = await self._hold_port()
-        hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
-        async with background(hub.run_writer, hub.aclose):
-            self._use(hub)
-            await hub.gone.wait()
-            self._lose()
-        log.warning("the hub of %s is gone; opening the port again", self.description)
-
-    async def _hold_port(self) -> socket.socket:
+    async def _hold_port(self, task_status: trio.TaskStatus[None]) -> socket.socket:
         """Have the port until a hub comes for it. Return the hub's connection, with port and name closed.
 
         Raises:
@@ -134,9 +110,8 @@ class SharedLink:
             async with open_link(self._spec, source_port=ports.source_port(self._spec)) as link:
                 if self._wish.needs_hub:
                     return await self._started_hub(name)
-                self._use(link)
-                hub = await self._hub_that_comes(name)
-                self._lose()
+                with self._used(link, task_status):
+                    hub = await self._hub_that_comes(name)
             log.info(_SHARED, self.description, _LINE.get(self._spec.kind, ""))
             return hub
 
@@ -173,90 +148,69 @@ class SharedLink:
                 others.enter_context(caller)
         raise LinkClosed("the hub ended at once")
 
-    def _use(self, link: Link) -> None:
-        """Go on with a link that was opened. What is known of the vehicle stays, and so does our seat."""
+    @contextmanager
+    def _used(self, link: Link, task_status: trio.TaskStatus[None]) -> Iterator[None]:
+        """Go on with a link that was opened, during the body. Our seat stays."""
         link.stats = self.stats
         self.seat = link.seat or self.seat
-        if self._address is not None:
-            link.answer(self._address)
-        if self._system:
-            link.focus(self._system)
         self._inner = link
-        self._said = ""
-        if not self._was_open:
+        if self._was_open:
+            self.stats.reopened += 1
+            self._news.append(REOPENED)
+        else:
             self._was_open = True
             self.description = link.description
-            self._task_status.started()
-        self._notify()
-
-    def _lose(self) -> None:
-        self._inner = None
-        self._lost_at = trio.current_time()
-        self._reopened = True
-        self.stats.reopened += 1
-
-    def _notify(self) -> None:
-        self._changed.set()
-        self._changed = trio.Event()
+            task_status.started()
+        self._changed.unpark_all()
+        try:
+            yield
+        finally:
+            self._inner = None
 
     # -- link.base.Link
 
     @property
     def backlog(self) -> int:
-        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        """Bytes accepted by `send` and not yet handed to the kernel."""
         return 0 if self._inner is None else self._inner.backlog
 
-    async def receive(self) -> list[bytes]:
+    async def receive(self) -> list[Piece]:
         """See link.base.Link."""
         await trio.lowlevel.checkpoint_if_cancelled()
         while not self._closed:
             inner = self._inner
             if inner is None:
-                await self._changed.wait()
-                continue
-            if self._reopened:
-                self._reopened = False
+                await self._changed.park()
+            elif self._news:
                 await trio.lowlevel.cancel_shielded_checkpoint()
-                return []
-            try:
-                pieces = await inner.receive()
-            except LinkClosed:
-                if self._inner is inner:
-                    await self._changed.wait()
+                return [self._news.pop()]
             else:
-                self._heard_by = inner
-                return pieces
+                try:
+                    return await inner.receive()
+                except LinkClosed:
+                    if self._inner is inner:
+                        await self._changed.park()
         raise LinkClosed(f"{self.description} is closed")
 
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """See link.base.Link."""
         if self._inner is None:
             self.stats.dropped_sends += len(frames)
         else:
-            self._inner.send_nowait(frames)
-
-    def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a piece of the list that `receive` returned last."""
-        return None if self._heard_by is None else self._heard_by.sender(index)
-
-    def answer(self, address: NetAddress) -> None:
-        """From now on send to this address."""
-        self._address = address
-        if self._inner is not None:
-            self._inner.answer(address)
-
-    def focus(self, system: int) -> None:
-        """From now on only what concerns one system matters."""
-        if system != self._system:
-            self._system = system
-            if self._inner is not None:
-                self._inner.focus(system)
+            self._inner.send(frames, to)
 
     async def aclose(self) -> None:
         """No more is sent or received; `run` closes what is open when it is cancelled."""
         self._closed = True
-        self._notify()
+        self._changed.unpark_all()
         await trio.lowlevel.checkpoint()
+
+
+def _may_pass(problem: LinkClosed, waited: float) -> bool:
+    """Return whether a link that could not be opened for so many seconds may soon be free."""
+    if isinstance(problem, ports.Busy):
+        return waited < PATIENCE
+    return waited < GRACE and getattr(problem.__cause__, "errno", None) in _TAKEN
 
 
 async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import trio
 
-from mavftpfs.link.base import background, look_up
-from mavftpfs.link.stream import Pipe, StreamLink
+from mavftpfs.link.base import Pipe, background, look_up
+from mavftpfs.link.stream import StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
 
 CONNECT_TIMEOUT = 5.0

@@ -1,9 +1,8 @@
 """UDP links. Layer: link.
 
-`udpin` binds a port and answers the last sender, until `answer` names the vehicle's address. `udpout`
-speaks first, to one host. The socket keeps its source port: PX4 answers only the first address it heard
-(servers.md 5). The socket is never connected, so that the ICMP message "port unreachable" of
-a vehicle that reboots is not an error.
+`udpin` binds a port and answers its senders. `udpout` speaks first, to one host. The socket keeps its source
+port: PX4 answers only the first address it heard (servers.md 5). The socket is never connected, so that the
+ICMP message "port unreachable" of a vehicle that reboots is not an error.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import SocketLink, background, look_up, pack
+from mavftpfs.link.base import Piece, PipeLink, background, look_up, pack
 from mavftpfs.link.uri import LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
@@ -26,46 +25,33 @@ _OUTBOX_LIMIT = 64 * 1024
 _LARGEST = 65535
 
 
-class UdpLink(SocketLink):
+class UdpLink(PipeLink):
     """A bound UDP socket; implements link.base.Link. Made by `open_udp`.
 
     Args:
         sock: bound, non-blocking.
-        peer: udpout's target; then datagrams from other hosts are ignored. None: udpin.
+        target: where udpout sends, whatever `to` is; datagrams from other hosts are ignored. None: udpin.
     """
 
-    def __init__(self, sock: socket.socket, description: str, peer: NetAddress | None = None) -> None:
-        super().__init__(sock, description, _OUTBOX_LIMIT)
-        self._peer = peer
-        self._only_host = None if peer is None else peer[0]
-        self._pinned = False
-        self._senders: list[NetAddress] = []
+    def __init__(self, sock: socket.socket, description: str, target: NetAddress | None = None) -> None:
+        super().__init__(description, sock, _OUTBOX_LIMIT)
+        self._sock = sock
+        self._target = target
+        self._heard: NetAddress | None = None
         # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
 
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
+        to = self._target or to or self._heard
         for datagram in pack(frames):
-            if self._outbox.size or not self._write(datagram):
-                self._keep(datagram)
+            if self._outbox or not self._write(datagram, to):
+                self._keep(datagram, to)
 
-    def sender(self, index: int) -> NetAddress | None:
-        """Return the sender of a piece of the last batch."""
-        return self._senders[index]
-
-    def answer(self, address: NetAddress) -> None:
-        """From now on send to this address; udpout goes on sending to the one it was given."""
-        if self._only_host is None:
-            if address != self._peer:
-                self.stats.dropped_sends += self._outbox.clear()  # that was for another one
-            self._peer = address
-            self._pinned = True
-
-    def _drain(self) -> list[bytes] | None:
+    def _take(self) -> list[Piece]:
         """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
-        receive, buffer = self._sock.recvfrom_into, self._buffer
-        pieces: list[bytes] = []
-        senders: list[NetAddress] = []
+        receive, buffer, target = self._sock.recvfrom_into, self._buffer, self._target
+        pieces: list[Piece] = []
         for _ in range(MAX_DATAGRAMS):
             try:
                 count, sender = receive(buffer)
@@ -73,28 +59,23 @@ class UdpLink(SocketLink):
                 break
             except OSError:
                 continue
-            if self._only_host is None or sender[0] == self._only_host:
-                pieces.append(bytes(buffer[:count]))
-                senders.append(sender)
-        if not pieces:
-            return None
-        self._senders = senders
-        self.stats.received_bytes += sum(map(len, pieces))
-        if self._only_host is None and not self._pinned:
-            self._peer = senders[-1]
+            if count and (target is None or sender[0] == target[0]):
+                pieces.append((bytes(buffer[:count]), sender))
+        if pieces:
+            self._heard = pieces[-1][1]
         return pieces
 
-    def _write(self, item: bytes) -> int:
-        if self._peer is None or self._closed:
+    def _write(self, data: bytes, to: NetAddress | None) -> int:
+        if to is None or self._closed:
             self.stats.dropped_sends += 1
-            return len(item)
+            return len(data)
         try:
-            sent = self._sock.sendto(item, self._peer)
+            sent = self._sock.sendto(data, to)
         except BlockingIOError:
             return 0
         except OSError:  # no route, no buffer: waiting would not help
             self.stats.dropped_sends += 1
-            return len(item)
+            return len(data)
         self.stats.writes += 1
         self.stats.sent_bytes += sent
         return sent
@@ -123,7 +104,7 @@ async def open_udp(spec: LinkSpec, source_port: int = 0) -> AsyncIterator[UdpLin
     if spec.kind.listens:
         spec = replace(spec, port=sock.getsockname()[1])
     link = UdpLink(sock, spec.description, None if spec.kind.listens else address)
-    async with background(link.run_writer, link.aclose):
+    async with background(link.run, link.aclose):
         yield link
 
 

@@ -101,16 +101,14 @@ class Supervisor(Life):
 
         async def beat() -> None:
             while True:
-                link.send_nowait(
-                    [framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID)]
-                )
+                link.send([framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID)])
                 await trio.sleep(1)
 
         async with trio.open_nursery() as nursery:
             nursery.start_soon(beat)
             while True:
-                for chunk in await link.receive():
-                    for message in framer.feed(chunk):
+                for data, _ in await link.receive():
+                    for message in framer.feed(data):
                         if isinstance(message, Heartbeat):
                             self._members.hear(message, trio.current_time())
 

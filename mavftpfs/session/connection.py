@@ -272,8 +272,6 @@ class Connection:
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
-        if self.vehicle.address is not None:
-            self.link.focus(self.vehicle.address.system)
         if self.was_lost:
             self.was_lost = False
             self.scheduler.server.wake()

@@ -14,7 +14,7 @@ from math import inf
 import trio
 
 from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, Piece
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message
 from mavftpfs.protocol.engine import Engine
@@ -89,37 +89,42 @@ class Driver:
 
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
-        identity = self.vehicle.identity
+        sender: NetAddress | None = None
         while True:
+            pieces: list[Piece] = []
             with trio.CancelScope(deadline=self._deadline) as scope:
                 self._scope = scope
                 try:
-                    chunks = await self.link.receive()
+                    pieces = await self.link.receive()
                 finally:
                     self._scope = None
             now = self._clock()
             if scope.cancelled_caught:
                 self.engine.on_deadline(now)
                 if self.framer.waiting and now >= self._heard_at + QUIET:
-                    self._handle(self.framer.on_silence(), now, self.link.sender(-1))
-            elif not chunks:  # the link was reopened
-                self.framer.reset()
-                if self.link.seat is not None:
-                    self.vehicle.own = self.framer.source = self.link.seat.own
-                    self.framer.link_id = self.link.seat.number
-                identity.reopened(now)
-            else:
+                    self._handle(self.framer.on_silence(), now, sender)
+            for data, sender in pieces:
+                if not data:
+                    self._on_reopened(now)
+                    continue
                 self._heard_at = now
-                for index, chunk in enumerate(chunks):
-                    self._handle(self.framer.feed(chunk), now, self.link.sender(index))
-                    if len(self._gathered) >= REFILL_AT:
-                        self._pass_on(now)
-                        self._refill(now)
+                self._handle(self.framer.feed(data), now, sender)
+                if len(self._gathered) >= REFILL_AT:
+                    self._pass_on(now)
+                    self._refill(now)
             self._pass_on(now)
             for _, on_batch in list(self._under_way.values()):
                 if on_batch is not None:
                     on_batch(now)
             self.kick()
+
+    def _on_reopened(self, now: float) -> None:
+        """Begin anew: half a frame is lost, our place on the port may be another, and so may the vehicle."""
+        self.framer.reset()
+        if self.link.seat is not None:
+            self.vehicle.own = self.framer.source = self.link.seat.own
+            self.framer.link_id = self.link.seat.number
+        self.vehicle.identity.reopened(now)
 
     async def run(self, operation: Operation) -> None:
         """Carry an operation out; a cancelled caller takes it with it.
@@ -211,7 +216,7 @@ class Driver:
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
-        self.link.send_nowait([frame])
+        self.link.send([frame], self.peer)
 
     def _handle(self, messages: list[Message], now: float, sender: NetAddress | None) -> None:
         """Gather replies, and tell the vehicle everything else, in its turn."""
@@ -232,7 +237,7 @@ class Driver:
                 if vehicle.address in self._addresses:
                     self._is_from(vehicle.address, sender, now)
                 else:
-                    self._send_to(sender)
+                    self.peer = sender
             strange = vehicle.identity.standing is Standing.STRANGER
             self._addresses.distrusted = self.peer if strange else None
 
@@ -267,7 +272,7 @@ class Driver:
                 if self.peer is not None:
                     log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
                     self.vehicle.identity.reopened(now)
-            self._send_to(sender)
+            self.peer = sender
         return True
 
     def _on_impostor(self, source: Address, sender: NetAddress, now: float) -> None:
@@ -279,10 +284,6 @@ class Driver:
             self._impostor_at = inf
             self.second = sender
             log.warning(_IGNORED, readable_address(sender), *source)
-
-    def _send_to(self, address: NetAddress) -> None:
-        self.peer = address
-        self.link.answer(address)
 
     def _refill(self, now: float) -> None:
         """Send what the engine has to send, if anything may go out now."""
@@ -297,4 +298,4 @@ class Driver:
         if self._on_payload is not None:
             for wire in payloads:
                 self._on_payload(now, "request", wire)
-        link.send_nowait(self.framer.encode_ftp_run(target, payloads))
+        link.send(self.framer.encode_ftp_run(target, payloads), self.peer)

@@ -64,8 +64,8 @@ class Endpoint:
         """
         while True:
             with trio.CancelScope(deadline=self._next_deadline()) as self._scope:
-                pieces = await self.link.receive()
-                if not pieces:
+                pieces = [data for data, _ in await self.link.receive()]
+                if b"" in pieces:
                     self._reset()
             if self._scope.cancelled_caught or self.cut:
                 pieces = []
@@ -118,7 +118,7 @@ class Endpoint:
 
     def _send(self, frames: list[bytes]) -> None:
         if frames and not self.cut:
-            self.link.send_nowait(frames)
+            self.link.send(frames)
 
     def _exchange_through(self, model: LinkModel, pieces: list[bytes], now: float) -> None:
         for piece in pieces:

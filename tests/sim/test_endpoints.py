@@ -169,10 +169,10 @@ async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
 
             async def hear(kind: type[Message]) -> None:
                 while not any(isinstance(message, kind) for message in heard):
-                    heard.extend(message for chunk in await link.receive() for message in framer.feed(chunk))
+                    heard.extend(message for data, _ in await link.receive() for message in framer.feed(data))
 
             await hear(Heartbeat)
-            link.send_nowait([frame[:middle]])
+            link.send([frame[:middle]])
             await trio.sleep(0.1)
-            link.send_nowait([frame[middle:]])
+            link.send([frame[middle:]])
             await hear(FtpRun)

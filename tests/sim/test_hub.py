@@ -14,6 +14,7 @@ import trio.testing
 
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.hub.hub import Hub
+from mavftpfs.link.base import REOPENED
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import (
     PROTOCOL,
@@ -23,7 +24,6 @@ from mavftpfs.link.hublink import (
     Wish,
     hear,
     join,
-    make_tag,
     pack_facts,
     pack_frames,
     set_buffers,
@@ -176,7 +176,7 @@ GARBAGE = [
     b'{"join": ' + b"[" * 60_000,
     *(pack_facts(HELLO | wrong) for wrong in WRONG),
 ]
-NONSENSE: list[Any] = ["x", -1, True, [], 5, {}, None, "host", [5, 5], ["x", 70_000], ["x", "y"], ["x"]]
+NONSENSE: list[Any] = ["x", -1, True, (), 5, None, "host", (5, 5), ("x", 70_000), ("x", "y"), ("x",)]
 
 
 async def test_a_program_that_talks_nonsense_disturbs_nobody(
@@ -189,8 +189,7 @@ async def test_a_program_that_talks_nonsense_disturbs_nobody(
                 await trio.sleep(0.1)
         client = await here.joined()
         for fact in NONSENSE:
-            client.tell({"answer": fact, "focus": fact})
-            client.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
+            client.send([Framer(US, stream=False).encode_heartbeat(18)], fact)
             await trio.sleep(0.1)
         assert len((await here.status())["clients"]) == 2
         await client.aclose()
@@ -225,10 +224,10 @@ async def test_frames_from_made_up_addresses_take_no_memory() -> None:
         for turn in range(3000):
             if turn == 1000:
                 before = tracemalloc.get_traced_memory()[0]
-            (message,) = pack_frames([b"frame"], make_tag((f"10.0.{turn >> 8}.{turn & 255}", 14550)))
+            address = (f"10.0.{turn >> 8}.{turn & 255}", 14550)
+            (message,) = pack_frames([b"frame"], address)
             theirs.send(message)
-            assert await link.receive() == [b"frame"]
-            assert link.sender(0) == (f"10.0.{turn >> 8}.{turn & 255}", 14550)
+            assert await link.receive() == [(b"frame", address)]
         assert tracemalloc.get_traced_memory()[0] - before < 1 << 17
     finally:
         tracemalloc.stop()
@@ -241,9 +240,9 @@ async def test_that_the_port_was_reopened_is_told_between_what_came_before_and_a
     set_buffers(ours)
     link = HubLink(ours, parse_source(f"udpin:{HOST}:14550"), {"own": US, "number": 0})
     with theirs:
-        for message in (*pack_frames([b"1"]), pack_facts({"reopened": True}), *pack_frames([b"2"])):
+        for message in (*pack_frames([b"1"]), *pack_frames([]), *pack_frames([b"2"])):
             theirs.send(message)
-        assert [await link.receive() for _ in range(3)] == [[b"1"], [], [b"2"]]
+        assert await link.receive() == [(b"1", None), REOPENED, (b"2", None)]
     await link.aclose()
 
 

@@ -74,11 +74,11 @@ class Port:
         except ConnectionRefusedError:
             await trio.sleep(0.02)
         with trio.move_on_after(0.1):
-            if await link.receive():
+            data, sender = (await link.receive())[-1]
+            if data:
                 address = self.vehicle.getsockname()
-                assert link.sender(0) == address
-                link.answer(address)
-                link.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
+                assert sender == address
+                link.send([Framer(US, stream=False).encode_heartbeat(18)], address)
                 await trio.lowlevel.wait_readable(self.vehicle)
                 self.vehicle.recv(2048)
                 return True
@@ -102,16 +102,16 @@ async def kill_hub(port: Port) -> None:
 
 @asynccontextmanager
 async def listening(link: Link) -> AsyncIterator[list[int]]:
-    """Take what comes in the background; yields how many pieces each batch had, so 0 for "reopened"."""
-    batches: list[int] = []
+    """Take what comes in the background; yields the sizes of all pieces, so 0 for "reopened"."""
+    sizes: list[int] = []
 
     async def listen() -> None:
         while True:
-            batches.append(len(await link.receive()))
+            sizes.extend(len(data) for data, _ in await link.receive())
 
     async with trio.open_nursery() as nursery:
         nursery.start_soon(listen)
-        yield batches
+        yield sizes
         nursery.cancel_scope.cancel()
 
 
@@ -134,9 +134,9 @@ async def test_the_last_client_of_a_killed_hub_has_the_port_itself_and_keeps_its
         seat = two.seat
         assert seat is not None
         assert seat.own == Address(254, 192)
-        async with listening(two) as batches:
+        async with listening(two) as sizes:
             await kill_hub(port)
-            await until(lambda: 0 in batches)
+            await until(lambda: 0 in sizes)
         await port.hears(two)
         assert await trio.to_thread.run_sync(port.hub) is None
         async with port.shared() as three:
@@ -280,7 +280,7 @@ async def test_the_hub_sends_from_the_port_from_which_the_first_program_sent() -
             beat = Framer(own, stream=False).encode_heartbeat(18)
             with trio.fail_after(60):
                 while not senders or senders[-1][0] != beat:
-                    link.send_nowait([beat])
+                    link.send([beat])
                     await trio.sleep(0.02)
                     with suppress(BlockingIOError):
                         senders.append(vehicle.recvfrom(2048))

@@ -90,7 +90,7 @@ class CrowdedLink(MemoryLink):
     Attributes:
         address: where the vehicle is now; what is sent elsewhere it does not hear.
         mirrors: further addresses that everything the vehicle says comes from, too.
-        answered: where our frames go.
+        answered: where our frames went last.
     """
 
     def __init__(self, vehicle: SimVehicle, model: LinkModel, address: NetAddress) -> None:
@@ -98,38 +98,20 @@ class CrowdedLink(MemoryLink):
         self.address = address
         self.mirrors: list[NetAddress] = []
         self.answered: NetAddress | None = None
-        self._queue: list[tuple[NetAddress, bytes]] = []
-        self._senders: list[NetAddress] = []
 
     def intrude(self, address: NetAddress, frame: bytes) -> None:
         """Let somebody else send a datagram."""
-        self._queue.append((address, frame))
-        self._inbox.append(frame)
+        self._inbox.append((frame, address))
         self.kick()
 
-    def sender(self, index: int) -> NetAddress | None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """See link.base.Link."""
-        return self._senders[index]
-
-    def answer(self, address: NetAddress) -> None:
-        """See link.base.Link."""
-        self.answered = address
-
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
-        """See link.base.Link."""
-        if self.answered in (None, self.address, *self.mirrors):
-            super().send_nowait(frames)
+        self.answered = to
+        if to in (None, self.address, *self.mirrors):
+            super().send(frames)
 
     def _arrive(self, frame: bytes) -> None:
-        for address in (self.address, *self.mirrors):
-            self._queue.append((address, frame))
-            self._inbox.append(frame)
-
-    def _take(self) -> list[bytes]:
-        chunks = super()._take()
-        taken, self._queue = self._queue[: len(chunks)], self._queue[len(chunks) :]
-        self._senders = [address for address, _ in taken]
-        return chunks
+        self._inbox += [(frame, address) for address in (self.address, *self.mirrors)]
 
 
 class LyingVehicle:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats, Seat
+from mavftpfs.link.base import LinkStats, Piece, Seat
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim.linkmodel import Direction, LinkModel
 from mavftpfs.sim.vehicle import SimVehicle
@@ -33,7 +33,7 @@ class MemoryLink:
         self.is_serial = is_serial
         self.vehicle = vehicle
         self.model = model
-        self._inbox: list[bytes] = []
+        self._inbox: list[Piece] = []
         self._time = float("-inf")
         self._closed = False
         self._changed = trio.Event()
@@ -56,7 +56,7 @@ class MemoryLink:
         self.model.restore(self._time)
         self._notify()
 
-    async def receive(self) -> list[bytes]:
+    async def receive(self) -> list[Piece]:
         """See link.base.Link."""
         await trio.lowlevel.checkpoint_if_cancelled()
         waited = False
@@ -73,7 +73,7 @@ class MemoryLink:
             with trio.CancelScope(deadline=self._next_deadline()):
                 await changed.wait()
 
-    def send_nowait(self, frames: Sequence[bytes]) -> None:
+    def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """See link.base.Link."""
         now = trio.current_time()
         self._catch_up()
@@ -82,16 +82,6 @@ class MemoryLink:
         for frame in frames:
             self.model.push(Direction.TO_VEHICLE, frame, now)
         self._notify()
-
-    def sender(self, index: int) -> NetAddress | None:
-        """Nobody else is heard."""
-        return None
-
-    def answer(self, address: NetAddress) -> None:
-        """Nothing to choose from."""
-
-    def focus(self, system: int) -> None:
-        """See link.base.Link."""
 
     async def aclose(self) -> None:
         """See link.base.Link."""
@@ -103,10 +93,10 @@ class MemoryLink:
         """Look again at the vehicle, and at what is on its way."""
         self._notify()
 
-    def _take(self) -> list[bytes]:
-        chunks, self._inbox = self._inbox[:MAX_PIECES], self._inbox[MAX_PIECES:]
-        self.stats.received_bytes += sum(map(len, chunks))
-        return chunks
+    def _take(self) -> list[Piece]:
+        pieces, self._inbox = self._inbox[:MAX_PIECES], self._inbox[MAX_PIECES:]
+        self.stats.received_bytes += sum(len(data) for data, _ in pieces)
+        return pieces
 
     def _notify(self) -> None:
         self._changed.set()
@@ -141,4 +131,4 @@ class MemoryLink:
             self._arrive(frame)
 
     def _arrive(self, frame: bytes) -> None:
-        self._inbox.append(frame)
+        self._inbox.append((frame, None))

@@ -106,12 +106,13 @@ class Net:
         self.router.add(PORT, Kind.PORT, fixed=False)
         self.router.add(EAST, Kind.ENDPOINT, fixed=True)
         self.router.add(WEST, Kind.ENDPOINT, fixed=False)
-        self.router.add(MOUNT, Kind.CLIENT, fixed=True)
-        self.router.add(OTHER, Kind.CLIENT, fixed=True)
+        self.router.add(MOUNT, Kind.CLIENT)
+        self.router.add(OTHER, Kind.CLIENT)
+        self.to: dict[int, NetAddress] = {}
 
     def send(self, frame: Frame, side: int, address: NetAddress | None = None) -> set[Place]:
         """Return where a frame goes; each place gets it once."""
-        places = self.router.route(frame, Place(side, address), self.now)
+        places = self.router.route(frame, Place(side, address), self.now, self.to.get(side))
         assert len(set(places)) == len(places)
         return set(places)
 
@@ -122,16 +123,17 @@ class Net:
 
 @pytest.fixture
 def net() -> Net:
-    """Two vehicles on the port, a ground station at each endpoint; each client has its vehicle."""
+    """Two vehicles on the port, a ground station at each endpoint; each client has asked its vehicle."""
     net = Net()
     net.send(beat(ONE), PORT, AT_ONE)
     net.send(beat(TWO), PORT, AT_TWO)
     net.send(hello(STATION), EAST)
     net.send(hello(Address(255, 191)), WEST, AT_WEST)
     for side, component, system in ((MOUNT, 191, 1), (OTHER, 192, 2)):
-        net.send(hello(Address(254, component)), side)
-        net.router.focus(side, system)
-        net.router.answer(side, AT_ONE if system == 1 else AT_TWO)
+        own = Address(254, component)
+        net.send(hello(own), side)
+        net.to[side] = AT_ONE if system == 1 else AT_TWO
+        net.send(parsed(Framer(own, stream=False).encode_request_message(Address(system, 1), 148)), side)
     net.now += 1
     return net
 
@@ -165,14 +167,23 @@ def test_where_a_frame_goes(net: Net, what: str) -> None:
 
 
 def test_a_client_whose_vehicle_was_not_heard_yet_speaks_to_all(net: Net) -> None:
-    net.router.answer(MOUNT, None)
-    assert net.sides(hello(CLIENT), MOUNT) == {PORT}
+    del net.to[MOUNT]
+    assert net.send(hello(CLIENT), MOUNT) == {TO_ONE, TO_TWO}
 
 
 def test_a_client_that_wants_only_heartbeats_is_told_those_of_all(net: Net) -> None:
-    net.router.focus(OTHER, BEATS)
+    net.router.remove(OTHER)
+    net.router.add(OTHER, Kind.CLIENT, focus=BEATS)
+    net.send(ftp(Address(254, 192), ONE), OTHER)
     assert OTHER not in net.sides(ftp(ONE, EVERYBODY), PORT, AT_ONE)
     assert OTHER in net.sides(beat(ONE), PORT, AT_ONE)
+
+
+def test_a_client_that_turns_to_another_vehicle_is_told_of_that_one(net: Net) -> None:
+    assert MOUNT not in net.sides(attitude(TWO), PORT, AT_TWO)
+    net.send(ftp(CLIENT, TWO), MOUNT)
+    assert MOUNT in net.sides(attitude(TWO), PORT, AT_TWO)
+    assert MOUNT not in net.sides(attitude(ONE), PORT, AT_ONE)
 
 
 @pytest.mark.holds("promise 1")
