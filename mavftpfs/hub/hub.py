@@ -13,6 +13,7 @@ import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, TypeAlias
 
 import trio
@@ -105,64 +106,65 @@ class _Endpoint:
     problem: str = ""
 
 
+async def run_hub(spec: LinkSpec) -> None:
+    """Take a port over from the program that has it, and serve until the hub is not needed any more.
+
+    Raises:
+        LinkClosed: the port cannot be opened. The program that had it is told, too.
+    """
+    name = port_name(spec)
+    first = call(name, spec)
+    if first is None:
+        return  # the program that started us ended
+    with first:
+        set_buffers(first)
+        tell(first, {"protocol": PROTOCOL, "hub": os.getpid()})
+        hello = await hear(first, HELLO_PATIENCE)  # with it, port and name are free
+        listening = take_name(name) if hello else None
+        if not hello or listening is None:
+            return
+        with listening:
+            try:
+                # Patient: a device or a peer may be away just now.
+                async with open_link(spec, patient=True, source_port=source_port(spec)) as port:
+                    await Hub(spec, port).run(listening, first, hello)
+            except LinkClosed as exc:
+                tell(first, {"refused": str(exc)})
+                raise
+
+
 class Hub:
     """Owns the port that a SOURCE names."""
 
-    def __init__(self, spec: LinkSpec) -> None:
+    def __init__(self, spec: LinkSpec, port: Link) -> None:
         self.spec = spec
         self.router = Router()
-        self._port: Link | None = None
+        self._port = port
         self._clients: dict[int, _Client] = {}
         self._endpoints: dict[str, _Endpoint] = {}
-        self._sides = 0
+        self._sides = count(PORT + 1)
         self._one_by_one = trio.Lock()
         self._ended = trio.Event()
-        self._work = trio.Event()
+        self._work = trio.lowlevel.ParkingLot()
         serial = spec.kind is LinkKind.SERIAL
         # The baud rate of a USB port means nothing; its symbolic links are under /dev/serial.
         is_line = serial and not os.path.realpath(spec.device).startswith(_USB)
         self._line = Line(spec.baud if is_line else None)
         self._outbox = Outbox(max(_LEAST_OUTBOX, spec.baud // 10) if serial else _OUTBOX)
         self._said_doubles: set[Address] = set()
+        self.router.add(PORT, Kind.PORT, fixed=spec.kind is not LinkKind.UDP_IN)
 
-    async def run(self) -> None:
-        """Take the port over from the program that has it, and serve until the hub is not needed any more.
-
-        Raises:
-            LinkClosed: the port cannot be opened. The program that had it is told, too.
-        """
-        name = port_name(self.spec)
-        first = call(name, self.spec)
-        if first is None:
-            return  # the program that started us ended
-        with first:
-            set_buffers(first)
-            tell(first, {"protocol": PROTOCOL, "hub": os.getpid()})
-            hello = await hear(first, HELLO_PATIENCE)  # with it, port and name are free
-            listening = take_name(name) if hello else None
-            if hello and listening is not None:
-                with listening:
-                    await self._serve_all(listening, first, hello)
-
-    async def _serve_all(self, name: socket.socket, first: socket.socket, hello: Facts) -> None:
-        try:
-            # Patient: a device or a peer may be away just now.
-            opening = open_link(self.spec, patient=True, source_port=source_port(self.spec))
-            async with opening as port, trio.open_nursery() as nursery:
-                self._port = port
-                self.router.add(PORT, Kind.PORT, fixed=self.spec.kind is not LinkKind.UDP_IN)
-                client = await self._join(first, hello, nursery)
-                if client is not None:
-                    nursery.start_soon(self._serve, client)
-                    nursery.start_soon(self._accept, name, nursery)
-                    nursery.start_soon(self._read, PORT, port)
-                    nursery.start_soon(self._write)
-                    nursery.start_soon(self._watch)
-                    await self._ended.wait()
-                nursery.cancel_scope.cancel()
-        except LinkClosed as exc:
-            tell(first, {"refused": str(exc)})
-            raise
+    async def run(self, name: socket.socket, first: socket.socket, hello: Facts) -> None:
+        """Serve until the hub is not needed any more. name: where programs call; first: the connection of the
+        first client, which said hello."""
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(self._answer, first, hello, nursery)
+            nursery.start_soon(self._accept, name, nursery)
+            nursery.start_soon(self._read, PORT, self._port)
+            nursery.start_soon(self._write)
+            nursery.start_soon(self._watch)
+            await self._ended.wait()
+            nursery.cancel_scope.cancel()
 
     # -- clients
 
@@ -174,17 +176,19 @@ class Hub:
         """Serve one connection: of a client, or of a program that asks for the status or the end."""
         with sock:
             set_buffers(sock)
-            request = await hear(sock, HELLO_PATIENCE) or {}
-            if "join" in request:
-                client = await self._join(sock, request, nursery)
-                if client is not None:
-                    await self._serve(client)
-            elif request.keys() & {"stop", "may_stop"} and not is_ours(sock):
-                tell(sock, {"refused": _OTHERS.format(self.spec.description)})
-            elif "status" in request or "stop" in request:
-                tell(sock, self.status())
-                if "stop" in request:
-                    self._ended.set()
+            await self._answer(sock, await hear(sock, HELLO_PATIENCE) or {}, nursery)
+
+    async def _answer(self, sock: socket.socket, request: Facts, nursery: trio.Nursery) -> None:
+        if "join" in request:
+            client = await self._join(sock, request, nursery)
+            if client is not None:
+                await self._serve(client)
+        elif request.keys() & {"stop", "may_stop"} and not is_ours(sock):
+            tell(sock, {"refused": _OTHERS.format(self.spec.description)})
+        elif "status" in request or "stop" in request:
+            tell(sock, self.status())
+            if "stop" in request:
+                self._ended.set()
 
     async def _join(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
         """Let a program in, or tell it why not."""
@@ -223,9 +227,8 @@ class Hub:
         if not may_share(sock, spec) or (hello.get("forward") and not is_ours(sock)):
             raise LinkClosed(_OTHERS.format(spec.description))
         own, number = self._granted(Address(*map(int, hello["own"])), hello.get("number"))
-        self._sides += 1
         forward = tuple(map(str, hello.get("forward", ())))
-        client = _Client(self._sides, sock, own, number, str(hello.get("name", "")), forward)
+        client = _Client(next(self._sides), sock, own, number, str(hello.get("name", "")), forward)
         self._clients[client.side] = client
         return client
 
@@ -285,8 +288,7 @@ class Hub:
             if text in self._endpoints:
                 continue
             spec = parse_source(text)
-            self._sides += 1
-            endpoint = self._endpoints[text] = _Endpoint(self._sides, text, spec)
+            endpoint = self._endpoints[text] = _Endpoint(next(self._sides), text, spec)
             self.router.add(endpoint.side, Kind.ENDPOINT, fixed=spec.kind is not LinkKind.UDP_IN)
             if patient:
                 nursery.start_soon(self._serve_endpoint, endpoint, True)
@@ -378,7 +380,6 @@ class Hub:
     def _flush(self, now: float) -> None:
         """Hand the kernel what it takes now."""
         outbox, port, line = self._outbox, self._port, self._line
-        assert port is not None
         batch: list[bytes] = []
         address: NetAddress | None = None
         while outbox and not port.backlog and line.ready_at() <= now:
@@ -392,29 +393,27 @@ class Hub:
         if batch:
             port.send(batch, address)
         if outbox:
-            self._work.set()
+            self._work.unpark_all()
 
     async def _write(self) -> None:
         """Send what had to wait for the line."""
         while True:
-            await self._work.wait()
-            self._work = trio.Event()
-            while self._outbox:
-                now = trio.current_time()
-                await trio.sleep(max(_POLL, self._line.ready_at() - now))
-                self._flush(trio.current_time())
+            if not self._outbox:
+                await self._work.park()
+            await trio.sleep(max(_POLL, self._line.ready_at() - trio.current_time()))
+            self._flush(trio.current_time())
 
     # -- the end
 
     async def _watch(self) -> None:
         """Check each second whether the hub is still needed, and warn of second vehicles."""
         while True:
+            await trio.sleep(_LOOK)
             self._end_if_done()
             for sender, where in self.router.senders.doubles().items():
                 if sender not in self._said_doubles:
                     self._said_doubles.add(sender)
                     log.warning(_DOUBLE, readable_address(where), *sender)
-            await trio.sleep(_LOOK)
 
     def _end_if_done(self) -> None:
         wanted = {text for client in self._clients.values() for text in client.forward}

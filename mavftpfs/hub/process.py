@@ -6,9 +6,9 @@ import signal
 
 import trio
 
-from mavftpfs.hub.hub import Hub
+from mavftpfs.hub.hub import run_hub
 from mavftpfs.link.base import background
-from mavftpfs.link.uri import parse_source
+from mavftpfs.link.uri import LinkSpec, parse_source
 
 
 def serve(source: str) -> None:
@@ -17,10 +17,10 @@ def serve(source: str) -> None:
     Raises:
         LinkClosed: the port cannot be used.
     """
-    trio.run(_until_signalled, Hub(parse_source(source)))
+    trio.run(_until_signalled, parse_source(source))
 
 
-async def _until_signalled(hub: Hub) -> None:
+async def _until_signalled(spec: LinkSpec) -> None:
     scope = trio.CancelScope()
     with trio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:
 
@@ -30,4 +30,4 @@ async def _until_signalled(hub: Hub) -> None:
 
         async with background(watch, trio.lowlevel.checkpoint):
             with scope:
-                await hub.run()
+                await run_hub(spec)

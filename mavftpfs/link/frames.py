@@ -34,10 +34,10 @@ class Frame(NamedTuple):
 class Splitter(FrameBuffer[Frame]):
     """Finds the frames in what one sender's datagrams, or a stream, bring."""
 
-    def _take(self, data: bytes, out: list[Frame]) -> int:
+    def _take(self, data: bytes, out: list[Frame], *, stream: bool) -> int:
         position, end = 0, len(data)
         while position < end:
-            verdict, stop, message_id = frame_at(data, position, stream=self.stream, highest_id=_ANY_ID)
+            verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
             if verdict is Verdict.PARTIAL:
                 break
             if verdict is Verdict.GARBAGE:

@@ -147,15 +147,18 @@ class FrameBuffer(Generic[FoundT]):
 
     Attributes:
         stream: whether `feed` gets pieces of a stream instead of datagrams.
-        waiting: a stream ended in what may be the beginning of a frame.
         garbage: bytes that were in no frame.
     """
 
     def __init__(self, *, stream: bool) -> None:
         self.stream = stream
-        self.waiting = False
         self.garbage = 0
         self._tail = b""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a stream ended in what may be the beginning of a frame."""
+        return self.stream and bool(self._tail)
 
     def feed(self, data: bytes) -> list[FoundT]:
         """Take a piece of the stream, or a datagram, and return what it completed."""
@@ -164,31 +167,27 @@ class FrameBuffer(Generic[FoundT]):
                 self.reset()  # a datagram begins with a frame of its own: the cut one is lost
             data = self._tail + data
         out: list[FoundT] = []
-        position = self._take(data, out)
-        self._tail = data[position:]
-        self.waiting = self.stream and position < len(data)
+        self._tail = data[self._take(data, out, stream=self.stream) :]
         return out
 
     def reset(self) -> None:
         """Forget a half-received frame: the stream was reopened."""
         self.garbage += len(self._tail)
         self._tail = b""
-        self.waiting = False
 
     def on_silence(self) -> list[FoundT]:
         """The stream fell silent within a frame, so that was no frame, unless it only lacked the byte behind
         it. Return what is found in the rest."""
         out: list[FoundT] = []
-        was_stream, self.stream = self.stream, False  # as at the end of a datagram: nothing more decides
-        while self._tail:
-            out += self.feed(b"")
-            self.garbage += bool(self._tail)
-            self._tail = self._tail[1:]
-        self.stream = was_stream
+        while self._tail:  # as at the end of a datagram: nothing more decides
+            rest = self._tail[self._take(self._tail, out, stream=False) :]
+            self.garbage += bool(rest)
+            self._tail = rest[1:]
         return out
 
-    def _take(self, data: bytes, out: list[FoundT]) -> int:
-        """Append what whole frames give; return where a frame begins that is not whole yet."""
+    def _take(self, data: bytes, out: list[FoundT], *, stream: bool) -> int:
+        """Append what whole frames give; return where a frame begins that is not whole yet. stream: more may
+        come."""
         raise NotImplementedError
 
 
@@ -256,7 +255,7 @@ class Framer(FrameBuffer[Message]):
 
     # ------------------------------------------------------------------ receiving
 
-    def _take(self, data: bytes, out: list[Message]) -> int:
+    def _take(self, data: bytes, out: list[Message], *, stream: bool) -> int:
         position = after = 0
         while True:
             if self._check is None:
@@ -265,7 +264,7 @@ class Framer(FrameBuffer[Message]):
                     self._report_run(data, after, position)
             if position >= len(data):
                 break
-            after = self._step(data, position, out)
+            after = self._step(data, position, out, stream=stream)
             if after == position:
                 break
             position = after
@@ -277,9 +276,9 @@ class Framer(FrameBuffer[Message]):
             self.on_frame(data[start:end])
             start = end
 
-    def _step(self, data: bytes, position: int, out: list[Message]) -> int:
+    def _step(self, data: bytes, position: int, out: list[Message], *, stream: bool) -> int:
         """Deal with what begins at `position`; return where to go on, the same if more is needed."""
-        verdict, stop, message_id = frame_at(data, position, stream=self.stream)
+        verdict, stop, message_id = frame_at(data, position, stream=stream)
         match verdict:
             case Verdict.GARBAGE:
                 self.garbage += stop - position

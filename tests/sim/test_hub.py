@@ -13,7 +13,7 @@ import trio
 import trio.testing
 
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.hub.hub import Hub
+from mavftpfs.hub.hub import run_hub
 from mavftpfs.link.base import REOPENED
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import (
@@ -82,7 +82,7 @@ async def running(*forward: str, source: str = "", again: bool = False) -> Async
     ended = trio.Event()
 
     async def run() -> None:
-        await Hub(spec).run()
+        await run_hub(spec)
         ended.set()
 
     async with plain_nursery() as nursery:
