@@ -12,12 +12,13 @@ import trio
 
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
 from mavftpfs.client.files import Target, heartbeats_in, mount_status, mounts_on
+from mavftpfs.client.listening import listening
 from mavftpfs.client.options import Options
 from mavftpfs.client.status import second_vehicle, with_vehicles
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer, names_of
-from mavftpfs.session.connection import HEARD_SOON, connected
+from mavftpfs.session.connection import connected, heard_within
 from mavftpfs.shared.errors import FtpNak, LinkClosed, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import readable_time
 
@@ -27,7 +28,6 @@ LISTEN_TIME = 3.0
 """Seconds in which every component sends its heartbeat at least twice."""
 PROBE_TIME = 6.0
 """Seconds that a component has at most to answer a listing."""
-_TICK = 0.1
 
 
 async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
@@ -86,29 +86,21 @@ async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]
 
 
 async def _listen(
-    link: Link, options: Options, on_wait: Callable[[], None], on_heard: Callable[[Heartbeat], None]
+    link: Link, options: Options, on_wait: Callable[[], None], on_new: Callable[[Heartbeat], None]
 ) -> dict[Address, Heartbeat]:
     """Return the heartbeats that are heard within LISTEN_TIME of the first one."""
-    anybody = replace(connect_options(options), target_system=0, target_component=0)
-    listened = min(LISTEN_TIME, options.connect_timeout / 2)
     found: dict[Address, Heartbeat] = {}
-    async with connected(link, anybody) as connection:
-        began = trio.current_time()
-        soon, end = began + HEARD_SOON, began + options.connect_timeout
-        while (now := trio.current_time()) < end:
-            for address, heartbeat in connection.vehicle.heard.items():
-                if not found:
-                    end = now + listened
-                if address not in found:
-                    on_heard(heartbeat)
-                found[address] = heartbeat
-            if not found and now >= soon:
-                soon = end
-                on_wait()
-            await trio.sleep(_TICK)
-        if not found:
-            raise connection.nobody(options.connect_timeout)
-        return found
+
+    def on_heard(heartbeat: Heartbeat) -> None:
+        if heartbeat.source not in found:
+            on_new(heartbeat)
+        found[heartbeat.source] = heartbeat
+
+    async with listening(link, options, on_heard) as listener:
+        if not await heard_within(listener.first, options.connect_timeout, on_wait):
+            raise listener.nobody(options.connect_timeout)
+        await trio.sleep(min(LISTEN_TIME, options.connect_timeout / 2))
+    return found
 
 
 def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:

@@ -19,23 +19,15 @@ from typing import Any
 import trio
 
 from mavftpfs.client import control
-from mavftpfs.client.connect import connect_options, opened, plain_nursery
+from mavftpfs.client.connect import opened, plain_nursery
+from mavftpfs.client.listening import listening
 from mavftpfs.client.mountpoint import is_dead, is_ours, timeout_note
-from mavftpfs.link.base import Link
-from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import (
-    MAV_AUTOPILOT_INVALID,
-    MAV_TYPE_ONBOARD_CONTROLLER,
-    OWN_COMPONENT,
-    Address,
-    Heartbeat,
-)
+from mavftpfs.link.messages import Heartbeat
 from mavftpfs.link.sharing import own_environment
 from mavftpfs.mount import places
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.mount.members import Member, Members, MemberState
-from mavftpfs.session.connection import signing_now
 from mavftpfs.shared.errors import MountFailed
 
 log = logging.getLogger("mavftpfs.mount")
@@ -69,11 +61,14 @@ class Supervisor(Life):
     async def serve(self, nursery: trio.Nursery) -> None:
         """See Life.serve."""
         self._nursery = nursery
-        async with opened(self.request.spec, self.request.options.client, beats=True) as link:
+        options = self.request.options.client
+        async with (
+            opened(self.request.spec, options, beats=True) as link,
+            listening(link, options, self._on_heard),
+        ):
             self.enter(State.MOUNTED)
             await self.start_control({}, nursery)
             async with plain_nursery() as tasks:
-                tasks.start_soon(self._hear, link)
                 tasks.start_soon(self._keep_members, tasks)
                 tasks.start_soon(self._tell_when_up)
                 await self._left.wait()
@@ -90,27 +85,8 @@ class Supervisor(Life):
 
     # -- vehicles
 
-    async def _hear(self, link: Link) -> None:
-        """Note which vehicles are heard. Some bridges answer only a client that speaks, so we send
-        heartbeats."""
-        options = self.request.options.client
-        own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
-        key = connect_options(options).signing_key
-        framer = Framer(own, stream=False, signing_key=key, signing_clock=signing_now)
-        framer.link_id = 0 if link.seat is None else link.seat.number
-
-        async def beat() -> None:
-            while True:
-                link.send([framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID)])
-                await trio.sleep(1)
-
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(beat)
-            while True:
-                for data, _ in await link.receive():
-                    for message in framer.feed(data):
-                        if isinstance(message, Heartbeat):
-                            self._members.hear(message, trio.current_time())
+    def _on_heard(self, heartbeat: Heartbeat) -> None:
+        self._members.hear(heartbeat, trio.current_time())
 
     async def _keep_members(self, nursery: trio.Nursery) -> None:
         """Start a mount for each vehicle that is heard and has none."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import random
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,12 +16,19 @@ import trio
 
 from mavftpfs.link.addresses import readable_address
 from mavftpfs.link.base import Link
-from mavftpfs.link.framing import AUTOPILOT_VERSION_ID, STORAGE_INFORMATION_ID, SYSTEM_TIME_ID, Framer
+from mavftpfs.link.framing import (
+    AUTOPILOT_VERSION_ID,
+    STORAGE_INFORMATION_ID,
+    SYSTEM_TIME_ID,
+    Framer,
+    FramerStats,
+)
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     MAV_TYPE_ONBOARD_CONTROLLER,
     OWN_COMPONENT,
     Address,
+    Heartbeat,
 )
 from mavftpfs.link.peers import names_of
 from mavftpfs.protocol.engine import Engine
@@ -157,20 +164,8 @@ class Connection:
         Raises:
             VehicleLost: none within `timeout` seconds; the text says what was heard instead.
         """
-        soon = min(HEARD_SOON, timeout)
-        with trio.move_on_after(soon):
-            await self._first_heartbeat.wait()
-            return
-        if timeout > soon:
-            on_wait()
-            with trio.move_on_after(timeout - soon):
-                await self._first_heartbeat.wait()
-                return
-        raise self.nobody(timeout)
-
-    def nobody(self, timeout: float) -> VehicleLost:
-        """Return what is raised when no vehicle was heard within `timeout` seconds, with what was heard."""
-        return VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
+        if not await heard_within(self._first_heartbeat, timeout, on_wait):
+            raise nobody(self.link, timeout, self.vehicle.heard, self.driver.framer.stats)
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
         """Have `listener` called with "reboot", "armed", "disarmed", "arming refused" or "back"."""
@@ -223,21 +218,6 @@ class Connection:
         if silent or self.vehicle.lost(now):
             return "lost"
         return "lossy" if self.engine.flow.loss >= LOSSY else "fine"
-
-    def _heard(self) -> str:
-        heard = [self.vehicle.heard[source] for source in sorted(self.vehicle.heard)]
-        bad_signatures, bad_times = self.driver.framer.stats.bad_signature, self.driver.framer.stats.bad_time
-        if not heard and bad_times:
-            return (
-                f": heard only {bad_times} frames with the right key and a signature that is too old; "
-                "compare the clocks of the vehicle and of this computer"
-            )
-        if not heard and bad_signatures:
-            return f": heard only {bad_signatures} frames with no or a bad signature; check signing_key"
-        if not heard:
-            what = "cable and baud rate" if self.link.is_serial else "address, port and firewall"
-            return f": no heartbeat heard at all; check SOURCE: {what}"
-        return f": heard only {names_of(heard)}; check target_system and target_component"
 
     # --- what the vehicle tells
 
@@ -345,6 +325,39 @@ class Connection:
             if not vehicle.tells_boot_time:
                 wanted.append(SYSTEM_TIME_ID)
         return wanted
+
+
+async def heard_within(first: trio.Event, timeout: float, on_wait: Callable[[], None]) -> bool:
+    """Return whether the first heartbeat comes within `timeout` seconds.
+
+    on_wait: called when it does not come at once.
+    """
+    with trio.move_on_after(min(HEARD_SOON, timeout)):
+        await first.wait()
+    if not first.is_set() and timeout > HEARD_SOON:
+        on_wait()
+        with trio.move_on_after(timeout - HEARD_SOON):
+            await first.wait()
+    return first.is_set()
+
+
+def nobody(link: Link, timeout: float, heard: Mapping[Address, Heartbeat], stats: FramerStats) -> VehicleLost:
+    """Return what is raised when no vehicle was heard on a link within `timeout` seconds. heard: what was
+    heard instead; stats: of the frames that arrived."""
+    if heard:
+        found = names_of(heard[source] for source in sorted(heard))
+        reason = f"heard only {found}; check target_system and target_component"
+    elif stats.bad_time:
+        reason = (
+            f"heard only {stats.bad_time} frames with the right key and a signature that is too old; "
+            "compare the clocks of the vehicle and of this computer"
+        )
+    elif stats.bad_signature:
+        reason = f"heard only {stats.bad_signature} frames with no or a bad signature; check signing_key"
+    else:
+        what = "cable and baud rate" if link.is_serial else "address, port and firewall"
+        reason = f"no heartbeat heard at all; check SOURCE: {what}"
+    return VehicleLost(f"no vehicle on {link.description} within {timeout:g} s: {reason}")
 
 
 @asynccontextmanager

@@ -1,0 +1,96 @@
+"""Which vehicles and other components are on a link, by their heartbeats alone. Layer: client.
+
+A scan and a mount of all vehicles listen in this way. A program that has a connection to a vehicle knows the
+others by that (`session.vehicle.Vehicle.heard`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from math import inf
+
+import trio
+
+from mavftpfs.client.connect import connect_options
+from mavftpfs.client.options import Options
+from mavftpfs.link.base import Link, background
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
+    MAV_TYPE_ONBOARD_CONTROLLER,
+    OWN_COMPONENT,
+    Address,
+    Heartbeat,
+)
+from mavftpfs.session.connection import HEARTBEAT_PERIOD, nobody, signing_now
+from mavftpfs.session.driver import QUIET
+from mavftpfs.shared.errors import VehicleLost
+
+
+class Listener:
+    """Hears heartbeats on a link. Made by `listening`.
+
+    Attributes:
+        heard: the last heartbeat of each component.
+        first: something was heard.
+    """
+
+    def __init__(self, link: Link, options: Options, on_heard: Callable[[Heartbeat], None]) -> None:
+        self.heard: dict[Address, Heartbeat] = {}
+        self.first = trio.Event()
+        self._link = link
+        self._on_heard = on_heard
+        own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
+        key = connect_options(options).signing_key
+        self._framer = Framer(own, stream=link.is_stream, signing_key=key, signing_clock=signing_now)
+        self._framer.link_id = 0 if link.seat is None else link.seat.number
+
+    def nobody(self, timeout: float) -> VehicleLost:
+        """Return what is raised when no heartbeat came within `timeout` seconds."""
+        return nobody(self._link, timeout, self.heard, self._framer.stats)
+
+    async def run(self) -> None:
+        """Listen until cancelled.
+
+        Raises:
+            LinkClosed: the link was closed.
+        """
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(self._beat)
+            while True:
+                await self._take()
+
+    async def _beat(self) -> None:
+        """Send heartbeats, because some bridges answer only a client that speaks."""
+        while True:
+            beat = self._framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID)
+            self._link.send([beat])
+            await trio.sleep(HEARTBEAT_PERIOD)
+
+    async def _take(self) -> None:
+        """Take what arrives next, or find what a stream that fell silent ended in."""
+        messages = []
+        with trio.move_on_after(QUIET if self._framer.waiting else inf) as scope:
+            for data, _ in await self._link.receive():
+                if data:
+                    messages += self._framer.feed(data)
+                else:
+                    self._framer.reset()
+        if scope.cancelled_caught:
+            messages = self._framer.on_silence()
+        for message in messages:
+            if isinstance(message, Heartbeat):
+                self.heard[message.source] = message
+                self.first.set()
+                self._on_heard(message)
+
+
+@asynccontextmanager
+async def listening(
+    link: Link, options: Options, on_heard: Callable[[Heartbeat], None] = lambda heartbeat: None
+) -> AsyncIterator[Listener]:
+    """Listen during the body. on_heard: called with each heartbeat."""
+    listener = Listener(link, options, on_heard)
+    async with background(listener.run, trio.lowlevel.checkpoint):
+        yield listener
