@@ -14,7 +14,7 @@ import serial
 import trio
 
 from mavftpfs.link.base import Pipe, background
-from mavftpfs.link.stream import StreamLink
+from mavftpfs.link.stream import Opened, StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
 
 _LEAST_OUTBOX = 4096
@@ -30,11 +30,11 @@ async def open_serial(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator
         LinkClosed: no such port, no permission, or in use.
     """
 
-    async def reopen() -> Pipe:
-        return await trio.to_thread.run_sync(_open_port, spec)
+    async def reopen() -> Opened:
+        return await trio.to_thread.run_sync(_open_port, spec), None
 
     try:
-        pipe = None if patient else await reopen()
+        pipe = None if patient else (await reopen())[0]
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     # About a second of the line: what waits longer than that is answered too late anyway.

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Awaitable, Callable, Sequence
+from typing import TypeAlias
 
 import trio
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import REOPENED, Piece, Pipe, PipeLink
-from mavftpfs.shared.errors import LinkClosed
 
 MAX_READS = 64
 _READ_SIZE = 16 * 1024
@@ -22,12 +22,15 @@ FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 2.0
 """Seconds between attempts to reopen."""
 
-Opener = Callable[[], Awaitable[Pipe]]
-"""Opens a new Pipe, waiting as long as it takes. Raises OSError or LinkClosed: try again later."""
+Opened: TypeAlias = tuple[Pipe, NetAddress | None]
+"""A pipe, and the address that opened it; None if this program did."""
+
+Opener = Callable[[], Awaitable[Opened]]
+"""Opens a pipe, waiting as long as it takes. Raises OSError: try again later."""
 
 
 class StreamLink(PipeLink):
-    """Implements link.base.Link over whatever `opener` opens; without one, the owner calls `replace`.
+    """Implements link.base.Link over whatever `opener` opens.
 
     Args:
         pipe: the first one, where it is already open.
@@ -37,20 +40,14 @@ class StreamLink(PipeLink):
     is_stream = True
 
     def __init__(
-        self,
-        description: str,
-        opener: Opener | None,
-        pipe: Pipe | None,
-        *,
-        is_serial: bool,
-        outbox_limit: int,
+        self, description: str, opener: Opener, pipe: Pipe | None, *, is_serial: bool, outbox_limit: int
     ) -> None:
         super().__init__(description, pipe, outbox_limit)
         self.is_serial = is_serial
         self._opener = opener
+        self._peer: NetAddress | None = None
         self._was_open = pipe is not None
         self._news: list[Piece] = []
-        self._peer: NetAddress | None = None
 
     @property
     def connected(self) -> bool:
@@ -73,31 +70,38 @@ class StreamLink(PipeLink):
         for frame in frames:
             self._keep(frame)
 
-    def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
-        """Go on with another pipe (a new connection). peer: the address that opened it, if it was not us."""
+    async def run(self) -> None:
+        """Write what had to wait, and reopen what failed; runs until cancelled."""
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(super().run)
+            nursery.start_soon(self._keep_open)
+
+    async def _keep_open(self) -> None:
+        pause = FIRST_PAUSE
+        while True:
+            if self._pipe is not None or self._closed:
+                pause = FIRST_PAUSE
+                await self._changed.park()
+                continue
+            try:
+                opened = await self._opener()
+            except OSError:
+                await trio.sleep(pause)
+                pause = min(pause * 2, LONGEST_PAUSE)
+            else:
+                self._use(*opened)
+
+    def _use(self, pipe: Pipe, peer: NetAddress | None) -> None:
+        """Go on with a pipe that was opened."""
         if self._closed:
             pipe.close()
             return
-        self._drop_pipe()
-        self._pipe = pipe
-        self._peer = peer
+        self._pipe, self._peer = pipe, peer
         if self._was_open:
             self.stats.reopened += 1
             self._news.append(REOPENED)
         self._was_open = True
         self._changed.unpark_all()
-
-    async def wait_disconnected(self) -> None:
-        """Wait until there is no pipe."""
-        while self.connected:
-            await self._changed.park()
-
-    async def run(self) -> None:
-        """Write what had to wait, and reopen what failed; runs until cancelled."""
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(super().run)
-            if self._opener is not None:
-                nursery.start_soon(self._keep_open, self._opener)
 
     async def aclose(self) -> None:
         """Close; what the kernel does not take now is lost."""
@@ -138,18 +142,3 @@ class StreamLink(PipeLink):
         self.stats.sent_bytes += sent
         self.stats.writes += 1
         return sent
-
-    async def _keep_open(self, opener: Opener) -> None:
-        pause = FIRST_PAUSE
-        while not self._closed:
-            if self._pipe is not None:
-                pause = FIRST_PAUSE
-                await self._changed.park()
-                continue
-            try:
-                pipe = await opener()
-            except (OSError, LinkClosed):
-                await trio.sleep(pause)
-                pause = min(pause * 2, LONGEST_PAUSE)
-            else:
-                self.replace(pipe)

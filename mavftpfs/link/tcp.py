@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import trio
 
-from mavftpfs.link.base import Pipe, background, look_up
-from mavftpfs.link.stream import StreamLink
+from mavftpfs.link.base import background, look_up
+from mavftpfs.link.stream import Opened, StreamLink
 from mavftpfs.link.uri import LinkSpec, cannot_open
 
 CONNECT_TIMEOUT = 5.0
@@ -24,7 +24,6 @@ CONNECT_TIMEOUT = 5.0
 
 _OUTBOX_LIMIT = 64 * 1024
 _MAX_ADDRESSES = 4
-_PAUSE = 0.2
 
 
 @asynccontextmanager
@@ -37,11 +36,11 @@ async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[St
         LinkClosed: the first attempt failed.
     """
 
-    async def connect() -> Pipe:
-        return await _connect(spec)
+    async def connect() -> Opened:
+        return await _connect(spec), None
 
     try:
-        pipe = None if patient else await connect()
+        pipe = None if patient else await _connect(spec)
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     link = StreamLink(spec.description, connect, pipe, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
@@ -62,14 +61,15 @@ async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
         raise cannot_open(spec, exc) from exc
     with listener:
         bound = replace(spec, port=listener.getsockname()[1])
-        link = StreamLink(bound.description, None, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
 
-        async def serve() -> None:
-            async with trio.open_nursery() as nursery:
-                nursery.start_soon(link.run)
-                nursery.start_soon(_accept_peers, listener, link)
+        async def accept() -> Opened:
+            await trio.lowlevel.wait_readable(listener)
+            peer, address = listener.accept()
+            # Each connection has a port of its own: a peer that comes back has the same host.
+            return _configure(peer), address[:1]
 
-        async with background(serve, link.aclose):
+        link = StreamLink(bound.description, accept, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+        async with background(link.run, link.aclose):
             yield link
 
 
@@ -108,23 +108,6 @@ async def _listen(spec: LinkSpec) -> socket.socket:
         listener.close()
         raise
     return listener
-
-
-async def _accept_peers(listener: socket.socket, link: StreamLink) -> None:
-    while True:
-        await trio.lowlevel.wait_readable(listener)
-        try:
-            peer, address = listener.accept()
-        except OSError:  # it went away again before we looked
-            await trio.sleep(_PAUSE)
-            continue
-        try:
-            await link.wait_disconnected()
-        except BaseException:
-            peer.close()
-            raise
-        # Each connection has a port of its own: a peer that comes back has the same host.
-        link.replace(_configure(peer), address[:1])
 
 
 def _configure(sock: socket.socket) -> socket.socket:

@@ -24,7 +24,7 @@ import trio
 from mavftpfs.link.base import Link, background
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.stream import StreamLink
+from mavftpfs.link.stream import Opened, StreamLink
 from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import UsageError
@@ -177,11 +177,16 @@ async def _open_pty(baud: int) -> AsyncIterator[Link]:
         # The slave stays open here, so the master stays readable while clients come and go.
         description = f"{os.ttyname(slave)},{baud}"
         pipe = FileIO(master, "r+")
-        link = StreamLink(description, None, pipe, is_serial=True, outbox_limit=_PTY_OUTBOX)
+        link = StreamLink(description, _never, pipe, is_serial=True, outbox_limit=_PTY_OUTBOX)
         async with background(link.run, link.aclose):
             yield link
     finally:
         os.close(slave)
+
+
+async def _never() -> Opened:
+    """Open nothing: the pipe of a pty stays."""
+    await trio.sleep_forever()
 
 
 def run(args: argparse.Namespace) -> int:
