@@ -283,12 +283,12 @@ class ExitCode(IntEnum):
 
 
 EXIT_CODES = {
-    ExitCode.OK: "fine",
-    ExitCode.USAGE: "wrong usage, or not possible with the files as they are",
-    ExitCode.NO_VEHICLE: "no vehicle, no FTP, or no right answer from it",
+    ExitCode.OK: "success",
+    ExitCode.USAGE: "wrong usage, or impossible with the files as they are",
+    ExitCode.NO_VEHICLE: "no vehicle, no FTP, or no right answer; or some of several files failed",
     ExitCode.MOUNT_FAILED: "mounting or unmounting failed",
-    ExitCode.UNDELIVERED: "data could not be delivered to the card; the message names where it lies",
-    ExitCode.BUG: "a bug of ours",
+    ExitCode.UNDELIVERED: "a file did not reach the card; the message says where it is kept",
+    ExitCode.BUG: "a bug in mavftpfs",
     ExitCode.INTERRUPTED: "interrupted; 128 and the number of the signal for others",
 }
 """What each means, for the man page."""
