@@ -28,17 +28,18 @@ from mavftpfs.api.params import Number, Params, get_values, set_values
 from mavftpfs.api.portal import LoopThread
 from mavftpfs.api.pythonfile import Mode, python_file
 from mavftpfs.api.wanted import Patterns, Since, selection_of, verify_of
-from mavftpfs.client import download, names, upload
+from mavftpfs.client import download, logs, names, upload
+from mavftpfs.client.compare import Verify
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetcher
 from mavftpfs.client.files import File, Files, Session, Target, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import Verify
 from mavftpfs.client.several import IN_PYTHON
 from mavftpfs.client.source import target_of
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join
+from mavftpfs.shared.readable import name_text
 
 __all__ = ["Drone", "Entry", "NotDelivered", "UsageError", "connect"]
 
@@ -509,8 +510,8 @@ class Drone:
         """
         where = None if place is None else remote(place)
         selection = selection_of(newest=newest, since=since, include=include, exclude=exclude)
-        wish = download.Wish(Path(local), where, selection)
-        outcome = await self._download(verify, lambda downloads: downloads.sync(wish))
+        wish = logs.Wish(Path(local), where, selection)
+        outcome = await self._download(verify, lambda downloads: logs.sync(downloads, wish))
         return [fetched.wanted.local for fetched in outcome.fetched]
 
     async def _download(
@@ -518,10 +519,11 @@ class Drone:
     ) -> download.Outcome:
         outcome = download.Outcome()
         fetcher = Fetcher(self._session, Progress(), verify_of(verify))
-        await work(download.Downloads(fetcher, outcome, _ignore, _ignore))
+        await work(download.Downloads(fetcher, outcome))
         for path, error in outcome.failed.items():
             count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
-            raise os_error(error, f"{download.named(path, error)}; {count} of {of} files are here") from error
+            text = download.named(name_text(path), error)
+            raise os_error(error, f"{text}; {count} of {of} files are here") from error
         return outcome
 
     @changing
@@ -551,7 +553,3 @@ async def _opened_or_made(files: Files, path: bytes) -> File:
         return await files.open(path, write=True, append=True)
     except NotFound:
         return await files.create(path, exclusive=False)
-
-
-def _ignore(told: object) -> None:
-    """Nothing is shown of single files."""

@@ -7,7 +7,7 @@ from datetime import datetime
 from math import isfinite
 from typing import get_args
 
-from mavftpfs.client.proof import Verify
+from mavftpfs.client.compare import Verify
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.shared.errors import UsageError
 

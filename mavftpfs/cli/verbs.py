@@ -24,7 +24,7 @@ import trio
 from mavftpfs.cli import watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line, say
 from mavftpfs.cli.drawing import shown
-from mavftpfs.client import download, names, upload
+from mavftpfs.client import download, logs, names, upload
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
@@ -169,7 +169,7 @@ def sync(args: Args) -> int:
         (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since, datetime.now(), "--since")
     selection = Selection(args.newest, since, tuple(args.include), tuple(args.exclude))
-    wish = download.Wish(Path(args.local), place, selection, args.dry_run)
+    wish = logs.Wish(Path(args.local), place, selection, args.dry_run)
     if args.watch:
         return watching.watch(args, wish, lambda work: run(args, work, component))
     if args.command is not None:
@@ -178,7 +178,7 @@ def sync(args: Args) -> int:
     error: MavftpfsError | None = None
 
     async def work(downloads: download.Downloads) -> None:
-        await (downloads.check(wish) if args.check else downloads.sync(wish))
+        await (logs.check if args.check else logs.sync)(downloads, wish)
 
     try:
         _download(args, outcome, work, component)
@@ -241,7 +241,7 @@ def cat(args: Args) -> int:
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, Progress(), args.verify)
-        await download.Downloads(fetcher, outcome, _ignore, say).cat(wanted, take)
+        await download.Downloads(fetcher, outcome, _Printed()).cat(wanted, take)
 
     with_session(args, work, component)
     return _exit_code(outcome)
@@ -253,16 +253,20 @@ def _exit_code(outcome: download.Outcome) -> int:
     return max(map(exit_code_for, outcome.failed.values()), default=ExitCode.OK)
 
 
-def _tell(fetched: Fetched) -> None:
-    resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
-    before = ", here already" if fetched.was_here else resumed
-    name = printable(fetched.wanted.name)
-    verified = f"verified by {fetched.proof.words}{printable(fetched.kept_words)}"
-    print(f"{name}: {readable_size(fetched.size)}{before}, {verified}", flush=True)
+class _Printed(download.Reports):
+    """Prints a line for each file that is here, and says on stderr why another one is not."""
 
+    def arrived(self, fetched: Fetched) -> None:
+        """See Reports."""
+        resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
+        before = ", here already" if fetched.was_here else resumed
+        name = printable(fetched.wanted.name)
+        verified = f"verified by {fetched.verified.how}{printable(fetched.kept_words)}"
+        print(f"{name}: {readable_size(fetched.size)}{before}, {verified}", flush=True)
 
-def _ignore(fetched: Fetched) -> None:
-    """For verbs that print nothing of single files."""
+    def says(self, line: str) -> None:
+        """See Reports."""
+        say(line)
 
 
 def _say_what_is_not_proven(outcome: download.Outcome) -> None:
@@ -282,7 +286,7 @@ def _download(
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify)
         async with noting_losses(session, bar):
-            await function(download.Downloads(fetcher, outcome, _tell, say))
+            await function(download.Downloads(fetcher, outcome, _Printed()))
 
     with _on_interrupt(lambda: _here(outcome)), shown(bar):
         with_session(args, work, component)
@@ -297,9 +301,8 @@ def _here(outcome: download.Outcome) -> str:
 
 def _sync_summary(outcome: download.Outcome) -> str:
     new, size = len(outcome.fetched), sum(fetched.size - fetched.resumed for fetched in outcome.fetched)
-    proven = sum(
-        not outcome.proofs[log.remote].lacking for log in outcome.here if log.remote in outcome.proofs
-    )
+    verified = [outcome.verified[log.remote] for log in outcome.here if log.remote in outcome.verified]
+    proven = sum(not one.lacking for one in verified)
     line = f"{new} new ({readable_size(size)}), {len(outcome.here)} here already"
     line += f" ({proven} proven now)" if proven else ""
     line += f", from {_name(outcome.place)}"
@@ -321,12 +324,13 @@ def _print_plan(outcome: download.Outcome) -> None:
 
 
 def _print_comparison(outcome: download.Outcome) -> None:
+    differing = outcome.differing
     for log in outcome.here:
-        if log.remote in outcome.differing:
-            print(f"{printable(log.name)} differs: {outcome.differing[log.remote]}")
-    same = sum(not proof.lacking for proof in outcome.proofs.values())
+        if log.remote in differing:
+            print(f"{printable(log.name)} differs: {differing[log.remote]}")
     unproven = sum(outcome.lacking.values())
-    parts = [f"{same} the same", f"{len(outcome.differing)} differ"]
+    same = len(outcome.verified) - len(differing) - unproven
+    parts = [f"{same} the same", f"{len(differing)} differ"]
     parts += [f"{unproven} not proven"] if unproven else []
     print(f"{', '.join(parts)}, {len(outcome.wanted)} not here, from {_name(outcome.place)}")
 

@@ -17,10 +17,10 @@ from typing import Any
 import trio
 
 from mavftpfs.cli.drawing import shown
-from mavftpfs.client.download import Wish
 from mavftpfs.client.files import Target
+from mavftpfs.client.logs import Wish
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.watch import Watch, WatchWish
+from mavftpfs.client.watch import Watch
 from mavftpfs.shared.errors import ExitCode
 from mavftpfs.shared.readable import readable, readable_time
 
@@ -42,11 +42,10 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
         UsageError: LOCAL or the options are wrong.
     """
     hand_on = None if args.command is None else partial(run_command, args.command, limit=EXEC_LIMIT)
-    wanted = WatchWish(wish, args.verify)
     bar = Progress()
 
     async def work(target: Target) -> None:
-        await Watch(wanted, say, hand_on, bar).run(target)
+        await Watch(wish, say, hand_on, bar, args.verify).run(target)
 
     try:
         with shown(bar, idle=""):

@@ -1,75 +1,82 @@
-"""Ways to vehicles that come and go: which ones are heard, and the files of one of them. Layer: client."""
+"""How the watch hears vehicles and gets the files of one: over a link, or by a mount. Layer: client."""
 
 from __future__ import annotations
 
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import trio
 
 from mavftpfs.client.connect import told_version, with_tree
 from mavftpfs.client.files import Session, session_of
 from mavftpfs.client.options import Options
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_COMP_ID_AUTOPILOT1, Address, Heartbeat
+from mavftpfs.link.messages import Address, Heartbeat
+from mavftpfs.link.peers import vehicles_in
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.vehicle import Standing
-from mavftpfs.shared.errors import LinkError
-
-TICK = 1.0
-"""Seconds between two looks at what was heard. Arming of the vehicle whose files we have is told at once."""
-MOUNT_TICK = 0.25
-"""Seconds between two questions to a mount: it is to be left within a second of arming."""
+from mavftpfs.shared.errors import LinkClosed
 
 
-class Hearing(Protocol):
-    """Is told what is heard; a vehicle is a system id."""
+class Heard(NamedTuple):
+    """A heartbeat of a vehicle. restarted, refused: since the last one it restarted, or refused to be
+    armed."""
 
-    def heard(self, system: int, *, armed: bool) -> None:
-        """A heartbeat came."""
-
-    def refused(self, system: int) -> None:
-        """It refused to be armed."""
-
-    def restarted(self, system: int) -> None:
-        """It restarted."""
-
-    def replaced(self, system: int) -> None:
-        """Another vehicle has its system id now; the contact is of no use any more."""
-
-    def ended(self, error: LinkError) -> None:
-        """The contact is of no use any more."""
-
-    def time_passed(self) -> None:
-        """Called at intervals, whatever is heard."""
+    system: int
+    armed: bool
+    restarted: bool = False
+    refused: bool = False
 
 
 class Contact(Protocol):
-    """A way to vehicles."""
+    """A way to vehicles, to the files of one of them."""
 
     @property
     def system(self) -> int | None:
         """The vehicle whose files can be had, None before one was heard."""
 
-    async def listen(self, hearing: Hearing) -> None:
-        """Call `hearing` for all that is heard, until cancelled."""
+    @property
+    def replaced(self) -> bool:
+        """Whether another vehicle has that system id now, so that the contact is of no use."""
+
+    @property
+    def uid(self) -> str | None:
+        """The unique id of that vehicle, None as long as it does not tell it."""
+
+    async def listen(self) -> list[Heard]:
+        """Return what was heard since the last call.
+
+        Raises:
+            LinkError: the contact broke.
+        """
 
     async def identity(self) -> str | None:
-        """Return the unique id of the vehicle whose files can be had, None if it does not tell it."""
+        """Return the unique id when the vehicle told it; None if it does not."""
 
-    async def enter(self, stack: AsyncExitStack) -> Session:
-        """Return that vehicle's files; they can be had until the stack is left."""
+    def session(self) -> AbstractAsyncContextManager[Session]:
+        """Give that vehicle's files for the length of the body.
+
+        Raises:
+            LinkError: they are to be had another way now.
+        """
 
 
 @dataclass(slots=True)
 class LinkContact:
-    """A connection of our own. Leaving it closes the server's session."""
+    """A connection of the watch's own. When the connection ends it closes the server's session.
+
+    is_mounted: returns whether a mount has the vehicle now, which would share its only session.
+    """
 
     connection: Connection
     spec: LinkSpec
     options: Options
+    is_mounted: Callable[[], Awaitable[bool]] | None = None
     _seen: dict[Address, Heartbeat] = field(default_factory=dict)
+    _restarts: int = 0
+    _refusals: int = 0
 
     @property
     def system(self) -> int | None:
@@ -77,89 +84,77 @@ class LinkContact:
         address = self.connection.vehicle.address
         return None if address is None else address.system
 
-    async def listen(self, hearing: Hearing) -> None:
-        """See Contact."""
-        self.connection.subscribe(lambda news: self._on_news(news, hearing))
-        while True:
-            if self.system is not None and self._replaced:
-                hearing.replaced(self.system)
-            else:
-                self._look(hearing)
-            hearing.time_passed()
-            await trio.sleep(TICK)
-
     @property
-    def _replaced(self) -> bool:
+    def replaced(self) -> bool:
+        """See Contact."""
         return self.connection.vehicle.identity.standing is Standing.STRANGER
 
-    def _on_news(self, news: str, hearing: Hearing) -> None:
-        self._look(hearing)
-        if self.system is not None and news == "arming refused":
-            hearing.refused(self.system)
-        if self.system is not None and news == "reboot":
-            hearing.restarted(self.system)
+    @property
+    def uid(self) -> str | None:
+        """See Contact."""
+        version = self.connection.vehicle.version
+        return None if version is None else version.board
 
-    def _look(self, hearing: Hearing) -> None:
-        heard = self.connection.vehicle.heard
-        for address, heartbeat in heard.items():
-            if self._seen.get(address) is heartbeat or not self._is_wanted(heartbeat):
-                continue
-            self._seen[address] = heartbeat
-            main = Address(address.system, MAV_COMP_ID_AUTOPILOT1)
-            if address == main or main not in heard:
-                hearing.heard(address.system, armed=heartbeat.armed)
-
-    def _is_wanted(self, heartbeat: Heartbeat) -> bool:
-        wanted = self.options.target_system in (0, heartbeat.source.system)
-        return wanted and heartbeat.autopilot != MAV_AUTOPILOT_INVALID
+    async def listen(self) -> list[Heard]:
+        """See Contact."""
+        await trio.lowlevel.checkpoint()
+        vehicle, found = self.connection.vehicle, []
+        restarted, self._restarts = vehicle.reboots > self._restarts, vehicle.reboots
+        refused, self._refusals = vehicle.refusals > self._refusals, vehicle.refusals
+        for heartbeat in vehicles_in(vehicle.heard.values()):
+            source = heartbeat.source
+            own = source.system == self.system
+            new = self._seen.get(source) is not heartbeat or (own and (restarted or refused))
+            if new and self.options.target_system in (0, source.system):
+                self._seen[source] = heartbeat
+                found.append(Heard(source.system, heartbeat.armed, own and restarted, own and refused))
+        return found
 
     async def identity(self) -> str | None:
         """See Contact."""
-        version = await told_version(self.connection)
-        return None if version is None else version.board
+        await told_version(self.connection)
+        return self.uid
 
-    async def enter(self, stack: AsyncExitStack) -> Session:
+    @asynccontextmanager
+    async def session(self) -> AsyncIterator[Session]:
         """See Contact."""
-        vehicle = await stack.enter_async_context(with_tree(self.connection, self.spec, self.options))
-        return session_of(vehicle, self.options)
+        if self.is_mounted is not None and await self.is_mounted():
+            raise LinkClosed("a mount has this vehicle now: its files are used")
+        async with with_tree(self.connection, self.spec, self.options) as vehicle:
+            yield session_of(vehicle, self.options)
 
 
 @dataclass(slots=True)
 class MountContact:
-    """A mount that is up. It closes the server's session itself when it is not used."""
+    """A mount that is up. The mount closes the server's session itself when nothing uses it."""
 
-    session: Session
+    files: Session
     system: int | None = None
-    _uid: str | None = None
+    uid: str | None = None
+    replaced: bool = False
     _restarts: int = 0
     _refusals: int = 0
 
-    async def listen(self, hearing: Hearing) -> None:
+    async def listen(self) -> list[Heard]:
         """See Contact."""
-        try:
-            while True:
-                status = await self.session.status()
-                vehicle = status["vehicle"]
-                if self.system is not None and vehicle["restarts"] > self._restarts:
-                    hearing.restarted(self.system)
-                if self.system is not None and vehicle.get("arming_refused", 0) > self._refusals:
-                    hearing.refused(self.system)
-                self.system, self._uid = vehicle["system"], vehicle["uid"]
-                self._restarts = vehicle["restarts"]
-                self._refusals = vehicle.get("arming_refused", 0)  # an older mount does not tell it
-                if self.system is not None and status["link"]["state"] in ("fine", "lossy"):
-                    hearing.heard(self.system, armed=vehicle["armed"])
-                hearing.time_passed()
-                await trio.sleep(MOUNT_TICK)
-        except LinkError as exc:
-            hearing.ended(exc)
+        status = await self.files.status()
+        vehicle, first = status["vehicle"], self.system is None
+        system, self.uid = vehicle["system"], vehicle["uid"]
+        restarts, refusals = vehicle["restarts"], vehicle["arming_refused"]
+        restarted = not first and restarts > self._restarts
+        refused = not first and refusals > self._refusals
+        self.system, self._restarts, self._refusals = system, restarts, refusals
+        if system is None or status["link"]["state"] not in ("fine", "lossy"):
+            return []
+        return [Heard(system, vehicle["armed"], restarted, refused)]
 
     async def identity(self) -> str | None:
         """See Contact."""
         await trio.lowlevel.checkpoint()
-        return self._uid
+        return self.uid
 
-    async def enter(self, stack: AsyncExitStack) -> Session:
+    @asynccontextmanager
+    async def session(self) -> AsyncIterator[Session]:
         """See Contact."""
         await trio.lowlevel.checkpoint()
-        return self.session
+        yield self.files

@@ -1,7 +1,7 @@
-"""Fetching one file so that it can go on after an interruption, and is proven. Layer: client.
+"""Downloads one file, resumes after an interruption, and verifies it. Layer: client.
 
-A file is kept as NAME.part until it is whole; only then it gets its name. If an earlier run left a .part, the
-fetch goes on with it, and then the vehicle's CRC32 of the whole file must agree.
+The bytes go into NAME.part, which gets its name only when the file is whole. If an earlier run left a .part,
+the download resumes it, and then the vehicle's CRC32 of the whole file must agree.
 """
 
 from __future__ import annotations
@@ -18,19 +18,18 @@ from pathlib import Path
 
 import trio
 
+from mavftpfs.client.compare import (
+    GENERATED,
+    Comparison,
+    Content,
+    Match,
+    Verify,
+    compare,
+    local_crc32,
+    wants_checksum,
+)
 from mavftpfs.client.files import READ_SIZE, Session, reading
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import (
-    BY_CRC32,
-    BY_SIZE,
-    GENERATED,
-    NOT_ASKED,
-    Proof,
-    Verify,
-    ask_crc32,
-    local_crc32,
-    proof_needed,
-)
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -40,7 +39,7 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
-from mavftpfs.shared.model import EntryKind, is_snapshot
+from mavftpfs.shared.model import EntryKind
 from mavftpfs.shared.readable import name_text, readable_size
 
 LEAST_READ, LARGEST_READ = 2048, 128 * 1024
@@ -98,7 +97,8 @@ class Wanted:
     """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
     part: where it lies until it is whole. keep_old: a local file of that name may be the beginning of this
-    one; if it is not, it is renamed to NAME.~1~.
+    one; if it is not, it is renamed to NAME.~1~. growing: the vehicle still writes it: what it
+    has now stays a .part.
     """
 
     remote: bytes
@@ -108,6 +108,7 @@ class Wanted:
     local: Path
     part: Path
     keep_old: bool = False
+    growing: bool = False
 
     @property
     def here(self) -> bool:
@@ -123,6 +124,10 @@ class Wanted:
             return part
         old = _size(self.local) if self.keep_old else 0
         return old if 0 < old < self.size else 0
+
+
+def _still_growing(name: str, came: int) -> StillGrowing:
+    return StillGrowing(f"{name} is still growing: only its first {readable_size(came)} came", came)
 
 
 def _size(path: Path) -> int:
@@ -142,9 +147,14 @@ class Fetched:
     wanted: Wanted
     size: int
     resumed: int
-    proof: Proof
+    verified: Comparison
     was_here: bool = False
     kept: Path | None = None
+
+    @property
+    def proven(self) -> bool:
+        """Whether its checksum was compared, or need not be compared later."""
+        return not (self.verified.lacking and self.verified.later)
 
     @property
     def kept_words(self) -> str:
@@ -258,16 +268,17 @@ class Fetcher:
     verify: Verify = "auto"
 
     async def fetch(self, wanted: Wanted) -> Fetched:
-        """Fetch a file. If the vehicle is lost for a while, go on when it is heard again.
+        """Download a file. If the vehicle is lost meanwhile, wait for it, and resume.
 
         Raises:
             DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
-            UsageError: the local disk does not take it. VehicleLost: it was not heard again within
-            connect_timeout. Else as Files.open and OpenFile.read.
+            UsageError: the local disk refuses it. VehicleLost: the vehicle was not heard again within
+            connect_timeout. Otherwise as Files.open and File.read.
         """
         for _ in range(MAX_RETURNS):
             try:
-                return await self._fetch(wanted)
+                with local_disk(wanted.local):
+                    return await self._fetch(wanted)
             except (VehicleLost, RequestTimeout) as exc:
                 if not await self.session.lost():
                     raise
@@ -276,86 +287,88 @@ class Fetcher:
         raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")
 
     async def write_to(self, remote: bytes, take: Take) -> None:
-        """Hand a file's bytes on, and prove them.
+        """Pass the bytes of a file on, and verify them.
 
         Raises:
-            IsADirectory. DataUnproven, StillGrowing: it is not what the vehicle has. Else as `fetch`.
+            IsADirectory. DataUnproven, StillGrowing: the vehicle has something else. Otherwise as `fetch`.
         """
         name = name_text(remote)
         if (await self.session.files.stat(remote)).kind is EntryKind.DIRECTORY:
             raise IsADirectory(f"{name} is a directory")
-        size, crc = await self._copy(remote, take, 0, 0)
-        await self._prove(remote, name, size, crc, resumed=False)
+        content = await self._copy(remote, take, Content(0, 0))
+        await self._verify(remote, name, content, resumed=False)
 
     async def _fetch(self, wanted: Wanted) -> Fetched:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
-        with local_disk(wanted.local):
-            proof = await self._prove_here(wanted) if wanted.here else None
-            if proof is not None:
-                return Fetched(wanted, wanted.size, wanted.size, proof, was_here=True)
-            if wanted.keep_old:  # logs keep their directories
-                wanted.local.parent.mkdir(parents=True, exist_ok=True)
-            part = Part(wanted.part, wanted.local)
-            try:
-                begun = wanted.begun
-                if part.size != begun:
-                    part.cut(0)
-                    if begun:
-                        await trio.to_thread.run_sync(shutil.copyfile, wanted.local, part.path)
-                return await self._fetch_and_commit(wanted, part)
-            except DataUnproven:
-                part.drop()
-                raise
-            finally:
-                part.close()
+        verified = await self._compare_here(wanted) if wanted.here else None
+        if verified is not None:
+            return Fetched(wanted, wanted.size, wanted.size, verified, was_here=True)
+        if wanted.keep_old:  # logs keep their directories
+            wanted.local.parent.mkdir(parents=True, exist_ok=True)
+        part = Part(wanted.part, wanted.local)
+        try:
+            begun = wanted.begun
+            if part.size != begun:
+                part.cut(0)
+                if begun:
+                    await trio.to_thread.run_sync(shutil.copyfile, wanted.local, part.path)
+            return await self._fetch_and_commit(wanted, part)
+        except DataUnproven:
+            part.drop()
+            raise
+        finally:
+            part.close()
 
-    async def _prove_here(self, wanted: Wanted) -> Proof | None:
-        """Return how a local file of the same size was proven to be this one; None if it is another one, or
-        that is not known. A log counts as the same by its size; any other file needs the same time, too."""
-        if is_snapshot(self.session.on_vehicle(wanted.remote)):
-            return None
-        answer = NOT_ASKED
+    async def _compare_here(self, wanted: Wanted) -> Comparison | None:
+        """Compare a local file that has the right size; return None if the file has to be downloaded.
+
+        Without a checksum, the size is enough for a log, and another file needs the same time, too.
+        """
+        checksum = wants_checksum(self.verify, wanted.size)
         self.progress.begin(wanted.name, wanted.size, wanted.size)
-        if proof_needed(self.verify, resumed=False, size=wanted.size):
+        if checksum:
             self.progress.check()
-            answer = await ask_crc32(self.session, wanted.remote)
-        if answer.crc is not None:
-            return BY_CRC32 if answer.crc == await local_crc32(wanted.local) else None
-        if wanted.keep_old:
-            return Proof("size", answer.lacking, answer.later)
+        found = await compare(self.session, wanted.remote, wanted.local, size=wanted.size, checksum=checksum)
+        if found is GENERATED or found.match is Match.DIFFERS:
+            return None
+        if found.match is Match.SAME or wanted.keep_old:
+            return found
         same_time = int(wanted.local.stat().st_mtime) == wanted.mtime
-        return Proof("size and time", answer.lacking, answer.later) if same_time else None
+        return replace(found, how="size and time") if same_time else None
 
     async def _fetch_and_commit(self, wanted: Wanted, part: Part) -> Fetched:
         resumed = part.size
         try:
-            size, proof = await self._attempt(wanted, part)
+            size, verified = await self._attempt(wanted, part)
         except DataUnproven:
             await self.session.files.refresh()
             part.cut(0)
             resumed = 0
-            size, proof = await self._attempt(wanted, part)
+            size, verified = await self._attempt(wanted, part)
         kept = await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
-        return Fetched(wanted, size, resumed, proof, kept=kept)
+        return Fetched(wanted, size, resumed, verified, kept=kept)
 
-    async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, Proof]:
-        """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
-        here = size = part.size
+    async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, Comparison]:
+        """Download what is missing, and verify the whole; return its size, and how it was verified."""
+        here = part.size
         self.progress.begin(wanted.name, wanted.size, here)
-        crc = await local_crc32(part.path) if here else 0
+        content = Content(here, await local_crc32(part.path) if here else 0)
 
         async def take(data: bytes | memoryview) -> None:
             part.append(data)
 
         if here == 0 or here < wanted.size:
-            size, crc = await self._copy(wanted.remote, take, here, crc)
+            content = await self._copy(wanted.remote, take, content)
+        if wanted.growing:
+            raise _still_growing(wanted.name, content.size)
         self.progress.check()
-        return size, await self._prove(wanted.remote, wanted.name, size, crc, resumed=here > 0)
+        return content.size, await self._verify(wanted.remote, wanted.name, content, resumed=here > 0)
 
-    async def _copy(self, remote: bytes, take: Take, offset: int, crc: int) -> tuple[int, int]:
-        """Hand on a file from `offset` on. crc: that of the bytes before. Returns its size and CRC32."""
+    async def _copy(self, remote: bytes, take: Take, here: Content) -> Content:
+        """Pass on the bytes of a file behind those that are here; return all that is here then."""
         amount = LEAST_READ
+        offset, crc = here
         async with reading(self.session.files, remote) as file:
             if offset > file.size:
                 raise DataUnproven(f"{name_text(remote)} has shrunk from {offset} to {file.size} bytes")
@@ -369,43 +382,38 @@ class Fetcher:
                 crc = crc32(data, crc)
                 offset += len(data)
                 self.progress.at(offset)
-            return file.size, crc
+            return Content(file.size, crc)
 
-    async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> Proof:
-        """Compare with the vehicle's checksum if that is wanted and can be had; return what was proven.
+    async def _verify(self, remote: bytes, name: str, content: Content, *, resumed: bool) -> Comparison:
+        """Compare the downloaded bytes with the vehicle's file; return how they were verified.
 
         Raises:
-            DataUnproven: they differ, or a file that was resumed has to be fetched again from the beginning.
+            DataUnproven: they differ, or a resumed file has to be downloaded again from the beginning.
             StillGrowing, NotProvenYet.
         """
-        if is_snapshot(self.session.on_vehicle(remote)):
-            if resumed:
-                raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
-            return GENERATED
-        answer = NOT_ASKED
-        if proof_needed(self.verify, resumed=resumed, size=size):
-            answer = await ask_crc32(self.session, remote)
-        if answer.crc == crc:
-            return BY_CRC32
-        await self._require_size(remote, name, size)
-        if answer.crc is not None:
-            raise DataUnproven(
-                f"{name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {answer.crc:08x}"
-            )
+        checksum = wants_checksum(self.verify, content.size, resumed=resumed)
+        found = await compare(self.session, remote, content, size=content.size, checksum=checksum)
+        if found is GENERATED and resumed:
+            raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
+        if found is GENERATED or found.match is Match.SAME:
+            return found
+        await self._require_size(remote, name, content.size)
+        if found.match is Match.DIFFERS:
+            raise DataUnproven(f"{name}: {found.how}")
         if not resumed:
-            return replace(BY_SIZE, lacking=answer.lacking, later=answer.later)
-        if not answer.later:
-            raise DataUnproven(f"{name} was resumed, and there is no checksum: {answer.lacking}")
-        raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not proven: {answer.lacking}")
+            return found
+        if not found.later:
+            raise DataUnproven(f"{name} was resumed, and there is no checksum: {found.lacking}")
+        raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not proven: {found.lacking}")
 
     async def _require_size(self, remote: bytes, name: str, size: int) -> None:
-        """Ask for the size again, because no checksum proves that the file is whole.
+        """Ask for the size again, because no checksum shows that the file is whole.
 
         Raises:
             StillGrowing: it has become larger. DataUnproven: it has become smaller.
         """
         now = await self.session.size_now(remote)
         if now > size:
-            raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came", size)
+            raise _still_growing(name, size)
         if now < size:
             raise DataUnproven(f"{name} has shrunk from {size} to {now} bytes")

@@ -11,10 +11,10 @@ from contextlib import suppress
 
 import trio
 
+from mavftpfs.client.compare import Match, compare
 from mavftpfs.client.connect import VERSION_PATIENCE
 from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import NO_CHECKSUM, local_crc32
 from mavftpfs.client.recovered import Recovered, recovered_in
 from mavftpfs.client.upload import put_file
 from mavftpfs.shared.errors import (
@@ -54,7 +54,7 @@ async def put_back(
         there_already = await _is_there(session, path, copy)
         if not there_already:
             await put_file(session, copy.file, path, progress)
-            if await _differs(session, path, copy):
+            if (await compare(session, path, copy.file)).match is Match.DIFFERS:
                 raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {copy.file}")
         _forget(copy)
         tell(copy, there_already)
@@ -96,7 +96,7 @@ async def _is_there(session: Session, path: bytes, copy: Recovered) -> bool:
         return False
     if found.kind is not EntryKind.FILE:
         raise UsageError(f"{name_text(path)} is a directory on the vehicle")
-    if found.size == copy.size and await _differs(session, path, copy) is False:
+    if (await compare(session, path, copy.file, size=found.size)).match is Match.SAME:
         return True
     before = copy.facts.get("size_on_vehicle")
     if found.size not in (before, 0):  # an empty one holds nothing to lose
@@ -106,14 +106,6 @@ async def _is_there(session: Session, path: bytes, copy: Recovered) -> bool:
             f"it was changed since; to replace it: mavftpfs put SOURCE {copy.file} {name_text(path)}"
         )
     return False
-
-
-async def _differs(session: Session, path: bytes, copy: Recovered) -> bool | None:
-    """Compare with the vehicle's checksum; None where there is none."""
-    try:
-        return await session.files.crc32(path) != await local_crc32(copy.file)
-    except NO_CHECKSUM:
-        return None
 
 
 def _forget(copy: Recovered) -> None:

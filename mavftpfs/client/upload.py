@@ -17,12 +17,12 @@ from typing import Any, BinaryIO
 import trio
 
 from mavftpfs.cache.reserved import MAX_NAME, fits_rename
+from mavftpfs.client.compare import BY_CRC32, BY_SIZE
 from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, written
 from mavftpfs.client.mounted import WITHDRAWAL_TIME
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import BY_CRC32, BY_SIZE
 from mavftpfs.client.status import BESIDE
 from mavftpfs.shared.errors import (
     CrossDevice,
@@ -42,8 +42,8 @@ Tell = Callable[[bytes, int, str], None]
 """Called with the path of a file that was put, its size, and how it was verified."""
 
 _WAYS = {
-    "verified_by_size": BY_SIZE.words,
-    "verified_by_crc": BY_CRC32.words,
+    "verified_by_size": BY_SIZE.how,
+    "verified_by_crc": BY_CRC32.how,
 }
 
 ASK_PERIOD = 0.25

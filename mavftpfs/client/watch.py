@@ -1,59 +1,56 @@
-"""Brings logs automatically: connects, looks, fetches and lets go as `flights` decides. Layer: client.
+"""Downloads logs after each flight: syncs again and again, as `watchpolicy` decides. Layer: client.
 
-One task listens for vehicles. Another one takes the steps, one at a time; news end a step that must not go
-on. A third hands on the logs that came. A transfer lets go by leaving the connection, which closes the
-server's session.
+`Watch.serve` listens to the vehicles, and starts a sync of one of them when it is due. If the vehicle arms,
+refuses to be armed or is lost, `serve` cancels the sync. After each sync, cancelled or not, the watch leaves
+the connection, which closes the server's session.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from math import inf
 from pathlib import Path
 
 import trio
 
-from mavftpfs.client.brought import HEAD, Brought, Memory
+from mavftpfs.client.compare import Verify
 from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
-from mavftpfs.client.contact import TICK, Contact, LinkContact, MountContact
-from mavftpfs.client.download import Wish, named, wanted_logs
+from mavftpfs.client.contact import Contact, Heard, LinkContact, MountContact
+from mavftpfs.client.download import Downloads, Outcome, Reports, named
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
-from mavftpfs.client.flights import Fetch, Log, Look, Policy, Step, Wait
+from mavftpfs.client.logs import Wish, path_of, sync
+from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
 from mavftpfs.client.options import Options
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import Verify
 from mavftpfs.client.selection import is_no_log
+from mavftpfs.client.watchpolicy import Log, Policy
 from mavftpfs.link.base import Link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected
-from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout
+from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout, UsageError
 from mavftpfs.shared.readable import readable_size
 
+TICK = 0.25
+"""Seconds between two looks at what was heard: a vehicle that is armed gets no request a second later."""
 REOPEN = 5.0
 """Seconds until a link that cannot be opened is tried again."""
 SPARE = 1 << 20
 """Bytes that are left free on the local disk; they count as needed."""
 
 HandOn = Callable[[Path], Awaitable[str]]
-"""Does something with a log that came; returns why it failed, or ""."""
+"""Runs a command for a downloaded log; returns why the command failed, or ""."""
 
 
-@dataclass(frozen=True, slots=True)
-class WatchWish:
-    """What is to be brought. logs: as `sync` has it."""
-
-    logs: Wish
-    verify: Verify = "auto"
+class LocalTrouble(UsageError):
+    """The local directory is not there, or has no room."""
 
 
 class Watch:
-    """Brings the logs of each vehicle that comes, into a directory for each. say: gets lines for people.
+    """Downloads the logs of each vehicle that comes, into a directory for each. say: gets lines for people.
 
     Raises:
         UsageError: the directory cannot be used.
@@ -61,335 +58,384 @@ class Watch:
 
     def __init__(
         self,
-        wish: WatchWish,
+        wish: Wish,
         say: Callable[[str], None],
         hand_on: HandOn | None = None,
         progress: Progress | None = None,
+        verify: Verify = "auto",
     ) -> None:
         self._wish = wish
-        self._local = wish.logs.local
+        self._verify: Verify = verify
+        self._complaints = Complaints(say)
         self._say = say
-        self._hand_on = hand_on
         self._progress = progress or Progress()
-        self._policy = Policy()
-        self._step: Step | None = None
-        self._scope = trio.CancelScope()
-        self._leave = False
-        self._broken: LinkError | None = None
-        self._wanted_system = 0
-        self._logs: dict[int, dict[bytes, Wanted]] = {}
-        self._names: dict[int, str] = {}
-        self._target: Target | None = None
-        self._same_heads: set[tuple[str, str]] = set()
-        self._to_hand_on, self._handed_over = trio.open_memory_channel[Brought](inf)
-        self._complaints: dict[str, str] = {}
-        with local_disk(self._local):
-            self._local.mkdir(parents=True, exist_ok=True)
-            self._memory = Memory(self._local)
-            self._memory.begin()
+        self._policies: dict[int, Policy] = {}
+        self._sync: VehicleSync | None = None
+        self._turn = 0
+        self.keeping = Keeping(wish.local, say, hand_on)
 
-    # --- what is heard (Hearing)
-
-    def heard(self, system: int, *, armed: bool) -> None:
-        """See contact.Hearing."""
-        news = self._policy.heard(system, armed, trio.current_time())
-        if not news:
-            return
-        if news in ("here", "back"):
-            self._same_heads.clear()
-            news += f", {'armed' if armed else 'disarmed'}"
-        self._tell_of(system, f"is {news}")
-
-    def refused(self, system: int) -> None:
-        """See contact.Hearing."""
-        now = trio.current_time()
-        was_free = self._policy.may_transfer(system, now)
-        self._policy.refused(system, now)
-        if was_free:
-            self._tell_of(system, "refused to be armed: nothing is transferred for a minute")
-
-    def restarted(self, system: int) -> None:
-        """See contact.Hearing."""
-        self._same_heads.clear()
-        self._policy.restarted(system, trio.current_time())
-        self._tell_of(system, "restarted")
-
-    def replaced(self, system: int) -> None:
-        """See contact.Hearing."""
-        self._policy.replaced(system)
-        self._leave = True
-        self._tell_of(system, "is another one now")
-
-    def ended(self, error: LinkError) -> None:
-        """See contact.Hearing."""
-        self._leave, self._broken = True, error
-        self._end_step()
-
-    def time_passed(self) -> None:
-        """See contact.Hearing."""
-        for system in self._policy.newly_lost(trio.current_time()):
-            self._tell_of(system, "is lost")
-
-    def _tell_of(self, system: int, news: str) -> None:
-        self._end_step()
-        stopped = isinstance(self._step, Fetch) and self._scope.cancel_called
-        self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
-
-    def _end_step(self) -> None:
-        """News came: end the step under way, unless it asks a vehicle and may go on."""
-        step, now = self._step, trio.current_time()
-        asks = isinstance(step, Look | Fetch) and self._policy.may_transfer(step.system, now)
-        if self._leave or not asks:
-            self._scope.cancel()
-
-    # --- what is done
+    # --- the way to the vehicles
 
     async def run(self, target: Target) -> None:
-        """Bring logs, by a mount that is up or over a link of our own, until cancelled.
+        """Download logs, by a mount that is up or over a link of the watch's own, until cancelled.
 
         Raises:
             UsageError: SOURCE or the options are wrong.
         """
-        self._target = target
         async with plain_nursery() as nursery:
-            nursery.start_soon(self._hand_on_all)
+            nursery.start_soon(self.keeping.hand_on_all)
             while True:
                 try:
                     mounted = await target.mounted()
-                    if mounted is not None:
-                        self._forget_complaint("link")
-                        await self.serve(MountContact(mounted))
-                        continue
-                    assert target.spec is not None
-                    async with opened(target.spec, target.options) as link:
-                        self._forget_complaint("link")
-                        await self.run_on(link, target.spec, target.options, target.sinks)
+                    if mounted is None:
+                        await self._run_on_link(target)
+                    else:
+                        self._complaints.over("link")
+                        contact = MountContact(mounted)
+                        while True:
+                            await self.serve(contact)
                 except (LinkError, RequestTimeout) as exc:
-                    self._complain("link", str(exc))
+                    self._complaints.tell("link", str(exc))
                 await trio.sleep(REOPEN)
 
-    async def run_on(self, link: Link, spec: LinkSpec, options: Options, sinks: Sinks = NO_SINKS) -> None:
-        """Serve each vehicle that is heard on an open link.
+    async def _run_on_link(self, target: Target) -> None:
+        assert target.spec is not None
+
+        async def is_mounted() -> bool:
+            return await target.mounted() is not None
+
+        async with opened(target.spec, target.options) as link:
+            self._complaints.over("link")
+            await self.run_on(link, target.spec, target.options, target.sinks, is_mounted)
+
+    async def run_on(
+        self,
+        link: Link,
+        spec: LinkSpec,
+        options: Options,
+        sinks: Sinks = NO_SINKS,
+        is_mounted: Callable[[], Awaitable[bool]] | None = None,
+    ) -> None:
+        """Serve each vehicle that is heard on an open link, one after the other.
+
+        is_mounted: returns whether a mount has the vehicle now.
 
         Raises:
-            LinkClosed: it was closed for good.
+            LinkError: it was closed for good, or a mount has the vehicle now.
         """
         while True:
-            system = options.target_system or self._wanted_system
-            settings = replace(connect_options(options), target_system=system)
+            settings = replace(connect_options(options), target_system=options.target_system or self._turn)
             async with connected(
                 link, settings, on_payload=sinks.payload, on_frame=sinks.frame
             ) as connection:
-                await self.serve(LinkContact(connection, spec, options))
+                await self.serve(LinkContact(connection, spec, options, is_mounted))
 
     async def serve(self, contact: Contact) -> None:
-        """Take the steps for a vehicle. Return when the contact has to be left, to close its session or to
-        serve another vehicle.
+        """Listen, and sync the logs of one vehicle when that is due. Return when the contact is to be left.
 
         Raises:
             LinkError: the contact broke.
         """
-        self._leave, self._broken = False, None
-        async with plain_nursery() as nursery, AsyncExitStack() as stack:
-            nursery.start_soon(contact.listen, self)
-            session: Session | None = None
-            while not self._leave:
-                step = self._policy.next(trio.current_time())
-                if isinstance(step, Wait):
-                    await self._take(step, partial(trio.sleep_until, step.until))
-                elif contact.system is None:
-                    await trio.sleep(TICK)
-                elif step.system != contact.system:
-                    self._wanted_system = step.system
-                    await trio.sleep(TICK)
-                    break
-                elif session is None:
-                    session = await contact.enter(stack)  # then another step may be due
-                else:
-                    await self._take(step, partial(self._work, step, contact, session))
-                    if self._scope.cancel_called:
-                        break
-        if self._broken is not None:
-            raise self._broken
+        self._sync = None
+        async with plain_nursery() as nursery:
+            while not contact.replaced:
+                self._hear(await contact.listen())
+                self._forget_another(contact)
+                now = trio.current_time()
+                running: VehicleSync | None = self._sync
+                if running is not None and (running.over or not running.policy.may_transfer(now)):
+                    if running.broken is not None:
+                        raise running.broken
+                    return
+                system = self._due(contact.system, now) if running is None else None
+                if system is not None and system == contact.system:
+                    self._sync = self._new_sync(system)
+                    nursery.start_soon(self._sync.run, contact)
+                elif system not in (None, self._turn):
+                    self._turn = system
+                    return
+                await trio.sleep(TICK)
+        self._forget_another(contact)
 
-    async def _take(self, step: Step, work: Callable[[], Awaitable[None]]) -> None:
-        """Take a step, which `_end_step` may end."""
-        with trio.CancelScope() as self._scope:
-            self._step = step
-            try:
-                await work()
-            finally:
-                self._step = None
-
-    async def _work(self, step: Look | Fetch, contact: Contact, session: Session) -> None:
-        if not self._local_is_ready(step):
-            self._policy.local_trouble(trio.current_time())
-        elif isinstance(step, Fetch):
-            await self._fetch(step.system, step.log, session)
-        elif isinstance(contact, LinkContact) and await self._is_mounted():
-            raise LinkClosed("a mount has this vehicle now: its files are used")
+    def _forget_another(self, contact: Contact) -> None:
+        """Begin anew with a system id that another vehicle has now."""
+        system, uid = contact.system, contact.uid
+        policy = None if system is None else self._policies.get(system)
+        if system is None or policy is None:
+            return
+        if contact.replaced or (uid and policy.uid and uid != policy.uid):
+            del self._policies[system]
+            self._say(f"vehicle {system} is another one now")
         else:
-            await self._look(step.system, contact, session)
+            policy.uid = uid or policy.uid
 
-    async def _is_mounted(self) -> bool:
-        """Return whether a mount of that vehicle came up: we would share its only session."""
-        return self._target is not None and await self._target.mounted() is not None
+    def _due(self, served: int | None, now: float) -> int | None:
+        """Return a vehicle whose logs are to be synced, None if there is none; `served` comes first."""
+        due = sorted(system for system, policy in self._policies.items() if policy.due(now))
+        return served if served in due else due[0] if due else None
 
-    async def _look(self, system: int, contact: Contact, session: Session) -> None:
-        """List the logs, and tell the policy which are new."""
-        name = self._names[system] = await contact.identity() or f"system-{system}"
-        local = self._local / name
-        self._complain(f"name of {system}", f"vehicle {system} is {name}; its logs go into {local}")
-        await session.files.refresh()
-        self._logs[system] = {}
-        failed = False
+    def _new_sync(self, system: int) -> VehicleSync:
+        policy = self._policies[system]
+        told = self._complaints, self._say, self._progress
+        return VehicleSync(system, policy, self._wish, self._verify, self.keeping, *told)
+
+    # --- what is heard
+
+    def _hear(self, found: Sequence[Heard]) -> None:
+        """Take heartbeats, and tell people what is new."""
+        now = trio.current_time()
+        for one in found:
+            policy = self._policies.setdefault(one.system, Policy())
+            news = policy.heard(one.armed, now)
+            if news in ("here", "back"):
+                news += f", {'armed' if one.armed else 'disarmed'}"
+            if news:
+                self._tell_of(one.system, f"is {news}", now)
+            if one.restarted:
+                policy.restarted(now)
+                self._tell_of(one.system, "restarted", now)
+            if one.refused:
+                was_free = policy.may_transfer(now)
+                policy.refused(now)
+                if was_free:
+                    told = "refused to be armed: nothing is transferred for a minute"
+                    self._tell_of(one.system, told, now)
+        for system, policy in self._policies.items():
+            if policy.newly_lost(now):
+                self._tell_of(system, "is lost", now)
+
+    def _tell_of(self, system: int, news: str, now: float) -> None:
+        transfers = self._sync is not None and self._sync.system == system and bool(self._progress.name)
+        stopped = transfers and not self._policies[system].may_transfer(now)
+        self._say(f"vehicle {system} {news}{'; the transfer waits' if stopped else ''}")
+
+
+class Complaints:
+    """Tells people each trouble once, until it is over or another one comes."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._told: dict[str, str] = {}
+
+    def tell(self, about: str, line: str) -> None:
+        """Say a line, unless it was the last one about the same thing."""
+        if self._told.get(about) != line:
+            self._told[about] = line
+            self._say(line)
+
+    def over(self, about: str) -> None:
+        """Forget the last line about something."""
+        self._told.pop(about, None)
+
+
+class Keeping:
+    """The local directory of a watch: its manifest, its room, and the command that is run for each log.
+
+    Raises:
+        UsageError: the directory cannot be used.
+    """
+
+    def __init__(self, local: Path, say: Callable[[str], None], hand_on: HandOn | None) -> None:
+        self.local = local
+        self._say = say
+        self._hand_on = hand_on
+        self._new = trio.Event()
+        with local_disk(local):
+            local.mkdir(parents=True, exist_ok=True)
+            self.manifest = Manifest(local)
+            self.manifest.begin()
+
+    def require_room(self, needed: int) -> None:
+        """Check that the directory is there, and has room for so many bytes.
+
+        Raises:
+            LocalTrouble: it is not, or has not.
+        """
+        if not self.manifest.is_there():
+            raise LocalTrouble(f"{self.local} is not there any more; waiting for it")
+        free = free_space(self.local)
+        if free - SPARE < needed:
+            wants = f"{readable_size(needed + SPARE)} are needed, {readable_size(free)} are free"
+            raise LocalTrouble(f"{self.local} is full: {wants}; waiting for room")
+
+    def look(self) -> None:
+        """Read the manifest again: another disk may be at the place now.
+
+        Raises:
+            UsageError: it cannot be read.
+        """
+        with local_disk(self.local):
+            self.manifest = Manifest(self.local)
+
+    def note(self, log: Downloaded) -> None:
+        """Note a log that is here; a command is run for it, if there is one and the log is proven.
+
+        Raises:
+            OSError: the local disk refuses it.
+        """
+        self.manifest.note(replace(log, handed_on=self._hand_on is None or not log.proven))
+        self._new.set()
+
+    async def hand_on_all(self) -> None:
+        """Run the command for the logs that are here, one after the other, also for those of earlier runs for
+        which it failed; return only when there is no command."""
+        tried: set[Downloaded] = set()
+        while self._hand_on is not None:
+            due = [log for log in self.manifest.logs() if log.proven and not log.handed_on]
+            log = next((log for log in due if log not in tried), None)
+            if log is None:
+                self._new = trio.Event()
+                await self._new.wait()
+                continue
+            tried.add(log)
+            if is_file(self.local / log.file):  # a user may have moved it away
+                await self._hand_on_one(log, self._hand_on)
+
+    async def _hand_on_one(self, log: Downloaded, hand_on: HandOn) -> None:
+        problem = await hand_on(self.local / log.file)
+        if problem:
+            self._say(f"{log.file}: {problem}; it is tried again at the next start")
+        elif self.manifest.of(log.vehicle, log.path) == log:  # the log did not grow meanwhile
+            try:
+                with local_disk(self.local):
+                    self.manifest.note(replace(log, handed_on=True))
+            except MavftpfsError as exc:
+                self._say(f"{log.file} was handed on, which could not be noted: {exc}")
+
+
+@dataclass(slots=True)
+class VehicleSync(Reports):
+    """One sync of the logs of a vehicle. over: the sync came to its end; broken: the contact did not survive
+    that."""
+
+    system: int
+    policy: Policy
+    wish: Wish
+    verify: Verify
+    keeping: Keeping
+    complaints: Complaints
+    say: Callable[[str], None]
+    progress: Progress
+    over: bool = False
+    broken: LinkError | None = None
+    _vehicle: str = ""
+
+    async def run(self, contact: Contact) -> None:
+        """Sync, and tell the policy how that went; without the contact the sync stays due."""
+        self.policy.begin()
         try:
-            with local_disk(self._local):
-                self._memory = Memory(self._local)
-            _, logs, unlisted, _ = await wanted_logs(session, self._wish.logs, local)
-            logs = [log for log in logs if not is_no_log(log)]
-            new = [log for log in logs if not await self._is_known(name, log, session)]
-            warning = self._wish.logs.selection.warning(new)
-            if warning:
-                self._complain(f"times of {system}", f"vehicle {system}: {warning}")
-        except NotFound as exc:
-            self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
-            return self._policy.looked(system, (), trio.current_time())
+            self.keeping.require_room(0)
+            self.keeping.look()
+            async with contact.session() as session:
+                await self._sync(session, await contact.identity() or f"system-{self.system}")
+        except LinkClosed as exc:
+            self.broken = exc
+        except (LocalTrouble, LocalDiskFull) as exc:
+            self.complaints.tell("local", str(exc))
+            self.policy.local_trouble(trio.current_time())
+        except NotFound as exc:  # there is no directory of logs before the first flight
+            self._complain("logs", str(exc))
         except MavftpfsError as exc:
-            self._complain(f"logs of {system}", f"vehicle {system}: {exc}")
-            return self._policy.failed(system, None, trio.current_time())
-        for path, error in unlisted:
-            failed = True
-            self._complain(f"logs of {system}", f"vehicle {system}: {named(path, error)}")
-        if not failed:
-            self._forget_complaint(f"logs of {system}")
-        self._logs[system] = {log.remote: log for log in new}
-        self._policy.looked(system, [Log(log.remote, log.size) for log in new], trio.current_time())
-        if failed:
-            self._policy.failed(system, None, trio.current_time())
+            self._complain("logs", str(exc))
+            self.policy.failed(trio.current_time())
+        else:
+            self.complaints.over(f"{self.system} logs")
+        if self.broken is None:
+            self.policy.synced()
+        self.over = True
 
-    async def _is_known(self, name: str, log: Wanted, session: Session) -> bool:
-        """Return whether a log was brought before. Logs without a time are told apart by their first bytes,
-        which are asked for once, until the vehicle was away."""
-        key = name, os.fsdecode(session.on_vehicle(log.remote))
-        known = self._memory.of(*key)
+    async def _sync(self, session: Session, vehicle: str) -> None:
+        self._vehicle, local = vehicle, self.keeping.local / vehicle
+        self._complain("name", f"is {vehicle}; its logs go into {local}", between=" ")
+        outcome = Outcome()
+        downloads = Downloads(Fetcher(session, self.progress, self.verify), outcome, self)
+        try:
+            await sync(downloads, replace(self.wish, local=local), self)
+        finally:
+            self.progress.end(0)
+            self.progress.plan(0, 0)
+        now = trio.current_time()
+        for log in outcome.wanted:
+            error = outcome.failed.get(log.remote)
+            if not isinstance(error, StillGrowing):
+                continue
+            self.policy.grew(log.remote, now)
+            if log.growing:
+                came = f"its first {readable_size(error.came)} are here as {log.part.name}"
+                self._tell(f"{log.name} still grows after the flight; {came}")
+        if any(not isinstance(error, StillGrowing | NotFound) for error in outcome.failed.values()):
+            self.policy.failed(now)
+
+    # --- which logs (Record)
+
+    async def missing(self, session: Session, logs: Sequence[Wanted]) -> list[Wanted]:
+        """See Record: the logs that the policy chooses."""
+        new = [log for log in logs if not is_no_log(log) and not await self._is_known(session, log)]
+        chosen = self.policy.choose([Log(log.remote, log.size) for log in new], trio.current_time())
+        return [replace(log, growing=chosen[log.remote]) for log in new if log.remote in chosen]
+
+    async def _is_known(self, session: Session, log: Wanted) -> bool:
+        """Return whether a log was downloaded before. If the vehicle tells no times, its first bytes are
+        compared, once until the vehicle was away."""
+        path = path_of(session, log)
+        known = self.keeping.manifest.of(self._vehicle, path)
         if known is None or known.size != log.size or not known.proven:
             return False
         if log.mtime is not None and known.mtime is not None:
             return log.mtime == known.mtime
-        if known.head is None or key in self._same_heads:
+        if known.head is None or path in self.policy.unchanged:
             return True
         async with reading(session.files, log.remote) as file:
             same = crc32(await file.read(0, min(HEAD, log.size))) == known.head
         if same:
-            self._same_heads.add(key)
+            self.policy.unchanged.add(path)
         return same
 
-    async def _fetch(self, system: int, log: Log, session: Session) -> None:
-        """Fetch a log, and tell the policy how it went."""
-        wanted = self._logs[system][log.path]
-        key = self._names[system], os.fsdecode(session.on_vehicle(log.path))
+    def note(self, session: Session, fetched: Fetched) -> None:
+        """See Record."""
+        log, path = fetched.wanted, path_of(session, fetched.wanted)
+        with log.local.open("rb") as file:
+            head = crc32(file.read(HEAD))
+        place = str(log.local.relative_to(self.keeping.local))
+        self.keeping.note(
+            Downloaded(path, place, fetched.size, log.mtime, self._vehicle, head, fetched.proven)
+        )
+
+    # --- what is told (Reports)
+
+    def begins(self, wanted: Wanted) -> None:
+        """See Reports; check the local directory first."""
+        self.keeping.require_room(0 if wanted.here else wanted.size - wanted.begun)
+        self.complaints.over("local")
         if not wanted.here:
             begun = f", from {readable_size(wanted.begun)} on" if wanted.begun else ""
-            self._say(f"vehicle {system}: {wanted.name} begins, {readable_size(wanted.size)}{begun}")
-        self._progress.plan(1, wanted.size)
-        try:
-            fetched = await Fetcher(session, self._progress, self._wish.verify).fetch(wanted)
-            with local_disk(wanted.local):
-                self._arrived(system, log, fetched, key)
-        except NotFound:
-            self._policy.fetched(system, log)
-        except StillGrowing as exc:
-            if self._policy.grows(system, log, trio.current_time()):
-                came = f"its first {readable_size(exc.came)} are here as {wanted.part.name}"
-                self._say(f"vehicle {system}: {wanted.name} still grows after the flight; {came}")
-        except LocalDiskFull as exc:
-            self._complain("local", f"{exc}; waiting for room")
-            self._policy.local_trouble(trio.current_time())
-        except MavftpfsError as exc:
-            self._complain(wanted.name, f"vehicle {system}: {named(wanted.name, exc)}; it is tried again")
-            self._policy.failed(system, log, trio.current_time())
+            self._tell(f"{wanted.name} begins, {readable_size(wanted.size)}{begun}")
+
+    def arrived(self, fetched: Fetched) -> None:
+        """See Reports."""
+        name, verified = fetched.wanted.name, fetched.verified
+        self.complaints.over(f"{self.system} {name}")
+        if fetched.proven:
+            self.policy.arrived()
+            self._tell(f"{name} is here, verified by {verified.how}{fetched.kept_words}")
         else:
-            self._forget_complaint("local")
-            self._forget_complaint(wanted.name)
-        finally:
-            self._progress.end(wanted.size)
-            self._progress.plan(0, 0)
+            self.policy.failed(trio.current_time())
+            self._tell(f"{name} is here, not proven: {verified.lacking}")
 
-    def _arrived(self, system: int, log: Log, fetched: Fetched, key: tuple[str, str]) -> None:
-        wanted, proof = fetched.wanted, fetched.proof
-        proven = not (proof.lacking and proof.later)
-        with wanted.local.open("rb") as file:
-            head = crc32(file.read(HEAD))
-        name, path = key
-        place = str(wanted.local.relative_to(self._local))
-        brought = Brought(path, place, fetched.size, wanted.mtime, name, head, proven)
-        self._memory.note(replace(brought, handed_on=not proven or self._hand_on is None))
-        if not proven:
-            self._policy.failed(system, log, trio.current_time())
-            self._say(f"vehicle {system}: {wanted.name} is here, not proven: {proof.lacking}")
-            return
-        self._policy.fetched(system, log)
-        self._say(f"vehicle {system}: {wanted.name} is here, verified by {proof.words}{fetched.kept_words}")
-        if self._hand_on is not None:
-            self._to_hand_on.send_nowait(brought)
+    def failed(self, name: str, error: MavftpfsError) -> None:
+        """See Reports."""
+        if not isinstance(error, StillGrowing | NotFound):
+            self._complain(name, f"{named(name, error)}; it is tried again")
 
-    # --- the local directory
+    def says(self, line: str) -> None:
+        """See Reports."""
+        self._complain("selection", line)
 
-    def _local_is_ready(self, step: Look | Fetch) -> bool:
-        """Return whether the directory is there and has room; if not, complain once."""
-        if not self._memory.is_there():
-            self._complain("local", f"{self._local} is not there any more; waiting for it")
-            return False
-        if isinstance(step, Fetch):
-            wanted = self._logs[step.system][step.log.path]
-            missing = 0 if wanted.here else wanted.size - wanted.begun
-            free = free_space(self._local)
-            if free - SPARE < missing:
-                needed = f"{readable_size(missing + SPARE)} are needed, {readable_size(free)} are free"
-                self._complain("local", f"{self._local} is full: {needed}; waiting for room")
-                return False
-        self._forget_complaint("local")
-        return True
+    def _complain(self, about: str, line: str, between: str = ": ") -> None:
+        self.complaints.tell(f"{self.system} {about}", f"vehicle {self.system}{between}{line}")
 
-    # --- what is handed on
-
-    async def _hand_on_all(self) -> None:
-        """Hand on the logs that came, one after the other; first those that an earlier run did not hand
-        on."""
-        if self._hand_on is None:
-            return
-        for log in self._memory.logs():
-            if log.proven and not log.handed_on:
-                await self._hand_on_one(log, self._hand_on)
-        async for log in self._handed_over:
-            await self._hand_on_one(log, self._hand_on)
-
-    async def _hand_on_one(self, log: Brought, hand_on: HandOn) -> None:
-        path = self._local / log.file
-        if not is_file(path):  # a user took it away
-            return
-        problem = await hand_on(path)
-        if problem:
-            self._say(f"{log.file}: {problem}; it is tried again at the next start")
-            return
-        try:
-            with local_disk(path):
-                self._memory.note(replace(log, handed_on=True))
-        except MavftpfsError as exc:
-            self._say(f"{log.file} was handed on, which could not be noted: {exc}")
-
-    # --- what is said once
-
-    def _complain(self, about: str, line: str) -> None:
-        """Print a line, unless it was the last one about the same thing."""
-        if self._complaints.get(about) != line:
-            self._complaints[about] = line
-            self._say(line)
-
-    def _forget_complaint(self, about: str) -> None:
-        """Forget the last line about something, because it is over."""
-        self._complaints.pop(about, None)
+    def _tell(self, line: str) -> None:
+        self.say(f"vehicle {self.system}: {line}")
 
 
 def is_file(path: Path) -> bool:

@@ -10,7 +10,8 @@ from typing import Any, cast
 import pytest
 import trio
 
-from mavftpfs.client.download import Downloads, Outcome, Wish
+from mavftpfs.client.compare import BY_CRC32, GENERATED, Comparison, Match, Verify
+from mavftpfs.client.download import Downloads, Outcome, Reports
 from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
@@ -21,8 +22,8 @@ from mavftpfs.client.fetch import (
     part_of,
 )
 from mavftpfs.client.files import Files, Session
+from mavftpfs.client.logs import Wish, check, sync
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.proof import BY_CRC32, GENERATED, Proof, Verify
 from mavftpfs.client.selection import Selection
 from mavftpfs.shared.errors import (
     Armed,
@@ -100,7 +101,7 @@ async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path, 
     assert (tmp_path / "big").read_bytes() == BIG
     assert tree.forgotten
     assert int((tmp_path / "big").stat().st_mtime) == MTIME
-    assert (fetched.size, fetched.resumed, fetched.proof) == (len(BIG), 0, BY_CRC32)
+    assert (fetched.size, fetched.resumed, fetched.verified) == (len(BIG), 0, BY_CRC32)
     assert all(file.closed for file in tree.opened)
     assert names_in(tmp_path) == ["big"]
 
@@ -141,7 +142,7 @@ async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, tree: Spoilt
         fetched = await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
         assert (tmp_path / "big").read_bytes() == BIG
         assert fetched.resumed > 0
-        assert (asked, fetched.proof) == (4, BY_CRC32)
+        assert (asked, fetched.verified) == (4, BY_CRC32)
         return
     with pytest.raises(VehicleLost):
         await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
@@ -186,7 +187,7 @@ async def test_without_a_checksum_it_says_what_was_proven(
 ) -> None:
     tree.crc_error = error
     fetched = await get(tree, b"/big", tmp_path / "big")
-    assert fetched.proof == Proof("size", lacking, later)
+    assert fetched.verified == Comparison(Match.UNKNOWN, "size", lacking, later)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +201,7 @@ async def test_what_is_made_anew_at_each_opening_is_not_proven(
     fetched = await fetcher_of(tree, root).fetch(wanted(tree, path, tmp_path / "x"))
     assert (tmp_path / "x").read_bytes() == b"now"
     assert (("crc32", path) in tree.calls) is proven
-    assert fetched.proof == (BY_CRC32 if proven else GENERATED)
+    assert fetched.verified == (BY_CRC32 if proven else GENERATED)
 
 
 async def test_a_read_that_ends_early_is_no_file(tmp_path: Path, tree: SpoiltTree) -> None:
@@ -262,6 +263,19 @@ async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> N
 # -- get ------------------------------------------------------------------------------------------
 
 
+class Noted(Reports):
+    """Keeps what a run tells."""
+
+    def __init__(self, told: list[str], said: list[str]) -> None:
+        self.told, self.said = told, said
+
+    def arrived(self, fetched: Fetched) -> None:
+        self.told.append(fetched.wanted.name)
+
+    def says(self, line: str) -> None:
+        self.said.append(line)
+
+
 async def get_all(
     tree: FakeTree,
     *paths: bytes,
@@ -271,7 +285,7 @@ async def get_all(
     verify: Verify = "auto",
 ) -> tuple[Outcome, list[str]]:
     outcome, said = Outcome(), list[str]()
-    downloads = Downloads(fetcher_of(tree, verify=verify), outcome, lambda _: None, said.append)
+    downloads = Downloads(fetcher_of(tree, verify=verify), outcome, Noted([], said))
     await downloads.get(paths, to, into=into, recursive=recursive)
     return outcome, said
 
@@ -432,7 +446,7 @@ LOGS = {
 }
 
 
-async def sync(
+async def synced(
     tree: FakeTree,
     local: Path,
     *,
@@ -443,9 +457,9 @@ async def sync(
 ) -> tuple[Outcome, list[str], list[str]]:
     outcome, told, said = Outcome(), list[str](), list[str]()
     fetcher = fetcher_of(tree, root, verify)
-    downloads = Downloads(fetcher, outcome, lambda fetched: told.append(fetched.wanted.name), said.append)
+    downloads = Downloads(fetcher, outcome, Noted(told, said))
     try:
-        await downloads.sync(Wish(local, selection=Selection(newest), dry_run=dry_run))
+        await sync(downloads, Wish(local, selection=Selection(newest), dry_run=dry_run))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said
@@ -467,7 +481,7 @@ async def sync(
 async def test_the_logs_are_found(
     tmp_path: Path, files: dict[bytes, bytes], root: bytes, place: bytes
 ) -> None:
-    outcome, told, _ = await sync(SpoiltTree(dict(files)), tmp_path, root=root)
+    outcome, told, _ = await synced(SpoiltTree(dict(files)), tmp_path, root=root)
     assert outcome.place == place
     assert told
 
@@ -475,7 +489,7 @@ async def test_the_logs_are_found(
 async def test_the_card_s_copy_of_our_memory_does_not_replace_it(tmp_path: Path) -> None:
     memory = tmp_path / ".mavftpfs-logs"
     memory.write_text("ours\n")
-    _, told, _ = await sync(SpoiltTree({**LOGS, b"/fs/microsd/log/.mavftpfs-logs": b"theirs"}), tmp_path)
+    _, told, _ = await synced(SpoiltTree({**LOGS, b"/fs/microsd/log/.mavftpfs-logs": b"theirs"}), tmp_path)
     assert told == ["d/2.ulg", "d/1.ulg"]
     assert memory.read_text() == "ours\n"
 
@@ -484,9 +498,9 @@ async def test_the_card_s_copy_of_our_memory_does_not_replace_it(tmp_path: Path)
 async def test_another_log_of_that_name_does_not_destroy_the_old_one(tmp_path: Path, new: bytes) -> None:
     """ArduPilot counts from 1 again after its logs were erased."""
     tree = SpoiltTree({b"/APM/LOGS/1.BIN": b"flight of May"})
-    await sync(tree, tmp_path)
+    await synced(tree, tmp_path)
     tree.files[b"/APM/LOGS/1.BIN"] = new
-    outcome, _, _ = await sync(tree, tmp_path)
+    outcome, _, _ = await synced(tree, tmp_path)
     assert outcome.complete
     assert (tmp_path / "1.BIN").read_bytes() == new
     assert (tmp_path / "1.BIN.~1~").read_bytes() == b"flight of May"
@@ -497,30 +511,30 @@ async def test_a_log_that_was_fetched_while_armed_is_proven_later(tmp_path: Path
     tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two"})
     tree.crc_error = Armed("in flight")
     for moved in (6, 0):
-        outcome, _, said = await sync(tree, tmp_path)
+        outcome, _, said = await synced(tree, tmp_path)
         assert sum(one.size - one.resumed for one in outcome.fetched) == moved
         assert (outcome.lacking, said, outcome.complete) == ({"armed": 2}, [], True)
     (tmp_path / "2").write_bytes(b"TWO")
     tree.crc_error = None
-    outcome, _, _ = await sync(tree, tmp_path)
+    outcome, _, _ = await synced(tree, tmp_path)
     assert {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path) if name[0] != "."} == {
         "1": b"one",
         "2": b"two",
         "2.~1~": b"TWO",
     }
-    assert outcome.proofs == {b"/log/1": BY_CRC32, b"/log/2": BY_CRC32}
+    assert outcome.verified == {b"/log/1": BY_CRC32, b"/log/2": BY_CRC32}
     tree.calls.clear()
-    await sync(tree, tmp_path)
+    await synced(tree, tmp_path)
     assert not any(name == "crc32" for name, _ in tree.calls)
 
 
 async def test_all_that_is_here_is_proven_if_that_is_wished_for(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two"})
-    await sync(tree, tmp_path)
+    await synced(tree, tmp_path)
     assert names_in(tmp_path) == ["1", "2"]
     (tmp_path / "2").write_bytes(b"TWO")
-    assert len((await sync(tree, tmp_path))[0].here) == 2
-    outcome, _, _ = await sync(tree, tmp_path, verify="all")
+    assert len((await synced(tree, tmp_path))[0].here) == 2
+    outcome, _, _ = await synced(tree, tmp_path, verify="all")
     assert ([log.name for log in outcome.here], [one.wanted.name for one in outcome.fetched]) == (
         ["1"],
         ["2"],
@@ -529,10 +543,10 @@ async def test_all_that_is_here_is_proven_if_that_is_wished_for(tmp_path: Path) 
     assert (tmp_path / "2").read_bytes() == b"two"
 
 
-async def check(tree: FakeTree, local: Path) -> Outcome:
+async def checked(tree: FakeTree, local: Path) -> Outcome:
     outcome = Outcome()
     fetcher = fetcher_of(tree, verify="none")
-    await Downloads(fetcher, outcome, lambda _: None, lambda _: None).check(Wish(local))
+    await check(Downloads(fetcher, outcome), Wish(local))
     return outcome
 
 
@@ -540,7 +554,7 @@ async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two", b"/log/3": b"three", b"/log/4": b"four"})
     for name, data in (("1", b"one"), ("2", b"TWO"), ("3", b"thr")):
         (tmp_path / name).write_bytes(data)
-    outcome = await check(tree, tmp_path)
+    outcome = await checked(tree, tmp_path)
     assert tree.reads == 0
     assert names_in(tmp_path) == ["1", "2", "3"]
     assert [log.remote for log in outcome.wanted] == [b"/log/4"]
@@ -550,14 +564,14 @@ async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
     assert not outcome.complete
     for path, data in tree.files.items():
         (tmp_path / path.decode().rpartition("/")[2]).write_bytes(data)
-    assert (await check(tree, tmp_path)).complete
+    assert (await checked(tree, tmp_path)).complete
 
 
 @pytest.mark.parametrize("what", ["LOCAL", "--from"])
 async def test_a_file_where_a_directory_is_needed_is_said(tmp_path: Path, what: str) -> None:
     (tmp_path / "file").write_bytes(b"1")
     tree = SpoiltTree({b"/log/1": b"one"})
-    downloads = Downloads(fetcher_of(tree), Outcome(), lambda _: None, lambda _: None)
+    downloads = Downloads(fetcher_of(tree), Outcome())
     place, local = (b"/log/1", tmp_path) if what == "--from" else (None, tmp_path / "file")
     with pytest.raises((UsageError, NotADirectory), match="is a file"):
-        await downloads.sync(Wish(local, place))
+        await sync(downloads, Wish(local, place))

@@ -1,4 +1,4 @@
-"""client.watch and client.flights: days of a companion computer, with simulated vehicles, on virtual time."""
+"""client.watch: days of a companion computer, with simulated vehicles, on virtual time."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import os
 import random
 import subprocess
 from collections.abc import AsyncIterator, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trio
 
-from mavftpfs.client.brought import NAME, Memory
-from mavftpfs.client.contact import Hearing
-from mavftpfs.client.download import Wish
+from mavftpfs.client.contact import Heard, MountContact
 from mavftpfs.client.files import Session
+from mavftpfs.client.logs import Wish
+from mavftpfs.client.manifest import NAME, Manifest
 from mavftpfs.client.options import Options
 from mavftpfs.client.selection import EVERYTHING, Selection
-from mavftpfs.client.watch import Watch, WatchWish
+from mavftpfs.client.watch import Watch
 from mavftpfs.link.messages import Address
 from mavftpfs.link.uri import parse_source
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -89,9 +90,9 @@ class Day:
     async def watched(self) -> AsyncIterator[None]:
         """Have the watch run during the body; a second time is another process."""
         hand_on = self._hand_on
-        watch = Watch(WatchWish(Wish(self.local, selection=self.selection)), self.said.append, hand_on)
+        watch = Watch(Wish(self.local, selection=self.selection), self.said.append, hand_on)
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(watch._hand_on_all)
+            nursery.start_soon(watch.keeping.hand_on_all)
             nursery.start_soon(watch.run_on, self.rig.link, SPEC, Options())
             yield
             nursery.cancel_scope.cancel()
@@ -457,31 +458,56 @@ async def test_flight_after_flight_without_growth(day: Day, flights: int, every:
     assert max(sizes[3:]) - sizes[1] < 1000
     assert max(files[3:]) <= files[1]
     assert (day.local / NAME).stat().st_size < 200 * 400
-    assert len(Memory(day.local).logs()) == 1
+    assert len(Manifest(day.local).logs()) == 1
 
 
 class ArmsWhileEntered:
     """A contact with a vehicle that is armed just when its files are to be had."""
 
     system = 1
+    uid = None
+    replaced = False
 
-    async def listen(self, hearing: Hearing) -> None:
-        self._hearing = hearing
-        hearing.heard(1, armed=False)
-        await trio.sleep_forever()
+    def __init__(self) -> None:
+        self._news = [Heard(1, armed=False)]
+
+    async def listen(self) -> list[Heard]:
+        await trio.lowlevel.checkpoint()
+        news, self._news = self._news, []
+        return news
 
     async def identity(self) -> str | None:
         raise AssertionError("an armed vehicle was asked")
 
-    async def enter(self, stack: AsyncExitStack) -> Session:
-        await trio.sleep(0.1)
-        self._hearing.heard(1, armed=True)
-        return session_of(MemoryTree())
+    @asynccontextmanager
+    async def session(self) -> AsyncIterator[Session]:
+        self._news = [Heard(1, armed=True)]
+        await trio.sleep(1.0)
+        yield session_of(MemoryTree())
 
 
 @pytest.mark.holds("promise 9")
 async def test_a_vehicle_that_is_armed_while_its_files_are_opened_is_not_asked(tmp_path: Path) -> None:
     said: list[str] = []
-    with trio.move_on_after(60.0):
-        await Watch(WatchWish(Wish(tmp_path)), said.append).serve(ArmsWhileEntered())
+    watch, contact = Watch(Wish(tmp_path), said.append), ArmsWhileEntered()
+    with trio.move_on_after(9.0):
+        while True:
+            await watch.serve(contact)
     assert said == ["vehicle 1 is here, disarmed", "vehicle 1 is armed"]
+
+
+async def test_a_mount_tells_of_arming_restarts_and_refusals(tmp_path: Path) -> None:
+    vehicle = {"system": 1, "uid": "a", "armed": False, "restarts": 3, "arming_refused": 2}
+    link = {"state": "fine"}
+
+    async def status() -> dict[str, Any]:
+        return {"vehicle": vehicle, "link": link}
+
+    contact = MountContact(Session(session_of(MemoryTree()).files, status))
+    assert await contact.listen() == [Heard(1, armed=False)]  # what was before does not count
+    vehicle.update(armed=True, restarts=4)
+    assert await contact.listen() == [Heard(1, armed=True, restarted=True)]
+    vehicle.update(arming_refused=3)
+    assert await contact.listen() == [Heard(1, armed=True, refused=True)]
+    link["state"] = "replaced"
+    assert await contact.listen() == []

@@ -1,4 +1,4 @@
-"""client.fetch, download, proof and names: what to fetch, skip, resume and prove, and how it is named."""
+"""client.fetch, compare, selection and names: what to fetch, skip, resume and prove, and how it is named."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.client import fetch, proof
+from mavftpfs.client import compare, fetch
 from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
 from mavftpfs.client.selection import Selection, latest_in, newest_first, parse_date
@@ -43,8 +43,8 @@ def test_what_is_here_of_a_file_of_100_bytes(
 
 
 def test_only_files_up_to_some_size_are_proven_by_default() -> None:
-    sizes = (proof.PROVEN_BY_DEFAULT, proof.PROVEN_BY_DEFAULT + 1)
-    assert [proof.proof_needed("auto", resumed=False, size=size) for size in sizes] == [True, False]
+    sizes = (compare.VERIFIED_BY_DEFAULT, compare.VERIFIED_BY_DEFAULT + 1)
+    assert [compare.wants_checksum("auto", size) for size in sizes] == [True, False]
 
 
 def log(below: str, mtime: int | None = None) -> Wanted:

@@ -1,6 +1,6 @@
-"""Remembers which logs were brought into a local directory, in a file there. Layer: client.
+"""The manifest of downloaded logs: a file in the local directory. Layer: client.
 
-Each line is a log as JSON; a later line of the same log counts. Lines are only added, so that a power cut
+Each line describes a log as JSON; the last line of a log counts. Lines are only added, so that a power cut
 loses at most the last one.
 """
 
@@ -13,19 +13,20 @@ from pathlib import Path
 from typing import Any
 
 NAME = ".mavftpfs-logs"
-"""Of the file."""
+"""Name of the file."""
 
 HEAD = 4096
-"""First bytes by which logs of the same name and size are told apart if they have no time."""
+"""A log without a time is recognised by the CRC32 of so many first bytes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Brought:
-    """A log that was brought. path: on the vehicle; vehicle: its unique id, None if that was not asked for;
-    file: below the local directory; size: bytes; mtime: seconds UTC, None if unknown.
+class Downloaded:
+    """A downloaded log. path: on the vehicle; file: below the local directory; size: in bytes; mtime: seconds
+    UTC, None if the vehicle tells none.
 
-    head: the CRC32 of its first HEAD bytes, None if that was not noted. proven: its checksum was compared, or
-    did not need to be. handed_on: `--exec` is done with it.
+    vehicle: its unique id, None if sync did not ask for that. head: the CRC32 of the first HEAD bytes, None
+    if nobody noted it. proven: its checksum was compared, or did not have to be. handed_on: no command of
+    `--exec` has to run for it.
     """
 
     path: str
@@ -41,31 +42,32 @@ class Brought:
 Key = tuple[str | None, str]
 
 
-class Memory:
-    """What is known of the logs in a directory; read when it is made."""
+class Manifest:
+    """The logs that the manifest of a directory names when this object is made, and those noted since."""
 
     def __init__(self, local: Path) -> None:
-        """Raises: OSError: it cannot be read."""
+        """Raises: OSError: the file cannot be read."""
+        self.local = local
         self._place = local / NAME
-        self._logs: dict[Key, Brought] = {}
+        self._logs: dict[Key, Downloaded] = {}
         for line in self._read():
             log = _parsed(line)
             if log is not None:
                 self._logs[log.vehicle, log.path] = log
 
-    def of(self, vehicle: str | None, path: str) -> Brought | None:
-        """Return what is known of a log."""
+    def of(self, vehicle: str | None, path: str) -> Downloaded | None:
+        """Return what the manifest says of a log."""
         return self._logs.get((vehicle, path))
 
-    def logs(self) -> list[Brought]:
-        """Return all logs that are known."""
+    def logs(self) -> list[Downloaded]:
+        """Return all logs of the manifest."""
         return list(self._logs.values())
 
     def begin(self) -> None:
         """Make the file, which marks the directory.
 
         Raises:
-            OSError: the local disk does not take it.
+            OSError: the local disk refuses it.
         """
         self._place.touch()
 
@@ -73,11 +75,11 @@ class Memory:
         """Return whether the file is there."""
         return self._place.exists()
 
-    def note(self, log: Brought) -> None:
-        """Remember a log, in place of what was known of it.
+    def note(self, log: Downloaded) -> None:
+        """Write down a log, in place of what the manifest said of it.
 
         Raises:
-            OSError: the local disk does not take it.
+            OSError: the local disk refuses it.
         """
         if self.of(log.vehicle, log.path) == log:
             return
@@ -94,16 +96,16 @@ class Memory:
             return []
 
 
-def _line(log: Brought) -> bytes:
-    """Return a log as a line. It begins with a line end, in case the last line was cut."""
+def _line(log: Downloaded) -> bytes:
+    """Return a log as a line. The line begins with a line end, in case the last one was cut."""
     return b"\n" + json.dumps(asdict(log)).encode() + b"\n"
 
 
-def _parsed(line: bytes) -> Brought | None:
+def _parsed(line: bytes) -> Downloaded | None:
     """Return the log of a line, None if the line is damaged."""
     try:
         facts: dict[str, Any] = json.loads(line)
-        log = Brought(**facts)
+        log = Downloaded(**facts)
     except (ValueError, TypeError, RecursionError):
         return None
     return log if isinstance(log.path, str) and isinstance(log.size, int) else None
