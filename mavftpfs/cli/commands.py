@@ -17,12 +17,12 @@ from mavftpfs.cli import report
 from mavftpfs.cli.drawing import changing_line
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
-from mavftpfs.client.options import at_source, split_words
+from mavftpfs.client.options import TABLE, Options, at_source, split_words
 from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, statuses_at
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon, places
 from mavftpfs.mount.members import Member
-from mavftpfs.mount.options import TABLE, MountOptions, parse_options
+from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
@@ -56,12 +56,12 @@ def mount(args: argparse.Namespace) -> int:
         return work(_report_failure)
     if args.foreground or args.debug:
         return work(_report_in_foreground)
-    for line in options.client.gone:  # in the background only the log would have it
+    for line in options.gone:  # in the background only the log would have it
         say(line)
     return daemon.in_background(work)
 
 
-def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
+def connection_of(args: argparse.Namespace) -> tuple[Options, LinkSpec]:
     """Return the parsed options and SOURCE.
 
     Raises:
@@ -70,20 +70,18 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
     options = parse_options(args.options)
     if os.path.isdir(args.source) and ":" in getattr(args, "mountpoint", ""):
         raise UsageError(f"SOURCE comes first, then the directory: {args.mountpoint} {args.source}")
-    spec, client = at_source(parse_source(args.source), options.client)
-    return replace(options, client=client), spec
+    spec, options = at_source(parse_source(args.source), options)
+    return options, spec
 
 
-def absolute_paths(options: MountOptions) -> MountOptions:
+def absolute_paths(options: Options) -> Options:
     """Return the options with local paths absolute: the background process works in `/`."""
-    client = options.client
-    found = {name: getattr(client, name, None) for name in TABLE.local_files}
-    client = replace(client, **{name: os.path.abspath(path) for name, path in found.items() if path})
-    return replace(options, client=client)
+    found = {name: getattr(options, name) for name in TABLE.local_files}
+    return replace(options, **{name: os.path.abspath(path) for name, path in found.items() if path})
 
 
 def _serve(
-    args: argparse.Namespace, options: MountOptions, spec: LinkSpec, place: str, report: daemon.Report
+    args: argparse.Namespace, options: Options, spec: LinkSpec, place: str, report: daemon.Report
 ) -> int:
     from mavftpfs.client.connect import open_sinks
 
@@ -95,7 +93,7 @@ def _serve(
 
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
-    with open_sinks(options.client, debug=args.debug, tell=say) as sinks:
+    with open_sinks(options, debug=args.debug, tell=say) as sinks:
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         if options.all:
             from mavftpfs.mount.supervisor import run_all
@@ -147,7 +145,7 @@ def _report_in_foreground(code: int, message: str) -> None:
     _report_failure(code, message)
 
 
-def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:
+def _start_logging(options: Options, *, foreground: bool, debug: bool) -> None:
     level = logging.DEBUG if debug else logging.INFO
     try:
         if foreground:
@@ -156,7 +154,7 @@ def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> N
             daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
     except OSError as exc:
         raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
-    daemon.warn_of_gone(options.client)
+    daemon.warn_of_gone(options)
 
 
 def _control_path(place: str) -> Path | None:

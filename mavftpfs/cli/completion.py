@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping
 
 import shtab
 
-from mavftpfs.mount.options import TABLE, option_help
+from mavftpfs.client.options import TABLE
+from mavftpfs.mount.options import option_help
 
 SHELLS = ("bash", "zsh", "fish")
 

@@ -56,7 +56,7 @@ Args = argparse.Namespace
 def _target(args: Args, component: int | None) -> Target:
     if component is not None:
         args.options.append(f"target_component={component}")
-    return target_of(args.source, parse_options(args.options).client)
+    return target_of(args.source, parse_options(args.options))
 
 
 def _paths_of(args: Args, default: Sequence[str] = ()) -> tuple[list[bytes], int | None]:

@@ -1,11 +1,12 @@
 """The table of options: name, type, default and help, each in one place. Layer: client; pure.
 
-The fields of `Options` are the rows; `mount.options` adds those of the kernel's side of a mount. `-o` text,
-the library's keywords, `--help`, the man page, completions and the guide's reference come from the table.
+The fields of `Options` are the rows. `-o` text (`mount.options`), the library's keywords, `--help`, the man
+page, completions and the guide's reference come from them.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -131,7 +132,15 @@ def endpoint(text: str) -> str:
     return parse_endpoint(_not_empty(text)).description
 
 
+def _octal(text: str) -> int:
+    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
+        raise ValueError("must be an octal number of at most 777, as 022")
+    return int(text, 8)
+
+
 LOCAL_FILE = Type(_not_empty, is_file=True)
+_MASK = Type(_octal)
+_ID = number(0, 2**32 - 2)
 
 
 # -- the table ------------------------------------------------------------------------------------
@@ -142,7 +151,7 @@ class Option:
     """A row of the table. default: as people read it. type: None for an option without a value.
 
     words: the words of an option without a value, and what each sets the field to. many: the option may be
-    given several times, and all values count.
+    given several times, and all values count. of_kernel: it means nothing without a mount.
     """
 
     field: str
@@ -151,6 +160,7 @@ class Option:
     type: Type | None = None
     words: tuple[tuple[str, bool], ...] = ()
     many: bool = False
+    of_kernel: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -158,29 +168,55 @@ class Option:
         return (f"{self.field}=",) if self.type is not None else tuple(word for word, _ in self.words)
 
 
-def valued(default: Any, kind: Type, help: str, *, shown: str = "", many: bool = False) -> Any:
+def valued(default: Any, kind: Type, help: str, *, shown: str = "", **more: bool) -> Any:
     """Return the field of an option with a value. shown: the default as people read it, if `kind` cannot
-    write it."""
-    row = {"type": kind, "help": help, "default": shown or kind.written(default), "many": many}
+    write it; more: as in Option."""
+    row = {"type": kind, "help": help, "default": shown or kind.written(default), **more}
     return field(default=default, metadata=row)
 
 
-def switch(words: Mapping[str, bool], help: str) -> Any:
-    """Return the field of an option without a value, whose default is False."""
-    default = next((word for word, value in words.items() if not value), "off")
-    return field(default=False, metadata={"words": tuple(words.items()), "help": help, "default": default})
+def switch(words: Mapping[str, bool], help: str, **more: bool) -> Any:
+    """Return the field of an option without a value, whose default is False. more: as in Option."""
+    shown = next((word for word, value in words.items() if not value), "off")
+    row = {"words": tuple(words.items()), "help": help, "default": shown, **more}
+    return field(default=False, metadata=row)
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """How to reach a vehicle and how to treat its files.
 
-    Seconds, bytes and bytes per second; None = found out, or not wanted. SOURCE sets root; baud overrides
-    that of SOURCE. `session.connection.ConnectOptions` explains the session's values, and
-    `cache.options.CacheOptions` those of the caches.
+    Seconds, bytes, bytes per second and permission bits; None = found out, or not wanted. SOURCE sets root;
+    baud overrides that of SOURCE. kernel_words: words of `-o` that libfuse takes.
+    `session.connection.ConnectOptions` explains the session's values, and `cache.options.CacheOptions` those
+    of the caches.
     """
 
     read_only: bool = switch({"ro": True, "rw": False}, "change nothing (ro), or allow changes (rw)")
+    allow_other: bool = switch(
+        {"allow_other": True},
+        "let other users in; needs user_allow_other in /etc/fuse.conf, unless root mounts",
+        of_kernel=True,
+    )
+    uid: int | None = valued(
+        None, _ID, "owner of the files; the kernel checks permissions", shown="you", of_kernel=True
+    )
+    gid: int | None = valued(None, _ID, "group of the files", shown="your group", of_kernel=True)
+    umask: int | None = valued(
+        None, _MASK, "permissions to take away, in octal", shown="your umask", of_kernel=True
+    )
+    fmask: int | None = valued(
+        None, _MASK, "permissions to take away from files", shown="umask=", of_kernel=True
+    )
+    dmask: int | None = valued(
+        None, _MASK, "permissions to take away from directories", shown="umask=", of_kernel=True
+    )
+    all: bool = switch(
+        {"all": True},
+        "mount each vehicle that is heard, below the mountpoint by its system id",
+        of_kernel=True,
+    )
+    kernel_words: tuple[str, ...] = ()
     root: bytes = ROOT
     baud: int | None = None
     target_system: int = valued(0, number(0, 255), "vehicle, by system id; 0: the first autopilot heard")
@@ -240,11 +276,6 @@ class Options:
     """A line for people about each word of 0.2 that was given and is gone."""
 
 
-def options_in(record: type[Any]) -> tuple[Option, ...]:
-    """Return the rows that the fields of a dataclass are."""
-    return tuple(Option(one.name, **one.metadata) for one in fields(record) if one.metadata)
-
-
 class Table:
     """Rows, by the words that name them.
 
@@ -275,7 +306,9 @@ class Table:
         return tuple(dict.fromkeys((*earlier.get(name, ()), value))) if row.many else value
 
 
-TABLE = Table(options_in(Options))
+TABLE = Table(Option(one.name, **one.metadata) for one in fields(Options) if one.metadata)
+LIBRARY = Table(row for row in TABLE.rows if not row.of_kernel)
+"""The rows that are keywords of the library."""
 
 
 # -- words of 0.2 -----------------------------------------------------------------------------------
@@ -370,15 +403,15 @@ def options_of(keywords: Mapping[str, object]) -> Options:
     for name, value in keywords.items():
         if value is None or (value is False and name in GONE):
             continue
-        if name in TABLE.words:
+        if name in LIBRARY.words:
             if not isinstance(value, bool):
                 raise UsageError(f"option {name} is True or False, not {value!r}")
-            place, becomes = TABLE.words[name]
+            place, becomes = LIBRARY.words[name]
             values[place] = becomes is value
-        elif name in TABLE.values:
-            several = TABLE.values[name].many and isinstance(value, list | tuple)
+        elif name in LIBRARY.values:
+            several = LIBRARY.values[name].many and isinstance(value, list | tuple)
             for one in value if several and isinstance(value, list | tuple) else (value,):
-                values[name] = TABLE.parsed(name, _as_text(name, one), values)
+                values[name] = LIBRARY.parsed(name, _as_text(name, one), values)
         elif not take_gone(values, name, "" if value is True else _as_text(name, value)):
             raise UsageError(f"unknown option {name!r}")
     return Options(**values)

@@ -16,8 +16,9 @@ import pyfuse3
 import trio
 
 from mavftpfs.client.mountpoint import is_dead, stderr_of, unmount, why_not_mounted
+from mavftpfs.client.options import Options
 from mavftpfs.mount.handles import Presentation
-from mavftpfs.mount.options import MountOptions
+from mavftpfs.mount.options import permissions
 from mavftpfs.shared.errors import MountFailed
 
 log = logging.getLogger("mavftpfs.mount")
@@ -85,16 +86,16 @@ def kernel_mount(
                 unmount(mountpoint, lazy=True)
 
 
-def presentation(options: MountOptions) -> Presentation:
+def presentation(options: Options) -> Presentation:
     """Return how entries look for these options, with this process's user and umask for what is not given."""
     umask = os.umask(0o022)
     os.umask(umask)
     return Presentation(
         uid=os.getuid() if options.uid is None else options.uid,
         gid=os.getgid() if options.gid is None else options.gid,
-        file_mode=options.file_mode(umask),
-        directory_mode=options.directory_mode(umask),
-        op_deadline=options.client.op_deadline,
+        file_mode=permissions(options, 0o666, options.fmask, umask),
+        directory_mode=permissions(options, 0o777, options.dmask, umask),
+        op_deadline=options.op_deadline,
     )
 
 

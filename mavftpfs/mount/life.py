@@ -25,9 +25,9 @@ import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Sinks
 from mavftpfs.client.control import Reply
 from mavftpfs.client.controlserver import Command, ControlServer
+from mavftpfs.client.options import Options
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mount.daemon import Report, ending_signals
-from mavftpfs.mount.options import MountOptions
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, exit_code_for
 
 log = logging.getLogger("mavftpfs.mount")
@@ -65,7 +65,7 @@ class MountRequest:
     source: str
     spec: LinkSpec
     mountpoint: str
-    options: MountOptions
+    options: Options
     control: Path | None = None
     sinks: Sinks = NO_SINKS
 

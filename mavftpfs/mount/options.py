@@ -1,4 +1,4 @@
-"""A mount's options: the client's, and those that only the kernel's side needs. Layer: mount; pure.
+"""The words of `-o`: options, and words for others than mavftpfs. Layer: mount; pure.
 
 `-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
 Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,
@@ -9,23 +9,11 @@ same words, so that a line of /etc/fstab can be given to them.
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import Any
 
 from mavftpfs.client.mountpoint import SUBTYPE
-from mavftpfs.client.options import (
-    Options,
-    Table,
-    Type,
-    number,
-    options_in,
-    split_words,
-    switch,
-    take_gone,
-    valued,
-)
+from mavftpfs.client.options import TABLE, Options, split_words, take_gone
 from mavftpfs.shared.errors import UsageError
 
 KERNEL_WORDS = frozenset({"dev", "nodev", "suid", "nosuid", "exec", "noexec", "sync", "async", "dirsync"})
@@ -58,55 +46,11 @@ IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
 IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 
-def _octal(text: str) -> int:
-    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
-        raise ValueError("must be an octal number of at most 777, as 022")
-    return int(text, 8)
-
-
-_MASK = Type(_octal)
-_ID = number(0, 2**32 - 2)
-
-
-@dataclass(frozen=True, slots=True)
-class MountOptions:
-    """The options of `-o`. None = not given. client: options that do not concern the kernel."""
-
-    client: Options = field(default_factory=Options)
-    allow_other: bool = switch(
-        {"allow_other": True},
-        "let other users in; needs user_allow_other in /etc/fuse.conf, unless root mounts",
-    )
-    uid: int | None = valued(None, _ID, "owner of the files; the kernel checks permissions", shown="you")
-    gid: int | None = valued(None, _ID, "group of the files", shown="your group")
-    umask: int | None = valued(None, _MASK, "permissions to take away, in octal", shown="your umask")
-    fmask: int | None = valued(None, _MASK, "permissions to take away from files", shown="umask=")
-    dmask: int | None = valued(None, _MASK, "permissions to take away from directories", shown="umask=")
-    all: bool = switch(
-        {"all": True}, "mount each vehicle that is heard, below the mountpoint by its system id"
-    )
-    kernel_words: tuple[str, ...] = ()
-
-    def file_mode(self, default_umask: int) -> int:
-        """Return the permission bits of files; write bits go where the mount is read-only."""
-        return self._bits(0o666, self.fmask, default_umask)
-
-    def directory_mode(self, default_umask: int) -> int:
-        """Return the permission bits of directories."""
-        return self._bits(0o777, self.dmask, default_umask)
-
-    def _bits(self, full: int, own_mask: int | None, default_umask: int) -> int:
-        mask = own_mask if own_mask is not None else self.umask
-        bits = full & ~(default_umask if mask is None else mask)
-        return bits & ~0o222 if self.client.read_only else bits
-
-
-TABLE = Table((*options_in(MountOptions), *options_in(Options)))
 _ALWAYS_ON = "default_permissions"
 """No server checks permissions, so the kernel always does."""
 
 
-def parse_options(texts: Iterable[str]) -> MountOptions:
+def parse_options(texts: Iterable[str]) -> Options:
     """Parse the values of all `-o`; later words win.
 
     Raises:
@@ -116,17 +60,26 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
     words: list[str] = []
     for word in split_words(texts):
         _take(word, values, words)
-    own = {name: values.pop(name) for name in MountOptions.__slots__ if name in values}
-    options = MountOptions(Options(**values), kernel_words=tuple(words), **own)
-    if options.all and (options.client.target_system or options.client.target_component):
+    options = Options(**values, kernel_words=tuple(words))
+    if options.all and (options.target_system or options.target_component):
         raise UsageError("option all is for each vehicle; leave out target_system= and target_component=")
     return options
 
 
-def fuse_words(options: MountOptions, source: str) -> set[str]:
+def permissions(options: Options, full: int, own_mask: int | None, default_umask: int) -> int:
+    """Return the permission bits of files, or of directories: those of `full` that no mask takes away.
+
+    own_mask: the mask of that kind, which comes before umask=. A read-only mount has no write bits.
+    """
+    masks = (own_mask, options.umask, default_umask)
+    bits = full & ~next(mask for mask in masks if mask is not None)
+    return bits & ~0o222 if options.read_only else bits
+
+
+def fuse_words(options: Options, source: str) -> set[str]:
     """Return the options that go to FUSE's init."""
     words = {f"fsname={_escape(source)}", f"subtype={SUBTYPE}", _ALWAYS_ON, *options.kernel_words}
-    words.add("ro" if options.client.read_only else "rw")
+    words.add("ro" if options.read_only else "rw")
     if options.allow_other:
         words.add("allow_other")
     return words

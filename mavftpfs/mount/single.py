@@ -47,7 +47,7 @@ def run_mount(request: MountRequest, report: Report) -> int:
     def attach(invalidate: Callable[[bytes], None]) -> AbstractAsyncContextManager[Attached]:
         return attached(
             request.spec,
-            request.options.client,
+            request.options,
             invalidate=invalidate,
             sinks=request.sinks,
             writing=True,
@@ -141,7 +141,7 @@ class SingleMount(Life):
 
     def status(self) -> Mapping[str, Any]:
         """See Life.status."""
-        client = self.request.options.client
+        client = self.request.options
         return {
             "root": os.fsdecode(client.root),
             "network_namespace": network_namespace(),

@@ -61,7 +61,7 @@ class Supervisor(Life):
     async def serve(self, nursery: trio.Nursery) -> None:
         """See Life.serve."""
         self._nursery = nursery
-        options = self.request.options.client
+        options = self.request.options
         async with (
             opened(self.request.spec, options, beats=True) as link,
             listening(link, options, self._on_heard),
@@ -75,7 +75,7 @@ class Supervisor(Life):
         await trio.to_thread.run_sync(places.remove, self.request.mountpoint)
 
     async def _tell_when_up(self) -> None:
-        with trio.move_on_after(self.request.options.client.connect_timeout):
+        with trio.move_on_after(self.request.options.connect_timeout):
             await self._first.wait()
             self.tell_mounted(timeout_note())
             return

@@ -24,7 +24,6 @@ from mavftpfs.client.connect import Attached
 from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import MountRequest
-from mavftpfs.mount.options import MountOptions
 from mavftpfs.mount.single import SingleMount
 from tests.ops.faketree import FakeTree
 
@@ -79,7 +78,7 @@ def main() -> int:
     source = "udpin:127.0.0.1:1"
     mountpoint, control = sys.argv[1:]
     request = MountRequest(
-        source, parse_source(source), mountpoint, MountOptions(Options(read_only=True)), control=Path(control)
+        source, parse_source(source), mountpoint, Options(read_only=True), control=Path(control)
     )
     return trio.run(SingleMount(request, Server().attach, report).run)
 

@@ -21,7 +21,7 @@ from mavftpfs.cli import commands
 from mavftpfs.cli import main as cli
 from mavftpfs.client import connect as compose
 from mavftpfs.client import control, status
-from mavftpfs.mount.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import (
     ExitCode,
@@ -186,7 +186,7 @@ UNITS_OF_0_2 = [
 
 @pytest.mark.parametrize("words", UNITS_OF_0_2)
 def test_units_of_0_2_go_on_to_start(monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]) -> None:
-    started: list[MountOptions] = []
+    started: list[Options] = []
 
     def start(args: argparse.Namespace) -> int:
         started.append(commands.connection_of(args)[0])
@@ -218,13 +218,13 @@ def test_words_of_0_2_that_belong_to_source_are_translated() -> None:
     options, spec = commands.connection_of(args)
     plain = argparse.Namespace(source="/dev/ttyX,921600#/fs/microsd", options=[])
     same, there = commands.connection_of(plain)
-    assert (spec.description, options.client.root) == (there.description, same.client.root)
-    assert len(options.client.gone) == 2
+    assert (spec.description, options.root) == (there.description, same.root)
+    assert len(options.gone) == 2
 
 
 def test_a_baud_rate_means_nothing_where_no_serial_port_is() -> None:
     options, _ = commands.connection_of(argparse.Namespace(source=SOURCE, options=["window=4,baud=57600"]))
-    window, baud = options.client.gone
+    window, baud = options.gone
     assert window.startswith("option window is gone")
     assert baud == "option baud is gone, and means nothing here: SOURCE is no serial port"
 
@@ -233,7 +233,7 @@ def test_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     args = argparse.Namespace(source="/dev/ttyX", options=["tlog=a/b.log"])
     options, _ = commands.connection_of(args)
     monkeypatch.chdir(tmp_path)
-    assert commands.absolute_paths(options).client.tlog == str(tmp_path / "a" / "b.log")
+    assert commands.absolute_paths(options).tlog == str(tmp_path / "a" / "b.log")
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_names_of_the_vehicle_are_shown_as_they_are_read(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: bytes, shown: str
 ) -> None:
-    def fail(args: argparse.Namespace) -> tuple[MountOptions, Any]:
+    def fail(args: argparse.Namespace) -> tuple[Options, Any]:
         raise errors.NotFound(f"{name!r} does not exist, nor does {name!r}")
 
     monkeypatch.setattr(commands, "connection_of", fail)
@@ -259,7 +259,7 @@ def test_names_of_the_vehicle_are_shown_as_they_are_read(
 def test_a_bug_is_one_line_without_d(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(args: argparse.Namespace) -> tuple[MountOptions, Any]:
+    def fail(args: argparse.Namespace) -> tuple[Options, Any]:
         raise ValueError("surprise")
 
     monkeypatch.setattr(commands, "connection_of", fail)

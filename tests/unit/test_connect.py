@@ -14,7 +14,7 @@ from mavftpfs.client.connect import cache_options, connect_options, process_name
 from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.kernel import presentation
-from mavftpfs.mount.options import MountOptions, fuse_words
+from mavftpfs.mount.options import fuse_words
 
 OTHER: dict[str, Any] = {
     "read_only": True,
@@ -38,20 +38,17 @@ ELSEWHERE = {"baud", "connect_timeout", "tlog", "forward", "gone", "all"}
 in `test_cli`."""
 
 
-def told(options: MountOptions) -> tuple[Any, ...]:
+def told(options: Options) -> tuple[Any, ...]:
     """Return what kernel, session and caches are told."""
     return (
-        connect_options(options.client),
-        cache_options(options.client, parse_source("udpin:0.0.0.0:14550")),
+        connect_options(options),
+        cache_options(options, parse_source("udpin:0.0.0.0:14550")),
         fuse_words(options, "SOURCE"),
         presentation(options),
     )
 
 
-OWN, SHARED = ({field.name for field in fields(part)} for part in (MountOptions, Options))
-
-
-@pytest.mark.parametrize("name", sorted((OWN | SHARED) - {"client"} - ELSEWHERE))
+@pytest.mark.parametrize("name", sorted({field.name for field in fields(Options)} - ELSEWHERE))
 def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
     value = OTHER.get(name, 77)
     if name == "signing_key":
@@ -60,8 +57,7 @@ def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
         (tmp_path / "key").chmod(0o600)
     elif name == "cache_size":
         value = 77 << 20
-    changed = {name: value} if name in OWN else {"client": replace(Options(), **{name: value})}
-    assert told(MountOptions(**changed)) != told(MountOptions())
+    assert told(replace(Options(), **{name: value})) != told(Options())
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import trio
 
+from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import Life, MountRequest, State
-from mavftpfs.mount.options import MountOptions
 from mavftpfs.shared.errors import ExitCode, LinkClosed
 
 SOURCE = "udpin:127.0.0.1:14550"
@@ -23,7 +23,7 @@ class Mount(Life):
     """Goes through the steps given; notes what it was told to do, and what the waiting command was told."""
 
     def __init__(self, *steps: Step) -> None:
-        request = MountRequest(SOURCE, parse_source(SOURCE), "/nowhere", MountOptions())
+        request = MountRequest(SOURCE, parse_source(SOURCE), "/nowhere", Options())
         super().__init__(request, lambda code, line: self.reported.append((code, line)))
         self.steps = steps
         self.reported: list[tuple[int, str]] = []

@@ -11,52 +11,50 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.client.options import GONE, Options, options_of
+from mavftpfs.client.options import GONE, TABLE, Options, options_of
 from mavftpfs.mount.options import (
     IGNORED_WORDS,
     KERNEL_WORDS,
-    TABLE,
-    MountOptions,
     option_help,
     parse_options,
+    permissions,
 )
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import UsageError
 from tests.support.optiontable import option_table, told_table
 
-OWN, SHARED, PASSED_ON = (
+DEFAULTS, PASSED_ON = (
     {field.name: field.default for part in parts for field in fields(part)}
-    for parts in ((MountOptions,), (Options,), (CacheOptions, ConnectOptions))
+    for parts in ((Options,), (CacheOptions, ConnectOptions))
 )
 
 
-ELSEWHERE = {"root", "baud", "local"}
-"""Fields that SOURCE, words of 0.2 and the library set."""
+ELSEWHERE = {"root", "baud", "local", "kernel_words", "gone"}
+"""Fields that SOURCE, words of 0.2 or for the kernel, and the library set."""
 
 
 def test_each_field_is_a_row_of_the_table() -> None:
-    named = {row.field for row in TABLE.rows}
-    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys() - {"gone", *ELSEWHERE}
+    assert {row.field for row in TABLE.rows} == DEFAULTS.keys() - ELSEWHERE
     assert not {*TABLE.values, *TABLE.words} & (KERNEL_WORDS | IGNORED_WORDS)
 
 
 def test_each_value_option_takes_its_own_default() -> None:
     for name, row in TABLE.values.items():
-        default = {**SHARED, **OWN}[name]
+        default = DEFAULTS[name]
         if default:
             assert TABLE.parsed(name, row.default, {}) == default
 
 
 def test_defaults_are_those_of_the_session_and_the_caches() -> None:
-    both = SHARED.keys() & PASSED_ON.keys()
-    assert {name: SHARED[name] for name in both} == {name: PASSED_ON[name] for name in both}
+    both = DEFAULTS.keys() & PASSED_ON.keys()
+    assert {name: DEFAULTS[name] for name in both} == {name: PASSED_ON[name] for name in both}
 
 
 @pytest.mark.parametrize(
     "word", [*sorted(IGNORED_WORDS), "x-gvfs-show", "comment=systemd.automount", "user=x"]
 )
 def test_words_for_others_are_ignored(word: str) -> None:
-    assert parse_options([word]) == MountOptions()
+    assert parse_options([word]) == Options()
 
 
 @pytest.mark.parametrize(
@@ -76,12 +74,12 @@ def test_words_for_others_are_ignored(word: str) -> None:
 )
 def test_values(text: str, field: str, value: object) -> None:
     options = parse_options([text])
-    assert getattr(options if field in OWN else options.client, field) == value
+    assert getattr(options, field) == value
 
 
 def test_the_last_word_wins() -> None:
     options = parse_options(["ro,uid=1", "rw,uid=2"])
-    assert (options.client.read_only, options.uid) == (False, 2)
+    assert (options.read_only, options.uid) == (False, 2)
     assert parse_options(["async,sync,async"]).kernel_words == ("async",)
 
 
@@ -118,7 +116,7 @@ def test_wrong_words_are_named(text: str, named: str) -> None:
 @given(st.text(max_size=40))
 def test_any_text_is_parsed_or_refused(text: str) -> None:
     with suppress(UsageError):
-        assert isinstance(parse_options([text]), MountOptions)
+        assert isinstance(parse_options([text]), Options)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +132,7 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
     ],
 )
 def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> None:
-    assert options_of(keywords) == parse_options([text]).client
+    assert options_of(keywords) == parse_options([text])
 
 
 @pytest.mark.parametrize(
@@ -169,12 +167,12 @@ def test_wrong_keywords_are_named(keywords: dict[str, object], named: str) -> No
 )
 def test_modes(text: str, files: int, directories: int) -> None:
     options = parse_options([text])
-    assert options.file_mode(0o022) == files
-    assert options.directory_mode(0o022) == directories
+    assert permissions(options, 0o666, options.fmask, 0o022) == files
+    assert permissions(options, 0o777, options.dmask, 0o022) == directories
 
 
 def test_default_permissions_is_always_on() -> None:
-    assert parse_options(["default_permissions"]) == parse_options(["", " , "]) == MountOptions()
+    assert parse_options(["default_permissions"]) == parse_options(["", " , "]) == Options()
 
 
 def test_the_guide_has_the_table() -> None:
@@ -208,7 +206,7 @@ def test_the_guide_has_the_table() -> None:
 def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
     options = parse_options([f"ro,{word},uid=7"])
     assert options == parse_options(["ro,uid=7"])
-    (line,) = options.client.gone
+    (line,) = options.gone
     assert f"option {word.partition('=')[0]} is gone, and is ignored: " in line
 
 
@@ -223,7 +221,7 @@ def test_harmless_words_of_0_2_are_ignored_and_named(word: str) -> None:
     ],
 )
 def test_some_words_of_0_2_are_translated(word: str, field: str, value: object) -> None:
-    options = parse_options([word]).client
+    options = parse_options([word])
     assert getattr(options, field) == value
     (line,) = options.gone
     assert "is still understood: " in line
@@ -256,8 +254,8 @@ def test_words_that_are_gone_are_in_no_help_and_free_for_nothing_else() -> None:
 
 def test_endpoints_are_collected() -> None:
     wanted = ("udpout:127.0.0.1:14550", "tcpin:127.0.0.1:5760")
-    assert parse_options(["forward=udpout:127.0.0.1:14550,forward=tcpin::5760"]).client.forward == wanted
-    assert parse_options([f"forward={place}" for place in (*wanted, wanted[0])]).client.forward == wanted
+    assert parse_options(["forward=udpout:127.0.0.1:14550,forward=tcpin::5760"]).forward == wanted
+    assert parse_options([f"forward={place}" for place in (*wanted, wanted[0])]).forward == wanted
     assert options_of({"forward": list(wanted)}).forward == wanted
     assert options_of({"forward": wanted[0]}).forward == wanted[:1]
     with pytest.raises(UsageError, match="forward=nowhere"):

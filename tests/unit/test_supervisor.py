@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import MountRequest
 from mavftpfs.mount.members import Member, MemberState
-from mavftpfs.mount.options import MountOptions
 from mavftpfs.mount.supervisor import Supervisor
 
 SOURCE = "udpin:127.0.0.1:14550"
 
 
 async def test_a_mount_that_cannot_be_started_has_failed_and_is_tried_again() -> None:
-    request = MountRequest(SOURCE, parse_source(SOURCE), "/nowhere", MountOptions())
+    request = MountRequest(SOURCE, parse_source(SOURCE), "/nowhere", Options())
     supervisor = Supervisor(request, lambda member: ["/does/not/exist"], lambda code, line: None)
     member = Member(1)
     member.start()
