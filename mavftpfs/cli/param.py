@@ -69,6 +69,9 @@ def _require_one_job(args: Args, setting: Sequence[str]) -> None:
     jobs = [f"--{name}" for name in ("load", "save", "diff") if getattr(args, name) is not None]
     if len(jobs) > 1 or (jobs and args.names):
         raise UsageError(f"{jobs[0]} does one thing, with all parameters; leave out the rest")
+    blanks = any(word.startswith("=") or word.endswith("=") for word in setting)
+    if blanks and len(args.names) > 1:
+        raise UsageError(f"write NAME=VALUE without blanks: {''.join(args.names)}")
     if setting and len(setting) < len(args.names):
         raise UsageError("set parameters (NAME=VALUE) or print them (NAME), not both")
     if args.changed and (setting or (jobs and jobs != ["--save"])):
@@ -185,6 +188,8 @@ async def _diff_vehicles(args: Args, target: Target) -> int:
     """Compare the vehicles of a mount of several. A vehicle that cannot be read is named and left out."""
     if target.mount is None:
         raise UsageError("--diff needs a FILE; without one, SOURCE is the directory of a mount with -o all")
+    if target.options.target_system:
+        raise UsageError("--diff without a FILE compares all vehicles; leave out target_system=")
     found, code = dict[str, list[Parameter]](), ExitCode.OK
     with shown(Progress(), idle="reading the parameters"):
         for name, place in (await vehicles_below(target.mount[0])).items():

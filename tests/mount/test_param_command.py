@@ -72,7 +72,9 @@ def test_setting(source: str) -> None:
 
 WRONG = {
     ("RTL_ALT=x",): "'x' is not a number",
-    ("RTL_ALT", "=3"): "not both",
+    ("RTL_ALT", "=", "3"): "without blanks: RTL_ALT=3",
+    ("RTL_ALT", "=3"): "without blanks: RTL_ALT=3",
+    ("RTL_ALT=", "3"): "without blanks: RTL_ALT=3",
     ("=3",): "write NAME=VALUE",
     ("RTL_ALT=1.5",): "not a whole number",
     ("RTL_ALT=1", "rtl_alt=2"): "given two values",
