@@ -6,8 +6,8 @@ options, first item, items) and 38 bytes an item, those of MAVLink's MISSION_ITE
 longitude are degrees times ten million, x and y of local frames metres times ten thousand, and plain
 numbers where the command has no place.
 
-A vehicle has no room for all of an item, so an item reads back differently. `differences` says which
-differences count.
+A vehicle does not store every field of an item, so some fields read back differently. `differences` tells
+which differences count.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MOST = 65535
 
 _DEGREES, _METRES, _PLAIN = 1e7, 1e4, 1.0
 _NO_PLACE = 2**31 - 1
-"""As x or y: none, the vehicle takes its own (MISSION_ITEM_INT)."""
+"""x or y of an item without a place: the vehicle uses its own position (MISSION_ITEM_INT)."""
 
 _GLOBAL = frozenset((0, 3, 5, 6, 10, 11))
 _SAME_FRAME = {5: 0, 6: 3, 11: 10}
@@ -46,9 +46,9 @@ _HAS_PLACE = frozenset(
 """Commands whose fifth and sixth parameter are a place (`hasLocation` in MAVLink's definitions)."""
 
 _HEIGHT_STEP = {MISSION: 0.011, FENCE: 0.011, RALLY: 1.0}
-"""How exactly a vehicle keeps heights, in metres: centimetres, and whole metres of rally points."""
+"""Precision in metres with which a vehicle stores heights: a centimetre; a metre for rally points."""
 _STEP = 1e-4
-"""Relative: how exactly a vehicle keeps the four parameters, which are 32-bit floats."""
+"""Relative precision with which a vehicle stores the four parameters, which are 32-bit floats."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def unpack(data: bytes, kind: int) -> list[Item]:
     """Parse a download.
 
     Raises:
-        RemoteProtocolError: it does not add up, or is of another kind.
+        RemoteProtocolError: the file is inconsistent, or holds items of another kind.
     """
     if len(data) < HEADER.size:
         raise RemoteProtocolError(f"a mission file of {len(data)} bytes has no header")
@@ -98,7 +98,7 @@ def _unpack_item(data: bytes, at: int) -> Item:
 
 
 def pack_upload(items: Sequence[Item], kind: int, target: tuple[int, int]) -> list[bytes]:
-    """Return an upload that replaces all items, in pieces that are not to be cut. target: the vehicle's
+    """Return an upload that replaces all items, in pieces that no request may split. target: the vehicle's
     ids.
     """
     header = HEADER.pack(MAGIC, kind, 0, 0, len(items))
@@ -212,19 +212,19 @@ def _scaled(text: str, scale: float) -> int:
     return scaled
 
 
-# -- what came of it ------------------------------------------------------------------------------
+# -- reading back -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A field that reads back differently. kept: the vehicle has a place for it; else it is no error."""
+    """A field that reads back differently. kept: the vehicle stores that field; otherwise it is no error."""
 
     text: str
     kept: bool
 
 
 def differences(wanted: Sequence[Item], got: Sequence[Item], kind: int) -> list[Difference]:
-    """Compare what was sent with what was read back. The first item of a mission is the vehicle's home."""
+    """Compare the items that were sent with those read back. A mission's first item is the vehicle's home."""
     first = 1 if kind == MISSION else 0
     if len(wanted[first:]) != len(got[first:]):
         count = f"wanted {len(wanted[first:])} items, got {len(got[first:])}"

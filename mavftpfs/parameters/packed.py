@@ -6,7 +6,7 @@ one of the length of the name's beginning that it shares with the entry before (
 less one, that rest, the value, and with flag 1 the default. Zeros before an entry are padding. All is
 little-endian.
 
-A vehicle may send anything: a file that does not add up is an error.
+A vehicle may send anything: an inconsistent file is an error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mavftpfs.shared.errors import RemoteProtocolError
 
 MAGIC = 0x671B
 MAGIC_DEFAULTS = 0x671C
-"""Of a file in which defaults may follow values."""
+"""The magic of a file in which defaults may follow values."""
 
 HEADER = struct.Struct("<HHH")
 _DEFAULT = 1
@@ -34,12 +34,12 @@ _VALUES = {
 }
 _BY_TYPE = {int(kind): (kind, WIDTHS[kind], _VALUES[kind].unpack_from) for kind in Kind}
 _NAME = re.compile(rb"(?![^,#=]*[,#=])[!-~]{1,16}")
-"""Without the characters that would end a name in a text."""
+"""A name without the characters that would end it in a text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """What a packed file says.
+    """The content of a packed file.
 
     total: how many parameters the vehicle has. with_defaults: a parameter without a default has its value as
     the default.
@@ -54,7 +54,7 @@ def unpack(data: bytes) -> Download:
     """Parse a download.
 
     Raises:
-        RemoteProtocolError: it does not add up.
+        RemoteProtocolError: the file is inconsistent.
     """
     if len(data) < HEADER.size:
         raise RemoteProtocolError(f"a parameter file of {len(data)} bytes has no header")
@@ -103,11 +103,11 @@ def pack_value(kind: Kind, value: Number) -> bytes:
 
 
 def pack_upload(parameters: Sequence[Parameter]) -> list[bytes]:
-    """Return an upload that sets these values, in pieces that are not to be cut: the header with the first
-    entry, then one entry each.
+    """Return an upload that sets these values, in pieces that no request may split: the header with the
+    first entry, then one entry each.
 
-    An upload that ends early may be carried out as far as it came (ArduPilot fills the rest with zeros). A
-    value that came in part would be set to something else.
+    If an upload ends early, the vehicle may apply the part that arrived (ArduPilot fills the rest with
+    zeros). It would set a value that arrived in part to something else.
     """
     entries = list(_entries(parameters))
     length = HEADER.size + sum(map(len, entries))
@@ -126,6 +126,6 @@ def _entries(parameters: Sequence[Parameter]) -> Iterator[bytes]:
 
 
 def _shared(last: bytes, name: bytes) -> int:
-    """Return how much of a name is taken from the one before; at least one byte is not."""
+    """Return how many bytes a name shares with the one before; the last byte is never shared."""
     most = min(len(last), len(name) - 1, _MAX_SHARED)
     return next((place for place in range(most) if last[place] != name[place]), max(most, 0))

@@ -1,8 +1,8 @@
-"""What a saved text asks for, and what the vehicle has of it afterwards. Layer: parameters; pure.
+"""Saving a text of parameters: the changes that it asks for, and their result. Layer: parameters; pure.
 
 A program that saves a text of all parameters means only the lines that it changed: counters, barometers and
-learned values have changed on the vehicle since it read them. So a save has a *base*: what the same program
-read before. Lines that are as in the base ask for nothing. Without a base (`cp`, `>`) every line counts.
+learned values have changed on the vehicle since it read them. So a save has a *base*: the text that the same
+program read before. Lines that equal the base ask for nothing. Without a base (`cp`, `>`) every line counts.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ Values = Mapping[str, Parameter]
 
 
 Base = Mapping[str, Parameter | None]
-"""What a program read, by names. None: it has saved another value since, so its line counts in any case."""
+"""The parameters that a program read, by name. None: the program saved another value since, so that its line
+counts in any case."""
 
 
 def unchanged(line: Line, base: Base) -> bool:
@@ -37,9 +38,9 @@ def pick_base(lines: Sequence[Line], bases: Sequence[Base], *, rereads: bool) ->
     """Return the base that a text was made from: the one with which it shares the most lines, of several the
     last.
 
-    bases: what the program read, the oldest first. rereads: the program reads the file again to make a
-    backup, as vim does. Else a text that equals an older base is meant as it is: the program knew the last
-    one, and goes back.
+    bases: the texts that the program read, the oldest first. rereads: the program reads the file again to
+    make a backup, as vim does. Otherwise a text that equals an older base counts against the last one: the
+    program knew that, and goes back.
     """
     if len(bases) < 2:
         return bases[0] if bases else None
@@ -54,11 +55,11 @@ def pick_base(lines: Sequence[Line], bases: Sequence[Base], *, rereads: bool) ->
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be done about a text.
+    """The changes that a text asks for.
 
-    wanted: parameters that are to be set, and that the vehicle does not have yet. problems: invalid lines.
-    conflicts: why nothing is set although the lines are valid. With a problem or a conflict nothing is sent.
-    notes: what the user should know.
+    wanted: parameters to set, which have other values on the vehicle. problems: invalid lines. conflicts: why
+    nothing is set although the lines are valid. With a problem or a conflict the mount sends nothing. notes:
+    lines for the user.
     """
 
     wanted: list[Parameter] = field(default_factory=list)
@@ -68,9 +69,10 @@ class Plan:
 
 
 def make_plan(lines: Sequence[Line], base: Base | None, current: Values, *, meant: bool) -> Plan:
-    """Compare a text with what the vehicle has.
+    """Compare a text with the vehicle's parameters.
 
-    meant: each line was written by itself (`>>`), so even a parameter that the vehicle sets by itself is set.
+    meant: the user wrote each line by itself (`>>`), so even a parameter that the vehicle sets by itself is
+    set.
     """
     plan = Plan()
     left_alone: list[str] = []
@@ -107,7 +109,7 @@ def _conflict(now: Parameter, wanted: Number, before: Number) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of a plan: the names that the vehicle took, a line for each one that it did not, and
+    """The result of a plan: the parameters that the vehicle took, a line for each that it did not, and
     notes."""
 
     taken: list[str]
@@ -116,7 +118,7 @@ class Verdict:
 
 
 def judge(wanted: Sequence[Parameter], after: Values) -> Verdict:
-    """Compare what was to be set with what was read back."""
+    """Compare the values that were sent with those read back."""
     verdict = Verdict([], [], [])
     for one in wanted:
         now = after.get(one.name)

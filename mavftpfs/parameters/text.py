@@ -4,7 +4,7 @@
 - the same with the default in a comment;
 - system, component, name, value and type between tabs: QGroundControl (.params).
 
-Each line says by itself which spelling it has, so a text may mix them. `#` begins a comment.
+The parser recognises the spelling of each line, so a text may mix them. `#` begins a comment.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _QGC_FIELDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line that sets a parameter. number: of the line, from 1. system, component: of a QGroundControl line,
-    else None.
+    """A line that sets a parameter. number: counts lines from 1. system, component: of a QGroundControl line,
+    otherwise None.
     """
 
     number: int
@@ -42,7 +42,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Why a line is invalid. number: of the line, from 1; 0 if it concerns no single line."""
+    """The reason why a line is invalid. number: counts lines from 1; 0 if no single line is the reason."""
 
     number: int
     reason: str

@@ -59,7 +59,7 @@ class Parameter:
 
 
 class BadValue(ValueError):
-    """A text is no value for a parameter; it says why."""
+    """A text is no value for a parameter; the message tells why."""
 
 
 def same(one: Number, other: Number) -> bool:
@@ -75,7 +75,7 @@ def text_of(kind: Kind, value: Number) -> str:
 def float_text(value: float) -> str:
     """Return the shortest decimal whose nearest 32-bit float is this value, which must be a 32-bit float.
 
-    Six digits always survive a normal float. So no shorter rounding has to be tried: `%g` drops the zeros.
+    Six digits always survive a normal float, so the function tries no shorter rounding: `%g` drops the zeros.
     """
     if not math.isfinite(value):
         return "nan" if value != value else "inf" if value > 0 else "-inf"
@@ -95,7 +95,7 @@ def nearest_float(value: Number) -> float:
     """Return the 32-bit float nearest to a number.
 
     Raises:
-        OverflowError: it is too large for one.
+        OverflowError: the number is too large for one.
     """
     return float(_to_float.unpack(_to_float.pack(float(value)))[0])
 
@@ -104,7 +104,7 @@ def parse_number(text: str) -> Number:
     """Read a decimal number: an int where it has neither point nor exponent.
 
     Raises:
-        BadValue: it is no number.
+        BadValue: the text is no number.
     """
     if not _NUMBER.fullmatch(text.lower()):
         raise BadValue(f"{text!r} is not a number")
@@ -121,7 +121,7 @@ def fit(kind: Kind, number: Number) -> Number:
     """Return a number as a value of a type.
 
     Raises:
-        BadValue: it does not fit.
+        BadValue: the number does not fit.
     """
     if kind is Kind.FLOAT:
         try:

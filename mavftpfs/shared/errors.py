@@ -35,7 +35,7 @@ class ProtocolError(MavftpfsError):
 
 
 class LocalProtocolError(ProtocolError):
-    """We broke a rule: a bug, or a request that cannot be expressed (a path that is too long)."""
+    """mavftpfs broke a rule: a bug, or a request that cannot be expressed (a path that is too long)."""
 
 
 class PathTooLong(LocalProtocolError):
@@ -163,11 +163,11 @@ class WriteFailed(MavftpfsError):
 
 
 class VerificationFailed(MavftpfsError):
-    """What is on the card is not what was written, and sending it again did not help (EIO)."""
+    """The card has other bytes than were written, and sending them again did not help (EIO)."""
 
 
 class NotVerified(MavftpfsError):
-    """What is on the card is in doubt, and the vehicle told no checksum (EIO); it is compared later."""
+    """The bytes on the card are in doubt, and the vehicle told no checksum (EIO); they are compared later."""
 
 
 class OtherRefusal(MavftpfsError):
@@ -191,7 +191,7 @@ class NoFtp(MavftpfsError):
 
 
 class NotDelivered(MavftpfsError):
-    """It is not proven that the vehicle has the bytes that were written.
+    """No answer proves that the vehicle has the bytes that were written.
 
     Attributes:
         there: whether the file is there as it was written. False: it is not, and nothing of it is sent from
@@ -270,7 +270,7 @@ class FtpNak(MavftpfsError):
 
 
 class ExitCode(IntEnum):
-    """What the shell is told."""
+    """The exit codes of commands."""
 
     OK = 0
     USAGE = 1
@@ -291,7 +291,7 @@ EXIT_CODES = {
     ExitCode.BUG: "a bug in mavftpfs",
     ExitCode.INTERRUPTED: "interrupted; 128 and the number of the signal for others",
 }
-"""What each means, for the man page."""
+"""The meaning of each, for the man page."""
 
 SIGNALLED = 128
 """This plus a signal's number is the exit code of a command that the signal ended, as in shells."""
@@ -302,7 +302,7 @@ _NOT_POSSIBLE = (
     *(NotFound, NotADirectory, IsADirectory, AlreadyExists, DirectoryNotEmpty, InvalidMove, CrossDevice),
     *(ReadOnly, Armed, FileBusy, NotSupported, InvalidText, LocalProtocolError),
 )
-"""The vehicle is there, but what was asked cannot be done with the files as they are."""
+"""The vehicle is there, but cannot do what was asked with the files as they are."""
 
 _CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
     *((cls, ExitCode.USAGE) for cls in _NOT_POSSIBLE),

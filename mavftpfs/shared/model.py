@@ -1,4 +1,4 @@
-"""What a listing says, how a path is written, what a server was seen to do. Layer: shared; pure.
+"""Entries of listings, spellings of paths, and traits of servers. Layer: shared; pure.
 
 Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; the root is `/`.
 `wire_path` gives the server's spelling: virtual trees have no leading slash (servers.md 11).
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class EntryKind(Enum):
-    """What a directory entry is."""
+    """The kind of a directory entry."""
 
     FILE = "F"
     DIRECTORY = "D"
@@ -107,8 +107,9 @@ def is_on_nuttx(path: bytes) -> bool:
 
 
 def is_snapshot(path: bytes) -> bool:
-    """Return whether it is an `@` file that must be read whole. The logs below `@MAV_LOG` are real files, and
-    those of `@ROMFS` are like them: they have true sizes and do not change."""
+    """Return whether the vehicle generates the `@` file at each opening, so that a client must read it whole.
+    The logs below `@MAV_LOG` are real files, and those of `@ROMFS` are like them: they have true sizes and do
+    not change."""
     return is_virtual(path) and path.split(b"/", 2)[1] not in (b"@MAV_LOG", b"@ROMFS")
 
 
@@ -116,7 +117,7 @@ def wire_path(path: bytes) -> bytes:
     """Return the server's spelling of a normalised path.
 
     Raises:
-        PathTooLong: it does not fit (servers cut silently, servers.md 13).
+        PathTooLong: the path does not fit (servers cut silently, servers.md 13).
     """
     wire = path[1:] if is_virtual(path) else path
     if len(wire) > MAX_WIRE_PATH:
@@ -129,7 +130,7 @@ def require_listable(path: bytes) -> None:
     removed.
 
     Raises:
-        LocalProtocolError: it holds a tab, which ends a name in a listing (servers.md 6, 14.33).
+        LocalProtocolError: the name holds a tab, which ends a name in a listing (servers.md 6, 14.33).
     """
     name = split(path)[1]
     if b"\t" in name:
@@ -141,10 +142,10 @@ def usable_name(name: bytes) -> bool:
     return bool(name) and name not in (b".", b"..") and b"/" not in name and b"\0" not in name
 
 
-# -- traits: what a server was seen to do ------------------------------------------------------------
+# -- traits of a server ------------------------------------------------------------------------------
 #
-# None means "not seen yet". Nothing here is derived from a name or a version: a field is filled when an
-# answer proves it, and forgotten when the vehicle restarts.
+# None means "not seen yet". Nothing here is derived from a name or a version: the engine fills a field when
+# an answer proves it, and forgets all of them when the vehicle restarts.
 
 SHARED_QUEUE_WINDOW = 4
 """Requests in flight where the server has a queue of five for all clients (servers.md 3, ArduPilot)."""
@@ -157,13 +158,14 @@ class Traits:
     Attributes:
         ack_carries_own_session: an Open ACK carried the non-zero id we had asked for (servers.md 14.6);
             then every reply echoes the request's session, and it is checked.
-        several_sessions: it answered us while another client had a session (ArduPilot, generation B).
+        several_sessions: the server answered us while another client had a session (ArduPilot, generation B).
         queue_limit: the most requests that may be in flight; None where no limit is known.
         write_ack_offset: WriteFile ACKs say where bytes were written (MAVSDK's say 0), and are believed only
             if that is the place.
-        paths_block_writes: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
-        lists_times: it answers opcode 16. time_silences: how often it did not answer that, and then answered
-        opcode 3.
+        paths_block_writes: a path operation made the server refuse the next write (PX4 on NuttX, servers.md
+            8).
+        lists_times: the server answers opcode 16. time_silences: how often the server did not answer that,
+            and then answered opcode 3.
         wo_truncates: OpenFileWO empties the file (servers.md 8).
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.

@@ -15,7 +15,7 @@ _MAX_SOCKET_PATH = 107
 
 
 def open_private(path: str | Path, flags: int) -> int:
-    """Open a file for writing, made 0600 if it is not there, and return its descriptor.
+    """Open a file for writing, and make it with mode 0600 if it is missing; return its descriptor.
 
     flags: of os.open, O_CREAT and O_CLOEXEC are added.
 
@@ -31,7 +31,7 @@ def open_private(path: str | Path, flags: int) -> int:
 
 
 def make_private_directory(path: Path) -> None:
-    """Make a directory 0700, and those above it that are missing; one that is there stays as it is.
+    """Make a directory with mode 0700, and the missing ones above it; an existing one stays as it is.
 
     Raises:
         OSError.
@@ -62,8 +62,8 @@ def directories_of(uid: int, home: str | None = None) -> list[Path]:
 
 
 def private_directory(directories: list[Path], *, longest_name: int) -> Path | None:
-    """Return the first directory that is, or can be made, this user's alone, and where a socket's path with
-    such a long name fits; None if there is none."""
+    """Return the first directory that belongs to this user alone, or can be made so, and in which the path of
+    a socket with such a long name fits; None if there is none."""
     for directory in directories:
         try:
             # Not parents=True for a runtime directory: only the system creates /run/user/UID.

@@ -23,7 +23,7 @@ def readable(message: str) -> str:
 
 
 def name_text(name: bytes) -> str:
-    """Return a name or path as text: what is no UTF-8 is escaped."""
+    """Return a name or path as text, with escapes for bytes that are no UTF-8."""
     return name.decode("utf-8", "backslashreplace")
 
 
@@ -33,7 +33,7 @@ def printable(text: str) -> str:
 
 
 def autopilot_name(number: int) -> str:
-    """Return what a MAV_AUTOPILOT value says."""
+    """Return the name of a MAV_AUTOPILOT value."""
     return _AUTOPILOTS.get(number, f"autopilot type {number}")
 
 

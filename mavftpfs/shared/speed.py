@@ -1,4 +1,4 @@
-"""How fast bytes move, as people are told. Layer: shared; pure."""
+"""The speed of a transfer, as people see it. Layer: shared; pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import inf
 
 
 class Speed:
-    """The mean over the last SPAN seconds, pauses included; not told before it is known.
+    """The mean over the last SPAN seconds, pauses included; None before it is known.
 
     The first bytes of a transfer, and those after a pause, tell nothing: they come at the speed of the
     buffers on the way. All times in seconds of one clock.

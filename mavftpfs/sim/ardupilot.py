@@ -1,8 +1,8 @@
 """ArduPilot's FTP server: queue, worker thread and sessions. Layer: sim; pure.
 
 Source: GCS_FTP.cpp of generation A (one session for the vehicle) and of generations B and C (five),
-servers.md 1-13 and 15, a recording. The worker is a generator. It yields the time at which it wants to go on,
-or None while it is idle.
+servers.md 1-13 and 15, a recording. The worker is a generator, which yields the time at which it is to be
+resumed, or None while it is idle.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
 _QUEUE = 5
-"""So many requests may wait. More are dropped silently."""
+"""Requests that may wait; the server drops more silently."""
 _STEAL_AFTER = 3.0
-"""A session idle for so long, in seconds, may be taken by another."""
+"""Seconds without a request after which another client may take a session."""
 
 
 @dataclass(slots=True)
@@ -64,8 +64,8 @@ class Session:
 
 
 class Operations:
-    """All requests except bursts. Each method fills in the reply and returns how long it took. A NAK is
-    raised."""
+    """All requests except bursts. Each method fills in the reply and returns how many seconds it took, or
+    raises a NAK."""
 
     def __init__(self, storage: Storage, profile: Profile) -> None:
         self._storage = storage
@@ -115,7 +115,7 @@ class Operations:
     # -- the file ----------------------------------------------------------------------------
 
     def _terminate(self, session: Session) -> None:
-        """Close; only generations B and C say so if that failed."""
+        """Close; only generations B and C report a failure."""
         try:
             session.close()
         except OSError:
@@ -289,7 +289,7 @@ class ArduPilot(Firmware):
     # -- timeline ----------------------------------------------------------------------------
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
-        """Queue a request, or drop it if five wait."""
+        """Queue a request, or drop it if five others wait."""
         self.advance(now)
         if len(self._queue) >= _QUEUE:
             self.dropped_requests += 1
@@ -426,7 +426,7 @@ class ArduPilot(Firmware):
         return oldest
 
     def _is_repeat(self, request: Request) -> bool:
-        """Whether this seems to be the request that was answered last, in any session of the server."""
+        """Return whether this seems to be the request that any session of the server answered last."""
         reply = self._reply
         return (
             request.source == reply.target
@@ -465,7 +465,7 @@ class ArduPilot(Firmware):
         self._reply.opcode, self._reply.size, self._reply.data = NAK, 1, bytes([code])
 
     def _fail(self, exc: OSError) -> None:
-        """Refuse with errno, or with whatever errno was left by an earlier failure."""
+        """Refuse with errno, or with the errno that an earlier failure left."""
         if not isinstance(exc, NoErrno) and exc.errno is not None:
             self._errno = exc.errno
         if self._errno == errno.EEXIST:
@@ -480,7 +480,7 @@ class ArduPilot(Firmware):
             self._reply.size, self._reply.data = 2, bytes([NakCode.FAIL_ERRNO, number & 0xFF])
 
     def _push(self, slot: Session) -> Iterator[float | None]:
-        """Send the reply as soon as the link has room. Until then the server does nothing else."""
+        """Send the reply as soon as the link has room; the server does nothing else until then."""
         while not self._has_room():
             yield self._horizon + _ROOM_POLL  # room changes between two calls of advance only
         slot.last_sent = self.now

@@ -1,6 +1,6 @@
 """The arguments of `mavftpfs sim`. Layer: sim; pure.
 
-They stand apart, because the help of every command lists them without running a vehicle.
+This is a module of its own, because the help of every command lists the arguments without running a vehicle.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ _FASTEST = 4_000_000
 _SLOWEST = 50
 """Baud rates that every serial driver takes."""
 _ANSWER_AT = 16
-"""So many replies at most wait for others before all are sent."""
+"""The most replies that wait for others before the endpoint sends all of them."""
 
 
 class Endpoint:
@@ -76,12 +76,12 @@ class Endpoint:
                 self._exchange_through(self.model, pieces, now)
 
     def kick(self) -> None:
-        """Look at the vehicle again: it was changed from outside."""
+        """Look at the vehicle again, because something changed it from outside."""
         if self._scope is not None:
             self._scope.cancel()
 
     def toggle_cut(self) -> bool:
-        """Cut the link, or mend it; return whether it is cut now."""
+        """Cut the link, or restore it; return whether it is cut now."""
         self.cut = not self.cut
         return self.cut
 

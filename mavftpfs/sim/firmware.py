@@ -1,11 +1,11 @@
-"""What the simulated firmwares have in common. Layer: sim; pure.
+"""The common part of the simulated firmwares. Layer: sim; pure.
 
 Requests and replies are not those of protocol.payload. Servers echo fields and leave stray bytes behind
 `size`, and this code must be fast.
 
-Time: `handle` and `outgoing` first let everything happen that was due by `now`, in order, at its own instant.
-Replies are emitted in the order of their due times: the outbox is a list of those that are due and a queue
-of the others.
+Time: `handle` and `outgoing` first do everything that was due by `now`, in order, each at its own instant.
+Replies leave in the order of their due times: the outbox is a list of those that are due and a queue of the
+others.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def parse(wire: bytes, source: Address) -> Request:
 
 
 def c_string(data: bytes) -> bytes:
-    """Return what stands before the first NUL."""
+    """Return the bytes before the first NUL."""
     return data.partition(b"\0")[0]
 
 
@@ -101,8 +101,7 @@ _PAUSES_KEPT = 1 << 18
 
 
 class Refusal(Exception):
-    """A NAK with data that the server chooses: a code, perhaps more. For an OSError they come from its
-    errno."""
+    """A NAK with data that the server chooses: a code, perhaps more. For an OSError the errno decides."""
 
     def __init__(self, code: int, *more: int) -> None:
         super().__init__(code, *more)
@@ -151,7 +150,7 @@ class Firmware(ABC):
 
     @abstractmethod
     def advance(self, now: float) -> None:
-        """Let everything happen that is due by `now`."""
+        """Do everything that is due by `now`."""
 
     @abstractmethod
     def next_wake(self) -> float | None:
@@ -190,7 +189,7 @@ class Firmware(ABC):
         return wake
 
     def forget_outbox(self) -> None:
-        """Drop what was not sent yet."""
+        """Drop the replies that were not sent yet."""
         self._ready = []
         self._ready_bytes = 0
         self._later.clear()

@@ -1,10 +1,10 @@
 """A bad link, as a pure and seeded model of both directions. Layer: sim; pure.
 
 Each direction has a drop-tail queue before a transmitter with a fixed rate. In half duplex there is one
-transmitter. It takes frames from the two queues in turn, much as a time-division radio does. A frame that was
-sent is lost, doubled, damaged or delayed with the given probabilities. Else it arrives in order, `delay` plus
-up to `jitter` after its last byte was sent. It is also lost if the link is cut when its last byte leaves or
-when it would arrive.
+transmitter. It takes frames from the two queues in turn, much as a time-division radio does. The
+model loses, doubles, damages or delays a sent frame with the given probabilities. Otherwise the frame arrives
+in order, `delay` plus up to `jitter` after its last byte was sent. A frame is also lost if the link is cut
+when its last byte leaves or when it would arrive.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Duplex(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """What a link is like; the same in both directions.
+    """The properties of a link, the same in both directions.
 
     rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
@@ -91,7 +91,7 @@ class LinkModel:
     # -- the ends ----------------------------------------------------------------------------
 
     def push(self, direction: Direction, frame: bytes, now: float) -> bool:
-        """Hand a frame to the transmitter's queue; returns False if it was dropped for want of room."""
+        """Append a frame to the transmitter's queue; return False if the queue is full, which drops it."""
         self._advance(now)
         lane = self._lanes[direction]
         if self.settings.rate is not None and len(frame) > self.room(direction):
@@ -114,7 +114,7 @@ class LinkModel:
         return frames
 
     def next_deadline(self) -> float | None:
-        """When something may arrive next; at times too early, never too late. None if nothing will."""
+        """Return when a frame may arrive next, at times too early and never too late; None if none will."""
         times = [lane.arrivals[0][0] for lane in self._lanes if lane.arrivals]
         for lane in self._lanes:
             if lane.queue:

@@ -1,8 +1,8 @@
 """MAVSDK's FTP server. Layer: sim; pure. Source: mavlink_ftp_server.cpp, servers.md 1-10, a recording.
 
-All clients share one read stream, one write stream and one file size. There is a thread for bursts, and no
-replay slot. Fields that a handler does not set are 0 in the reply. A request that is not understood gets no
-answer.
+All clients share one read stream, one write stream and one file size. The server has a thread for bursts, and
+no replay slot. Fields that a handler does not set are 0 in the reply. The server does not answer a request
+that it does not understand.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _IO_ERROR = 201
 
 
 class Silence(Exception):
-    """No answer at all."""
+    """The server sends no answer."""
 
 
 @dataclass(slots=True)
@@ -62,7 +62,7 @@ class _WriteStream:
     failed: bool = False
 
     def flush(self) -> None:
-        """Write the tail. That the card is full is noticed only at the next write, or never."""
+        """Write the tail. The server notices a full card only at the next write, or never."""
         offset, data = self.tail
         self.tail = (0, b"")
         try:
@@ -321,7 +321,7 @@ class Mavsdk(Firmware):
         return b""
 
     def _seek(self, request: Request) -> _ReadStream:
-        """Place the one read position; a wrong session closes everything first."""
+        """Set the one read position; a wrong session closes everything first."""
         if request.session != 0 or self._reader is None:
             self._close()
         if request.offset >= self._file_size:

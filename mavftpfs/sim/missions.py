@@ -1,4 +1,4 @@
-"""Missions of one vehicle, and what ArduPilot makes of `@MISSION/*.dat`. Layer: sim; pure.
+"""Missions of one vehicle, as ArduPilot serves and accepts `@MISSION/*.dat`. Layer: sim; pure.
 
 Source: servers.md 11 and 17; AP_Filesystem_Mission and a recording. An upload replaces all items when it is
 closed. If it is refused, the old items stay; some versions ACK the close all the same.
@@ -29,7 +29,8 @@ _PLACELESS = frozenset((20, 112, 114, 115, 177, 178, 183, 206, 211))
 class Missions:
     """Items by kind: mission, fence, rally. The mission's first item is home.
 
-    limit: more items are refused. says_so: a refused upload is EINVAL at the close; else the close is ACKed.
+    limit: the most items that the vehicle accepts. says_so: the close of a refused upload is EINVAL;
+    otherwise the server ACKs it.
     """
 
     limit: int = 700
@@ -46,7 +47,7 @@ class Missions:
         """Take an upload.
 
         Raises:
-            OSError: EINVAL, it is refused, and `says_so`.
+            OSError: EINVAL, the vehicle refuses the upload, and `says_so`.
         """
         kind = NAMES.index(name)
         items = self._parsed(kind, data)

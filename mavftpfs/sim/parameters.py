@@ -1,10 +1,10 @@
-"""The parameters of one vehicle, and what its server makes of `@PARAM/param.pck`. Layer: sim; pure.
+"""The parameters of one vehicle, as its server serves and accepts `@PARAM/param.pck`. Layer: sim; pure.
 
-Source: servers.md 11 and 17; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. This packs
-and parses by code of its own, so that it has no mistake in common with the code that it tests.
+Source: servers.md 11 and 17; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. The
+simulator packs and parses with code of its own, so that it shares no mistake with the code that it tests.
 
-A *table* holds the values. It packs a download, and an upload changes it: PX4 parses strictly, each write as
-it comes. ArduPilot parses the whole file when it is closed, and does not tell whether it took it.
+A *table* holds the values, packs a download, and takes an upload: PX4 parses strictly, each write as it
+arrives. ArduPilot parses the whole file when the client closes it, and does not tell whether it took it.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ _WIDTHS = {INT8: 1, INT16: 2, INT32: 4, FLOAT: 4}
 class Parameter:
     """A parameter. `value` and `default` are as stored, little-endian; a default of None is the value.
 
-    drift: it grows by so much each second, by itself. limits: a value outside becomes the nearest one inside.
-    read_only: it is not set. needs: it is there only while the parameter of that name is not 0. misfit: its
-    default does not fit its type, so a download has the default though it looks equal (SIM_OH_RELAY_MSK).
+    drift: the growth of the value in each second. limits: a value outside becomes the nearest one inside.
+    read_only: the vehicle ignores a new value. needs: the parameter exists only while the one of that name is
+    not 0. misfit: the default does not fit the type, so a download has the default although it looks equal
+    (SIM_OH_RELAY_MSK).
     """
 
     name: bytes
@@ -96,7 +97,7 @@ def parameter(
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What a download asks for: `param.pck?start=50&count=10&withdefaults=1`. count 0: all that are left."""
+    """The arguments of a download, `param.pck?start=50&count=10&withdefaults=1`. count 0: all the rest."""
 
     start: int = 0
     count: int = 0
@@ -194,7 +195,7 @@ class Table:
         return not one.needs or self._held[one.needs].number != 0
 
     def _drift(self, now: float) -> None:
-        """Let whole seconds pass."""
+        """Advance the parameters that drift by whole seconds."""
         if not math.isfinite(now):
             return
         if self._drifted_to is None:
@@ -222,7 +223,7 @@ class _Entry(NamedTuple):
 
 
 def _parse_entry(data: bytes | bytearray, at: int, last: bytes) -> _Entry | None:
-    """Parse an entry; None: it is not all there yet.
+    """Parse an entry; return None if a part of it is still missing.
 
     Raises:
         OSError: EINVAL, a flag, a type that does not exist, or a name that is too long.

@@ -1,6 +1,6 @@
-"""Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
+"""Firmware profiles: the properties of each simulated server, as data. Layer: sim; pure.
 
-The firmwares that are simulated. Sources of the numbers: servers.md, PX4 `mavlink_ftp.cpp`, ArduPilot
+Sources of the numbers: servers.md, PX4 `mavlink_ftp.cpp`, ArduPilot
 `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
 """
 
@@ -16,7 +16,7 @@ TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 
 
 class Family(Enum):
-    """Whose code the server runs."""
+    """The project whose code the server runs."""
 
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
@@ -34,27 +34,27 @@ class Storage(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """What differs between servers. Times in seconds, sizes in bytes, rates in bytes per second. A family
+    """The differences between servers. Times in seconds, sizes in bytes, rates in bytes per second. A family
     ignores the fields that it does not need.
     """
 
     name: str
     family: Family
     about: str = ""
-    """What it simulates, for `sim --help`."""
+    """The simulated firmware, for `sim --help`."""
     version: int = 0
     """The firmware's version as AUTOPILOT_VERSION has it; the last byte is 255 in releases."""
     log_place: str = "log"
     """Where logs lie on the card."""
     storage: Storage = Storage.POSIX
     case_fold: bool = False
-    """Names are found whatever their case (FatFs)."""
+    """The card ignores the case of names (FatFs)."""
     newlib_errnos: bool = False
     """ENOTEMPTY is 90, ENAMETOOLONG 91, ENOSYS 88, ELOOP 92 (servers.md 12)."""
 
     # Requests
     list_with_time: bool = False
-    """Opcode 16 is answered; else it is an unknown opcode."""
+    """The server answers opcode 16; otherwise that is an unknown opcode."""
     bare_time_directories: bool = False
     """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
     unknown_code: int = 7
@@ -66,19 +66,19 @@ class Profile:
     double_nul: bool = False
     """Listing entries end in two zero bytes (ArduPilot before mid-2026)."""
     drop_long_names: bool = False
-    """A name too long for a page is left out. False: it ends the listing early (ArduPilot)."""
+    """A listing leaves out a name that is too long for a page. False: it ends there (ArduPilot)."""
     root_omits_files: bool = False
     """Listing `/` shows no plain files, listing `.` does (ArduPilot SITL, generation A)."""
     counted_path_nul: bool = True
     """A path may count its trailing NUL in `size` (ArduPilot since mid-2025)."""
     path_limit: int = 238
-    """Longer paths are cut silently (PX4, ArduPilot)."""
+    """The server cuts longer paths silently (PX4, ArduPilot)."""
 
     longest_reply: int = MAX_DATA
     """Data bytes of a reply to a read or a burst at most. PX4 may send less over a radio (servers.md 7)."""
 
     tells_storage: bool = True
-    """STORAGE_INFORMATION is sent when asked for (not by MAVSDK's server)."""
+    """The vehicle sends STORAGE_INFORMATION when asked for it (MAVSDK's server does not)."""
 
     # Sessions
     sessions: int = 1
@@ -89,7 +89,7 @@ class Profile:
     write_only_creates: bool = True
     """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
     open_replaces: bool = False
-    """An open closes what any client has open; else it is refused (PX4 of September 2026)."""
+    """An open closes any other client's file (PX4 of September 2026); otherwise the server refuses it."""
     checks_sender: bool = False
     """An answer is repeated only to the client that asked, and without stray bytes (PX4 of September
     2026)."""

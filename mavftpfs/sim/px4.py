@@ -270,7 +270,7 @@ class Px4(px4ops.PathRequests):
             self._dispatch(parse(wire, source), wire, now)
 
     def _is_cached(self, seq: int, source: Address) -> bool:
-        """Whether the last answer was to a request with this number."""
+        """Return whether the last answer was to a request with this number."""
         if self._cached is None or seq + 1 != self._cached_seq:
             return False
         return source == self._cached_target or not self.profile.checks_sender
@@ -302,7 +302,7 @@ class Px4(px4ops.PathRequests):
         return self._refuse(_FAIL_ERRNO)
 
     def _reply(self, target: Address, wire: bytes, data: bytes, now: float, ack: bool = False) -> None:
-        """Answer a request; PX4 writes the answer into the request's buffer, so other fields are echoed."""
+        """Answer a request. PX4 writes into the request's buffer, so it echoes the other fields."""
         seq, session, opcode, _, _, complete, offset = HEADER.unpack_from(wire)
         if ack and opcode in (Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE):
             session = 0
@@ -433,7 +433,7 @@ class Px4(px4ops.PathRequests):
         self._deliver(source, packed, now)
 
     def _refuse_read(self, request: Request) -> bytes:
-        """Say why a ReadFile cannot be served."""
+        """Return why a ReadFile cannot be served."""
         if request.session != 0 or self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
         if request.offset >= self._file_size:

@@ -21,7 +21,7 @@ _SIGNS = rb"!#-)\-0-9@^-`{}~"
 _SHORT = re.compile(
     rb"(?:[%(s)bA-Z]{1,8}|[%(s)ba-z]{1,8})(?:\.(?:[%(s)bA-Z]{,3}|[%(s)ba-z]{,3}))?" % {b"s": _SIGNS}
 )
-"""What NuttX keeps without a long name (its fat_parsesfname)."""
+"""Names that NuttX stores without a long name (its fat_parsesfname)."""
 
 _GAP_LIMIT = 65_536
 _CRC_BLOCK = 65_536

@@ -54,13 +54,13 @@ class OpenFile(Protocol):
         ...
 
     def close(self) -> None:
-        """Make what was written durable. May be called twice."""
+        """Make the written bytes durable. Harmless if called twice."""
         ...
 
 
 class ClaimedFile:
-    """What the open files that a server makes itself have in common: the size that they claim, and a close
-    that counts once. on_close: called by it first.
+    """The common part of open files that a server makes itself: the size that they claim, and a close that
+    counts once. on_close: called by the close first.
     """
 
     def __init__(self, claimed: int, on_close: Callable[[], None]) -> None:
@@ -80,7 +80,7 @@ class ClaimedFile:
             self.closed()
 
     def closed(self) -> None:
-        """Do what is to be done at the end."""
+        """Clean up at the end; called once."""
 
 
 class TreeFile(OpenFile, Protocol):
@@ -200,7 +200,7 @@ class MemoryTree:
     # -- building a tree ---------------------------------------------------------------------
 
     def add(self, path: bytes, data: bytes = b"", mtime: int | None = None) -> None:
-        """Put a file there, replacing its content, making parents as needed."""
+        """Make or replace a file, with its parents."""
         self.add_directory(parent_and_name(path)[0])
         with_file = self.open(path, write=True, create=True, truncate=True)
         if data:
@@ -221,7 +221,7 @@ class MemoryTree:
             self._find(path).mtime = mtime
 
     def add_other(self, path: bytes) -> None:
-        """Put a thing there that is neither file nor directory (a fifo, say)."""
+        """Make something that is neither file nor directory (a fifo, say)."""
         self._link(path, _Node(Kind.OTHER, self._now()))
 
     def data(self, path: bytes) -> bytes:

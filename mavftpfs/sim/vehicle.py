@@ -1,7 +1,8 @@
 """A simulated vehicle: an FTP server with the rest of an autopilot's MAVLink around it. Layer: sim; pure.
 
-Neither does any I/O. Requests or frames go in, replies or frames come out. `now` is in monotonic seconds and
-must not go back. `next_deadline` says when to ask again. No request can make the server raise.
+Neither class does any I/O. Requests or frames go in, replies or frames come out. `now` is in monotonic
+seconds and must not go back. `next_deadline` tells when to ask again. The server never raises, whatever
+request arrives.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ class FtpServer:
         return self.firmware.outgoing(now)
 
     def next_deadline(self) -> float | None:
-        """When to call `outgoing` again if no request comes; in the past if it has something now."""
+        """Return when to call `outgoing` again if no request comes; a past time if there is a reply now."""
         return self.firmware.next_deadline()
 
     def reboot(self, now: float) -> None:
@@ -189,11 +190,11 @@ class SimVehicle:
         self._ready: list[bytes] = []
 
     def arm(self) -> None:
-        """Be armed from the next heartbeat on, which is sent at once."""
+        """Arm, and send the next heartbeat at once."""
         self._set_armed(True)
 
     def disarm(self) -> None:
-        """Be disarmed from the next heartbeat on, which is sent at once."""
+        """Disarm, and send the next heartbeat at once."""
         self._set_armed(False)
 
     def reboot(self, now: float, downtime: float = 0.0, *, beat_after: float = 0.0) -> None:
@@ -210,7 +211,7 @@ class SimVehicle:
         self.on_news()
 
     def set_stream(self, stream: bool) -> None:
-        """Say, before the first `receive`, whether it will get pieces of a stream or datagrams."""
+        """Set, before the first `receive`, whether that gets pieces of a stream or datagrams."""
         self.framer.stream = stream
 
     def receive(self, data: bytes, now: float) -> None:
@@ -234,8 +235,8 @@ class SimVehicle:
     def foreign_request(self, payload: bytes, source: Address, now: float, *, audible: bool = True) -> None:
         """Let another ground station ask something over another link.
 
-        The answers, to `source`, are heard on this link too; so is the request where `audible`, as a
-        router forwards it.
+        This link hears the answers, to `source`, too, and, if `audible`, the request, as a router forwards
+        it.
         """
         if audible:
             self._ready.append(Framer(source, stream=False).encode_ftp(self.address, payload))
@@ -266,7 +267,7 @@ class SimVehicle:
         return frames
 
     def next_deadline(self) -> float:
-        """When to call `outgoing` again if nothing is received; in the past if there is something now."""
+        """Return when to call `outgoing` again if nothing arrives; a past time if there is a frame now."""
         if self._ready:
             return self._down_until
         due = self._next_beat
