@@ -19,8 +19,8 @@ from math import inf
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer, Wants
-from mavftpfs.protocol.requests import MANNERS, Request
-from mavftpfs.shared.errors import MavftpfsError, SessionLost
+from mavftpfs.protocol.requests import MANNERS, READ_MANNER, Request
+from mavftpfs.shared.errors import SessionLost
 
 _MOST_PACKETS = 40_000
 _MIN_QUIET = 1.0
@@ -166,10 +166,10 @@ class BurstTransfer(ReadTransfer):
         gap = self.wants.take(self.chunks.size, self._covered)
         if gap is not None:
             return self._requests_for(gap, self.chunks.size)
-        if self._unanswered:
+        if self.wants.on_its_way:
             return []
         self._covered = 0
-        first = self.wants.demand.first() or self.wants.ahead.first()
+        first = self.wants.demand.todo.first() or self.wants.ahead.todo.first()
         if first is None:
             return []
         opcode = Opcode.BURST_READ_FILE
@@ -177,7 +177,7 @@ class BurstTransfer(ReadTransfer):
 
     def on_burst_sent(self, request: Request, now: float) -> int:
         """Begin to follow the burst; return how many packets it may bring (MAVSDK: all the rest)."""
-        rto = self.port.timeout("data")
+        rto = self.port.timeout(READ_MANNER)
         self._burst = burst = Burst(request.seq, request.offset, self.size, request.size, now, rto)
         self.timer = burst.quiet_deadline()
         return (self.size - request.offset) // request.size + 2
@@ -189,8 +189,7 @@ class BurstTransfer(ReadTransfer):
         if burst is None or data is None:
             return False
         if data:
-            self.wants.discard(reply.offset, reply.offset + len(data))
-            self._place(reply.offset, [data])
+            self._place(reply.offset, [data], now)
         if burst.endless:
             self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
         elif burst.over:
@@ -207,10 +206,10 @@ class BurstTransfer(ReadTransfer):
         else:
             self._end_burst(burst)
 
-    def fail(self, error: MavftpfsError) -> None:
+    def finish(self) -> None:
         """End; what was on its way is wanted again."""
         self._burst = None
-        super().fail(error)
+        super().finish()
 
     def _end_burst(self, burst: Burst) -> None:
         self._burst, self.timer, self._covered = None, inf, burst.highest

@@ -65,8 +65,8 @@ class ChunkSize:
         return self.size
 
     def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
-        """Note that requests for `size` bytes each, sent then, were answered, `count` of them at the first
-        attempt. The others prove nothing: a late server answers full ones, too, in the end."""
+        """Note that `count` requests for `size` bytes each, sent then, were answered in time. Late answers
+        prove nothing: a late server answers full ones, too, in the end."""
         if size > self._least:
             if size >= self._shortest_lost:
                 self.trying, self._lost = False, 0
@@ -77,9 +77,8 @@ class ChunkSize:
             self._answered += count
             self._judge_losses(now)
 
-    def on_lost(self, size: int, sent_at: float, now: float) -> bool:
-        """Note that a request for `size` bytes, sent then, is to be repeated; return whether its bytes go out
-        in other chunks."""
+    def on_lost(self, size: int, sent_at: float, now: float) -> None:
+        """Note that a request for `size` bytes, sent then, is lost."""
         if size > self._least and sent_at > self._since:
             if not self._lost:
                 self._first_lost_at = now
@@ -88,7 +87,6 @@ class ChunkSize:
             self._lost += 1
             self._short_next = False  # a short one is next, also where there is one request at a time
             self._judge_losses(now)
-        return size > self._least and (self.trying or size > self.size)
 
     def _judge_losses(self, now: float) -> None:
         """Try short chunks if long ones are lost; use short ones once they proved to come through."""

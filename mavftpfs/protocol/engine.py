@@ -1,10 +1,11 @@
-"""The client engine: matches replies, repeats what is lost, keeps the window. Layer: protocol; pure.
+"""The client engine: matches replies, keeps the window, notices losses. Layer: protocol; pure.
 
 Theory of operation. Operations say what to ask (`next_requests`) and are told of believed answers. A reply
 belongs to the request whose seq is one less. It is believed if it has the request's req_opcode and, where
-servers echo them, its session and offset. A reply that is not believed changes nothing. A loss is known by
-later answers (see `ledger`) or by a timer. Lost requests go out before new ones of the same operation. While
-burst packets arrive timers stand still, because ArduPilot answers nothing else then (servers.md 4).
+servers echo them, its session and offset. A reply that is not believed changes nothing. A request is lost
+when a later one was answered and a little more than a round trip passed, or when its timer runs out (see
+`timers`). Its operation is told, and asks again. While burst packets arrive timers stand still, because
+ArduPilot answers nothing else then (servers.md 4).
 
 Nothing that comes in can raise: `receive` takes any payload at any time.
 """
@@ -21,14 +22,12 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.pathgate import PathGate
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload, reply_of, split_run
-from mavftpfs.protocol.requests import Operation, Request, encode
+from mavftpfs.protocol.requests import Manner, Operation, Request, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
 
 OP_DEADLINE = 30.0
-_MAX_REPLAYS = 8
-_MAX_SIDE_EFFECT_REPLAYS = 2
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
@@ -39,14 +38,14 @@ _NAK = int(Opcode.NAK)
 class EngineStats:
     """Plain counters since the engine was made.
 
-    requests: transmissions, also by_opcode. retransmissions: transmissions that repeat a request. spurious:
-    retransmissions that turned out to be needless. replies: believed ones, burst packets included. unknown:
-    replies that fit no outstanding request (late, duplicate, not ours). unexplained: unknown replies that no
-    repetition of ours explains.
+    requests: transmissions, also by_opcode. lost: requests that were taken to be lost while their operation
+    wanted an answer. spurious: of these, the ones that were answered after all. replies: believed ones, burst
+    packets included. unknown: replies that nothing waits for (late, duplicate, not ours). unexplained: of
+    these, the ones that no repetition of ours explains.
     """
 
     requests: int = 0
-    retransmissions: int = 0
+    lost: int = 0
     spurious: int = 0
     replies: int = 0
     unknown: int = 0
@@ -61,10 +60,10 @@ class Engine:
         rng: for the first seq and the session id to ask for.
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
-        on_unexplained: called with each reply that fits no outstanding request and that no repetition of ours
-            explains, and with the seconds since its request went out (None where that is not known).
-        on_late: called with each ACK that nothing waits for any more, of a request that was repeated, taken
-            back, or whose operation was cancelled, and with the time at which that went out first.
+        on_unexplained: called with each reply that fits no request of ours whose answer may still come, and
+            with the seconds since its request went out (None where that is not known).
+        on_late: called with each ACK that nothing waits for any more, of a request that was lost or repeated,
+            or whose operation was cancelled, and with the time at which that went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -101,21 +100,23 @@ class Engine:
 
     @property
     def rtt(self) -> float | None:
-        """Smoothed round trip in seconds: of the reads or writes that came last, else of any request; None
-        before the first."""
-        for timer in (self._timers.moving, *self._timers.of.values()):
-            if timer.samples:
-                return timer.smoothed
-        return None
+        """Smoothed round trip in seconds: of chunks of files, else of any request; None before the first."""
+        timers = self._timers
+        known = (one.smoothed for one in (timers.bulk, timers.single) if one.known)
+        return next(known, None)
 
     @property
     def in_flight(self) -> int:
         """Requests on their way, those of cancelled operations included."""
-        return len(self._ledger.flying)
+        return len(self._ledger.outstanding)
 
-    def timeout(self, family: str) -> float:
-        """Return the present retransmission timeout of a family of opcodes, in seconds."""
-        return self._timers.timeout(family)
+    def serves_others(self, op: Operation) -> bool:
+        """Return whether requests of other operations are in flight."""
+        return any(request.op is not op for request in self._ledger.outstanding.values())
+
+    def timeout(self, manner: Manner) -> float:
+        """Return how many seconds an answer is waited for at present."""
+        return self._timers.timeout(manner)
 
     # --- traits
 
@@ -174,19 +175,34 @@ class Engine:
             return
         request = self._ledger.find(reply.seq)
         if request is None:
-            self._on_unknown(reply, now)
+            self.stats.unknown += 1
+            if reply.req_opcode != _BURST:  # else of a burst that was given up
+                self.stats.unexplained += 1
+                self._on_unexplained(reply, self._ledger.late_by(reply.seq, now))
         elif reply.req_opcode != request.opcode:
-            self._on_replay(request)
-        elif not request.fits(reply, self.traits):
-            return
-        elif reply.opcode != _NAK or not self._asks_again(request, reply):
-            if not self._ledger.settle(request, reply.seq):
+            self._on_replay(request, now)
+        elif request.fits(reply, self.traits):
+            self._on_reply(request, reply, now)
+
+    def _on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Take a believed reply."""
+        ledger, op, was_lost = self._ledger, request.op, not request.outstanding
+        ledger.on_answered(request)
+        if was_lost and op is ledger.ghost:
+            self.stats.unknown += 1
+        else:
+            if was_lost:
                 self.stats.spurious += 1
                 self.flow.on_spurious()
+                self._timers.reordering.on_needless(now)
             self._on_answers(request, 1, now)
-            op = request.op
-            if op is self._ledger.ghost:
-                self._on_late(reply, request.first_sent)
+        if op is ledger.ghost:
+            if reply.opcode == Opcode.ACK:
+                self._tell_late(reply, request.first_sent)
+        elif reply.opcode == _NAK and self._session_changed(request, reply):
+            request.stale = True
+            op.on_lost(request, now)
+        else:
             op.on_reply(request, reply, now)
             if op.done:
                 self.remove(op)
@@ -196,7 +212,7 @@ class Engine:
         replies = split_run(wires)
         at, malformed = 0, 0
         while at < len(replies):
-            run = self._ledger.settle_run(replies, at, self._burst_heard_at)
+            run = self._ledger.on_run(replies, at, self._burst_heard_at)
             if run:
                 op = run[0][0].op
                 self._on_answers(run[-1][0], len(run), now)
@@ -213,53 +229,49 @@ class Engine:
 
     def _on_answers(self, newest: Request, count: int, now: float) -> None:
         """Note answers to requests of one operation that went out together; newest: the last of them."""
-        ledger, flow = self._ledger, self.flow
+        ledger, timers = self._ledger, self._timers
         self.stats.replies += count
-        self._heard_at = newest.op.progress_at = now
-        timed = newest.single and newest.sent_at > self._burst_heard_at
-        rtt = self._timers.sample(newest, now) if timed else None
-        flow.on_replies(now, rtt, count, newest.order, ledger.order)
-        for lost in ledger.lose_outrun():
-            flow.on_loss(lost.order)
+        self._heard_at = now
+        timed = not newest.repeated and newest.sent_at > self._burst_heard_at
+        rtt = timers.sample(newest, now) if timed else None
+        self.flow.on_replies(now, rtt, count, newest.order, ledger.order)
+        passed = []
+        for order, request in ledger.outstanding.items():
+            if order > newest.order:
+                break
+            if timed and request.manner.ordered:
+                passed.append(request)
+        wait = timers.passed_wait(now) if passed else 0.0
+        for request in passed:
+            request.passed = True
+            request.timer = request.sent_at + wait
+            if request.timer <= now:
+                self._lose(request, now)
+            else:
+                self._due = min(self._due, request.timer)
 
-    def _on_unknown(self, reply: Payload, now: float) -> None:
-        """Count a reply that fits no outstanding request. Packets of a burst that was given up are
-        explained."""
-        self.stats.unknown += 1
-        duplicates = self._ledger.duplicates
-        sent_at = duplicates.explains(reply.seq)
-        if sent_at is not None:
-            self._on_late(reply, sent_at)
-        elif reply.req_opcode != _BURST:
-            self.stats.unexplained += 1
-            self._on_unexplained(reply, duplicates.late_by(reply.seq, now))
-
-    def _on_late(self, reply: Payload, sent_at: float) -> None:
-        """An answer came that nothing waits for any more. sent_at: when its request went out first."""
-        if reply.opcode == Opcode.ACK:
-            self._tell_late(reply, sent_at)
-
-    def _on_replay(self, request: Request) -> None:
+    def _on_replay(self, request: Request, now: float) -> None:
         """The server replays an earlier reply under this seq, so it will never answer this one (servers.md
-        2)."""
-        request.replays += 1
-        # It may also be a packet of an abandoned burst: then each new seq is one more execution.
-        limit = _MAX_SIDE_EFFECT_REPLAYS if request.manner.same_seq else _MAX_REPLAYS
-        if request.replays <= limit and request.flying:
-            request.fresh_seq = True
-            self._ledger.lose(request)
+        2). It may also be a packet of an abandoned burst, and each new seq is one more execution: so wait
+        for the time in which an answer would have come."""
+        if request.outstanding and not request.stale:
+            request.stale = True
+            request.timer = min(request.timer, now + self._timers.timeout(request.manner))
+            self._due = min(self._due, request.timer)
 
-    def _asks_again(self, request: Request, reply: Payload) -> bool:
+    def _session_changed(self, request: Request, reply: Payload) -> bool:
         """Whether a refusal only says that the session changed while the request was on its way."""
-        if not request.follows or request.session == self.session or reply.data[:1] != _INVALID_SESSION:
-            return False
-        request.replays += 1
-        if request.replays > _MAX_REPLAYS:
-            return False
-        request.fresh_seq = True
-        if request.flying:
-            self._ledger.lose(request)
-        return True
+        changed = request.follows and request.session != self.session
+        return changed and reply.data[:1] == _INVALID_SESSION
+
+    def _lose(self, request: Request, now: float) -> None:
+        """Give up a request. Its operation asks again, unless it is not there any more."""
+        op = request.op
+        self.flow.on_loss(request.order)
+        self._ledger.lose(request)
+        if op is not self._ledger.ghost:
+            self.stats.lost += 1
+            op.on_lost(request, now)
 
     # --- bursts
 
@@ -270,7 +282,7 @@ class Engine:
             return False
         self.stats.replies += 1
         self._heard_at = now
-        op.progress_at = now
+        op.progress(now)
         if op.done:
             self.remove(op)
         return True
@@ -282,7 +294,7 @@ class Engine:
         wires: list[bytes] = []
         self.flow.begin()
         concerned = self._ops if self.traits.paths_block_writes else ()
-        self._gate.look(concerned, self._ledger.flying.values(), now, self.rtt)
+        self._gate.look(concerned, self._ledger.outstanding.values(), now, self.rtt)
         starved = True
         for op in self._ops.copy():
             starved = starved and self._serve(op, now, wires)
@@ -292,7 +304,7 @@ class Engine:
             self.flow.on_starved()
         if self.flow.limited:  # it is not the vehicle that is silent
             for op in self._ops:
-                op.progress_at = max(op.progress_at, now)
+                op.progress(max(op.progress_at, now))
         return wires
 
     def hold(self, now: float) -> None:
@@ -304,18 +316,16 @@ class Engine:
         """Send what `op` has; return False when the window is full."""
         if op.done or not op.waits(now):
             return True
-        if self._gate.keeps(op) or self._waits_for_lone(op):
-            op.progress_at = now  # it is not the vehicle that is silent
+        if self._gate.keeps(op) or self._waits_for_exclusive(op):
+            op.progress(now)  # it is not the vehicle that is silent
             return True
-        ledger = self._ledger
         # An urgent one may use one slot more than bulk work: a full window must not make it wait.
         urgent = op.urgent
-        in_flight = len(ledger.flying) - urgent
+        in_flight = self.in_flight - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
         left, size = room, 0
         while left > 0:
-            again = ledger.take_again(op, now) if ledger.again else None
-            requests = op.next_requests(left, now) if again is None else [again]
+            requests = op.next_requests(left, now)
             if not requests:
                 break
             wires += self._transmit(requests, now)
@@ -326,77 +336,78 @@ class Engine:
             self.flow.on_sent(sent, size, now)
         return left > 0
 
-    def _waits_for_lone(self, op: Operation) -> bool:
-        """Return whether another operation goes alone. What went out before that is carried out before it."""
-        lone = next((one for one in self._ops if one.alone and not self._gate.keeps(one)), None)
+    def _waits_for_exclusive(self, op: Operation) -> bool:
+        """Return whether another operation has the server for itself. What went out before that is carried
+        out before it."""
+        lone = next((one for one in self._ops if one.exclusive and not self._gate.keeps(one)), None)
         return lone is not None and op is not lone
 
     def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
-        """Number requests of one opcode, or one that is repeated, and return them encoded."""
+        """Number requests of one opcode, and return them encoded."""
         first, ledger = requests[0], self._ledger
+        op, manner = first.op, first.manner
         self.stats.by_opcode[first.opcode] += len(requests)
+        op.sent = True
+        quiet = now - op.progress_at
+        timer = now + self._timers.wait(manner, quiet)
         if first.follows:
             first.session = self.session
-        first.op.sent = True
-        if first.sends:
-            self.stats.retransmissions += 1
-            ledger.relaunch(first, now)
-            first.timer = now + self._timers.wait(first)
+        if first.owed:
+            ledger.relaunch(first, now, timer)
         else:
-            ledger.launch(requests, now, now + self._timers.of[first.manner.family].rto)
+            ledger.launch(requests, now, timer)
         if first.opcode == _BURST:
-            self._burst_op = first.op
+            self._burst_op = op
             ledger.leave(first)  # its packets tell what became of it, and it is never repeated
             # The seqs of its packets must not be seqs of ours (servers.md 2, collision).
-            ledger.jump(first.op.on_burst_sent(first, now))
+            ledger.jump(op.on_burst_sent(first, now))
         else:
-            self._due = min(self._due, first.timer)
-        return encode(requests)
+            self._due = min(self._due, timer)
+        return encode(requests, unheard=quiet > 2.0 * self._timers.timeout(manner))
 
     # --- timers
 
     def next_deadline(self) -> float | None:
         """Return when `on_deadline` is to be called, or None if nothing is pending."""
-        deadline = min(self._due if self._ledger.flying else inf, self.flow.next_room_at())
+        deadline = min(self._due if self._ledger.outstanding else inf, self.flow.next_room_at())
         for op in self._ops:
             deadline = min(deadline, op.timer, op.progress_at + op.patience)
         return None if deadline == inf else deadline
 
     def on_deadline(self, now: float) -> None:
-        """Repeat what is overdue, and end operations that took too long, or that have a request which did.
-        Harmless when called early or late."""
-        silent: list[str] = []
-        late: set[Operation] = set()
-        ledger, flow = self._ledger, self.flow
-        requests: list[Request] = []
+        """Lose what is overdue, and end operations that got no further for too long. Harmless when called
+        early or late."""
         if now >= self._due:
-            self._due, requests = inf, list(ledger.flying.values())
-        for request in requests:
-            if request.timer <= now:
-                # Round trips may have grown meanwhile. And ArduPilot answers nothing else during a burst:
-                # silence proves nothing then (servers.md 4).
-                due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(request)
-                paused = request.manner.ordered and not flow.starved and len(ledger.flying) > _FEW
-                pause = flow.pause if paused else 0.0
-                # A stream of other answers is no pause.
-                request.timer = max(due, min(due, self._heard_at) + pause)
-            if request.timer > now:
-                self._due = min(self._due, request.timer)
-                continue
-            if self._heard_at < request.sent_at:
-                silent += [request.manner.family] * request.sends
-            if now - request.first_sent >= request.op.patience:
-                late.add(request.op)
-            flow.on_loss(request.order)
-            ledger.lose(request)
-        for family in set(silent):
-            self._timers.of[family].on_silence()
-        if silent:
-            flow.on_silence(len(silent))
+            self._lose_overdue(now)
         for op in self._ops.copy():
             if op.timer <= now:
                 op.on_timer(now)
-            if (op in late or op.progress_at + op.patience <= now) and not op.done:
+            if op.progress_at + op.patience <= now and not op.done:
                 op.fail(RequestTimeout(f"no answer within {round(op.patience, 1):g} s"))
             if op.done:
                 self.remove(op)
+
+    def _lose_overdue(self, now: float) -> None:
+        unheard = 0
+        self._due = inf
+        for request in list(self._ledger.outstanding.values()):
+            if request.timer <= now and not (request.passed or request.stale):
+                request.timer = self._overdue_at(request, now)
+            if request.timer > now:
+                self._due = min(self._due, request.timer)
+                continue
+            unheard += self._heard_at < request.sent_at
+            self._lose(request, now)
+        if unheard:
+            self.flow.on_silence(unheard)
+
+    def _overdue_at(self, request: Request, now: float) -> float:
+        """Return when a request is lost by its timer, as far as is known now, because round trips may have
+        grown since it went out. ArduPilot answers nothing else during a burst, so silence proves nothing then
+        (servers.md 4)."""
+        manner, op, flow = request.manner, request.op, self.flow
+        quiet = max(0.0, request.sent_at - op.progress_at)
+        due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(manner, quiet)
+        paused = manner.ordered and not flow.starved and self.in_flight > _FEW
+        # A stream of other answers is no pause.
+        return max(due, min(due, self._heard_at) + (flow.pause if paused else 0.0))

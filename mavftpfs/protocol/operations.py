@@ -12,7 +12,7 @@ from math import inf
 from typing import NamedTuple
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import MANNERS, Operation, Request, nak_of
+from mavftpfs.protocol.requests import MANNERS, WORK_FLOOR, Operation, Request, nak_of
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
@@ -23,8 +23,12 @@ BEYOND = 100_000
 
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
-_MAX_FRUITLESS_PAGES = 32
 _MAX_EMPTY_PAGES = 4
+_USUAL_PACE = 0.1
+"""Usual cards read a megabyte per second and more. A checksum is asked for again when a usual card would have
+answered. That is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md
+2). MAVSDK computes it again, but it is a computer."""
+
 _KINDS = {b"F": EntryKind.FILE, b"D": EntryKind.DIRECTORY}
 _MAX_DIGITS = 20
 
@@ -36,7 +40,7 @@ class Simple(Operation):
         session: the id to send; None sends the engine's, and asks again with the new one if it changed.
         patience: seconds until RequestTimeout, inf for the engine's deadline.
         server_time: seconds that the slowest server works at it; a repetition waits for so long.
-        alone: see Operation.
+        exclusive: see Operation.
 
     Attributes:
         reply: the ACK, once done without error.
@@ -55,17 +59,19 @@ class Simple(Operation):
         session: int | None = None,
         patience: float = inf,
         server_time: float | None = None,
-        alone: bool = False,
+        exclusive: bool = False,
     ) -> None:
         if len(data) > MAX_DATA:
             raise PathTooLong(f"{len(data)} bytes do not fit the {MAX_DATA} of a request")
         self.patience = patience
         self.opcode = opcode
-        self.alone = alone
+        self.exclusive = exclusive
         self.retransmitted = False
         manner = MANNERS[opcode]
         if server_time is not None:
-            manner = manner._replace(family="work", free_sends=2, slow_from=1, slowest=server_time)
+            usual = server_time * (_USUAL_PACE if opcode == Opcode.CALC_FILE_CRC32 else 1.0)
+            floor = max(manner.floor, WORK_FLOOR)
+            manner = manner._replace(floor=floor, work=server_time, usual_work=usual)
         request = Request(
             self, opcode, manner, session or 0, offset, len(data), data, follows=session is None
         )
@@ -73,15 +79,20 @@ class Simple(Operation):
         self.reply: Payload
 
     def next_requests(self, most: int, now: float) -> list[Request]:
-        """Return the one request, once."""
+        """Return the one request, once, and again when it was lost."""
         requests, self._requests = self._requests, []
+        self.retransmitted = self.retransmitted or (self.sent and bool(requests))
         return requests
+
+    def on_lost(self, request: Request, now: float) -> None:
+        """Have it go out again, under the same seq where an answer may still come under that."""
+        keeps_seq = request.manner.same_seq and not request.stale
+        self._requests = [request if keeps_seq else request.anew()]
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """End with the ACK or the NAK."""
-        self.retransmitted = request.sends > 1
         if reply.opcode == Opcode.NAK:
-            self.fail(nak_of(request, reply))
+            self.fail(nak_of(request, reply, retransmitted=self.retransmitted))
         else:
             self.reply = reply
             self.finish()
@@ -194,8 +205,7 @@ class ListDirectory(Operation):
         self._asked = False
         self._pages = 0
         self._first_page = b""
-        self._first_page_again = 0
-        self._fruitless_pages = 0
+        self._first_page_again = False
         self._empty_pages = 0
 
     def next_requests(self, most: int, now: float) -> list[Request]:
@@ -206,12 +216,20 @@ class ListDirectory(Operation):
         manner, path = MANNERS[self.opcode], self._path
         return [Request(self, self.opcode, manner, 0, self.strings, len(path), path, follows=True)]
 
+    def on_lost(self, request: Request, now: float) -> None:
+        """Ask for the page again, unless it came."""
+        if request.offset == self.strings:
+            self._asked = False
+
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""
+        if request.offset != self.strings:
+            return  # the page came before, as the answer to a repetition
         if reply.opcode == Opcode.NAK:
             nak = nak_of(request, reply)
             # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
             if self._beyond or nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages):
+                self.progress(now)
                 self._on_eof()
             else:
                 self.fail(nak)
@@ -227,6 +245,7 @@ class ListDirectory(Operation):
                 return
             self._beyond = self.complete = False
         if page.strings == 0:
+            self.progress(now)
             self._on_empty_page()
             return
         if self._empty_pages and page.entries:
@@ -234,8 +253,10 @@ class ListDirectory(Operation):
         self._empty_pages = 0
         if self.strings == 0:
             self._first_page = reply.data
-        elif reply.data == self._first_page:
-            self._on_first_page_again()
+        elif page.entries and reply.data == self._first_page and self._ignores_offset():
+            self.complete = False
+            self.finish()
+            return
         self.strings += page.strings
         self.unshown += page.unshown
         known = len(self._names)
@@ -244,15 +265,9 @@ class ListDirectory(Operation):
                 self._names.add(entry.name)
                 self.entries.append(entry)
         # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
-        if len(self._names) > known:
-            self._fruitless_pages = 0
-        elif page.entries:
-            self._fruitless_pages += 1
-        if (
-            self._pages >= MAX_PAGES
-            or len(self.entries) >= MAX_ENTRIES
-            or self._fruitless_pages > _MAX_FRUITLESS_PAGES
-        ):
+        if len(self._names) > known or not page.entries:
+            self.progress(now)
+        if self._pages >= MAX_PAGES or len(self.entries) >= MAX_ENTRIES:
             self.complete = False
             self.finish()
 
@@ -265,15 +280,14 @@ class ListDirectory(Operation):
         self.end = self.strings - self._beyond if self.complete else None
         self.finish()
 
-    def _on_first_page_again(self) -> None:
-        """The server seems to ignore the offset, so what is behind its first page is not known.
+    def _ignores_offset(self) -> bool:
+        """Return whether the server sends its first page for ever, now that the page came again.
 
         MAVSDK repeats a first page, too, where it leaves out more entries than it shows (servers.md 6). But
         such a page has much room left, and comes only twice.
         """
-        self._first_page_again += 1
-        if self._first_page_again > 1 or len(self._first_page) > MAX_DATA // 2:
-            self.complete = False
+        again, self._first_page_again = self._first_page_again, True
+        return again or len(self._first_page) > MAX_DATA // 2
 
     def _on_empty_page(self) -> None:
         # Old PX4 ends so; newer ones when an entry fits no page, and offset + 1 gets past it.

@@ -14,10 +14,10 @@ from mavftpfs.protocol.requests import READ_MANNER, Operation, Request, Run, nak
 from mavftpfs.shared.errors import (
     DataUnproven,
     LocalProtocolError,
-    MavftpfsError,
     SessionLost,
 )
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.ranges import Ranges
 
 SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals that mean "no file is open" (servers.md 1)."""
@@ -46,51 +46,78 @@ class DataSink(Protocol):
 
 
 class Wants:
-    """What is wanted of a file and has not come, but for what ReadFile requests are out for. It outlives the
-    transfers that take from it.
+    """What is wanted of a file and has not come. It outlives the transfers that take from it.
 
     Attributes:
         demand: what programs wait for; it goes first. ahead: readahead, none of it in demand.
     """
 
     def __init__(self) -> None:
-        self.demand, self.ahead = ExtentSet(), ExtentSet()
+        self.demand, self.ahead = Ranges(), Ranges()
 
     @property
-    def empty(self) -> bool:
-        """Whether nothing is wanted."""
+    def idle(self) -> bool:
+        """Whether nothing is wanted or on its way."""
         return self.demand.empty and self.ahead.empty
 
+    @property
+    def on_its_way(self) -> bool:
+        """Whether requests are out."""
+        return not (self.demand.out.empty and self.ahead.out.empty)
+
     def add(self, ranges: Iterable[tuple[int, int]], *, demand: bool) -> None:
-        """Want these ranges, too."""
+        """Want these ranges, too. demand: a program waits for them, also for what is readahead so far."""
+        demanded, ahead = self.demand, self.ahead
         for start, stop in ranges:
             if demand:
-                self.demand.add(start, stop)
-                self.ahead.discard(start, stop)
-            else:
-                for gap_start, gap_stop in self.demand.missing(start, stop):
-                    self.ahead.add(gap_start, gap_stop)
+                for part in ahead.out.intersection(start, stop):
+                    demanded.out.add(*part)
+                ahead.on_done(start, stop)
+                for part in demanded.out.missing(start, stop):
+                    demanded.todo.add(*part)
+                continue
+            new = ExtentSet([(start, stop)])
+            for present in (demanded.todo, demanded.out, ahead.out):
+                for part in present.intersection(start, stop):
+                    new.discard(*part)
+            for part in new:
+                ahead.todo.add(*part)
 
-    def discard(self, start: int, stop: int) -> None:
-        """Want [start, stop) no more."""
-        self.demand.discard(start, stop)
-        self.ahead.discard(start, stop)
-
-    def clear(self, *, demand: bool = True) -> None:
-        """Want nothing more; demand: False: no readahead."""
-        if demand:
-            self.demand = ExtentSet()
-        self.ahead = ExtentSet()
-
-    def take(self, limit: int, below: int) -> tuple[int, int, bool] | None:
-        """Remove and return the first of it below an offset, at most `limit` bytes, and whether it is
-        demand."""
-        for wanted, demand in ((self.demand, True), (self.ahead, False)):
-            for first, end in wanted.intersection(0, below):
-                end = min(end, first + limit)
-                wanted.discard(first, end)
-                return first, end, demand
+    def take(self, limit: int, below: int) -> tuple[int, int] | None:
+        """Return the first of what is wanted below an offset, at most `limit` bytes, for which a request goes
+        out now."""
+        for wanted in (self.demand, self.ahead):
+            first = wanted.todo.first()
+            if first is not None and first[0] < below:
+                row = first[0], min(first[1], first[0] + limit, below)
+                wanted.take(*row)
+                return row
         return None
+
+    def on_done(self, start: int, stop: int) -> None:
+        """These bytes came."""
+        self.demand.on_done(start, stop)
+        self.ahead.on_done(start, stop)
+
+    def on_lost(self, start: int, stop: int) -> None:
+        """A request for these bytes is lost."""
+        self.demand.on_lost(start, stop)
+        self.ahead.on_lost(start, stop)
+
+    def give_back(self) -> None:
+        """Nobody takes answers any more."""
+        self.demand.give_back()
+        self.ahead.give_back()
+
+    def drop(self, *, demand: bool = True) -> None:
+        """Want nothing more; demand: False: no readahead. What is on its way comes all the same, but no
+        program waits for it."""
+        self.ahead.todo = ExtentSet()
+        if demand:
+            self.demand.todo = ExtentSet()
+            for part in self.demand.out:
+                self.ahead.out.add(*part)
+            self.demand.out = ExtentSet()
 
 
 class ReadTransfer(Operation):
@@ -105,7 +132,7 @@ class ReadTransfer(Operation):
         received_bytes: delivered to the sink so far.
 
     Fails with SessionLost (reopen, and start another with `wants`; the file may have become shorter, too),
-    FtpNak, or RequestTimeout. Then, and after `give_back`, all that did not come is in `wants`.
+    FtpNak, or RequestTimeout. After `finish`, too, all that did not come is to be asked for by `wants`.
     """
 
     urgent = False
@@ -125,48 +152,22 @@ class ReadTransfer(Operation):
         self.received_bytes = 0
         self.wants = Wants() if wants is None else wants
         self._sink = sink
-        self._unanswered: dict[Request, bool] = {}  # whether a program waits for it
 
     # --- what the owner says and sees
 
     def want(self, start: int, stop: int, demand: bool) -> None:
         """Ask for what the sink lacks of [start, stop), clamped to the size, if it is not on its way."""
-        lacking = ExtentSet(self._sink.missing(start, min(stop, self.size)))
-        for request in self._unanswered:
-            lacking.discard(request.offset, request.offset + request.size)
-            if request.offset < stop and start < request.offset + request.size:
-                self._unanswered[request] |= demand
-        self.wants.add(lacking, demand=demand)
-
-    def drop(self, *, demand: bool = True) -> None:
-        """Want nothing more; demand: False: no readahead. What is on its way still arrives."""
-        self.wants.clear(demand=demand)
-        if demand:
-            self._unanswered = dict.fromkeys(self._unanswered, False)
-
-    def give_back(self) -> None:
-        """Want again all that was asked for and did not come. Answers that still come are not taken."""
-        for request in list(self._unanswered):
-            self._want_again(request)
-
-    def _want_again(self, request: Request, got: int = 0) -> None:
-        rest = (request.offset + got, request.offset + request.size)
-        self.wants.add([rest], demand=self._unanswered.pop(request))
-
-    @property
-    def in_flight(self) -> int:
-        """How many ReadFile requests are on their way, or lost and to be repeated."""
-        return len(self._unanswered)
+        self.wants.add(self._sink.missing(start, min(stop, self.size)), demand=demand)
 
     @property
     def idle(self) -> bool:
         """Whether nothing is wanted or on its way."""
-        return not self._unanswered and self.wants.empty
+        return self.wants.idle
 
     @property
     def demanded(self) -> bool:
         """Whether a program waits for some of it."""
-        return not self.wants.demand.empty or any(self._unanswered.values())
+        return not self.wants.demand.empty
 
     # --- requests
 
@@ -176,16 +177,19 @@ class ReadTransfer(Operation):
         limit = chunk if self.chunks.trying else most * chunk
         return self._requests_for(self.wants.take(limit, self.size), chunk)
 
-    def _requests_for(self, row: tuple[int, int, bool] | None, chunk: int) -> list[Request]:
+    def _requests_for(self, row: tuple[int, int] | None, chunk: int) -> list[Request]:
         if row is None:
             return []
-        session, requests = self.session, []
-        start, stop, demand = row
-        for offset in range(start, stop, chunk):
-            request = Request(self, _READ, READ_MANNER, session, offset, min(chunk, stop - offset))
-            requests.append(request)
-            self._unanswered[request] = demand
-        return requests
+        session, (start, stop) = self.session, row
+        return [
+            Request(self, _READ, READ_MANNER, session, offset, min(chunk, stop - offset))
+            for offset in range(start, stop, chunk)
+        ]
+
+    def on_lost(self, request: Request, now: float) -> None:
+        """Ask for its bytes again, unless they came."""
+        self.chunks.on_lost(request.size, request.sent_at, now)
+        self.wants.on_lost(request.offset, request.stop)
 
     # --- replies to ReadFile
 
@@ -204,50 +208,39 @@ class ReadTransfer(Operation):
 
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
-        unanswered, first = self._unanswered, run[0][0]
-        self.chunks.on_answered(first.size, len(run) if first.sends == 1 else 0, first.sent_at, now)
+        first = run[0][0]
+        self.chunks.on_answered(first.size, len(run), first.sent_at, now)
         pieces: list[bytes] = []
         start = stop = first.offset
         for request, data in run:
             offset, size = request.offset, request.size
             if offset != stop:
-                self._place(start, pieces)
+                self._place(start, pieces, now)
                 pieces, start = [], offset
-            if len(data) < size:
-                self._on_short(request, len(data))
-            else:
-                del unanswered[request]
-                if len(data) > size:
-                    data = data[:size]
+            if len(data) > size:
+                data = data[:size]
             pieces.append(data)
             stop = offset + len(data)
-            if self.done:
+            if len(data) < size:
+                self.wants.on_lost(stop, request.stop)
+            if not data:
+                self.fail(SessionLost(f"the file has no bytes at {offset}, before its size of {self.size}"))
                 break
-        self._place(start, pieces)
+        self._place(start, pieces, now)
 
-    def _place(self, offset: int, pieces: list[bytes]) -> None:
+    def _place(self, offset: int, pieces: list[bytes], now: float) -> None:
         data = pieces[0] if len(pieces) == 1 else b"".join(pieces)
         if data:
+            self.progress(now)
             self.received_bytes += len(data)
+            self.wants.on_done(offset, offset + len(data))
             self._sink.on_data(offset, data)
 
-    def _on_short(self, request: Request, count: int) -> None:
-        self._want_again(request, count)
-        if count == 0:
-            end, size = request.offset, self.size
-            self.fail(SessionLost(f"the file has no bytes at {end}, before its size of {size}"))
-
-    def takes_back(self, request: Request, now: float) -> bool:
-        """See Operation: the bytes of a chunk that was too long are asked for in shorter ones."""
-        if not self.chunks.on_lost(request.size, request.sent_at, now):
-            return False
-        self._want_again(request)
-        return True
-
-    def fail(self, error: MavftpfsError) -> None:
+    def finish(self) -> None:
         """End; what was on its way is wanted again."""
-        self.give_back()
-        super().fail(error)
+        if not self.done:
+            self.wants.give_back()
+        super().finish()
 
 
 class ReadToEof(Operation):
@@ -275,21 +268,28 @@ class ReadToEof(Operation):
         self._limit = limit
         self._blocks: dict[int, bytes] = {}
         self._whole = 0  # blocks 0.._whole-1 are there
-        self._next = 0
+        self._out: set[int] = set()  # blocks that requests are out for
         self._end: int | None = None  # lowest index known to hold nothing
         self._last: int | None = None  # index of a short block
 
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the request for the next block; at most a few ahead of what is known to exist."""
-        if self._next > self._whole + _BLOCKS_AHEAD or not self._plausible(self._next):
-            return []
-        offset = self._next * self._chunk
-        self._next += 1
-        return [Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)]
+        for index in range(self._whole, self._whole + _BLOCKS_AHEAD + 1):
+            if index not in self._blocks and index not in self._out and self._plausible(index):
+                self._out.add(index)
+                offset = index * self._chunk
+                return [Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)]
+        return []
+
+    def on_lost(self, request: Request, now: float) -> None:
+        """Ask for the block again."""
+        self._out.discard(request.offset // self._chunk)
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Keep a block, or learn where the end is."""
         index = request.offset // self._chunk
+        self._out.discard(index)
+        self.progress(now)
         if reply.opcode == _NAK:
             nak = nak_of(request, reply)
             ended = nak.code == NakCode.FILE_EXISTS and self._ends_short(index)

@@ -1,9 +1,9 @@
 """One request on its way, and the manner in which each opcode is repeated. Layer: protocol; pure.
 
 A manner says how a request is repeated after its answer was lost. Reads, writes and listings may be executed
-twice. So each of their transmissions has its own seq, and can be told apart. A request that changes the
-server goes out again under the *same* seq first, because PX4 and ArduPilot replay their last reply, if this
-is still their last one (servers.md 2).
+twice. So their operations ask again by a new request with a seq of its own, and answers can be told apart. A
+request that changes the server goes out again under the *same* seq first, because PX4 and ArduPilot replay
+their last reply, if this is still their last one (servers.md 2).
 """
 
 from __future__ import annotations
@@ -20,64 +20,60 @@ from mavftpfs.shared.model import Traits
 
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
-_LONG_FROM = 3
-"""From this transmission on, every second one of a short request has full length (see `encode`)."""
-
 
 class Manner(NamedTuple):
     """How requests of one opcode are timed and repeated.
 
-    family: opcodes with similar round trips. same_seq: repeat under the same seq. ordered: servers answer
-    in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
-    offset. free_sends: transmissions before the waits double. slowest: seconds that the slowest server works
-    at it, beyond the round trip in the family "work". slow_from: the transmission from which on so long is
-    waited, because a slow server carries out each one (servers.md 14.38).
+    Attributes:
+        floor: the least seconds to wait for an answer.
+        same_seq: the request is repeated under the same seq.
+        bulk: the request carries a chunk of a file. Round trips of chunks and of single requests are measured
+            apart.
+        ordered: servers answer in order, so answers to later requests prove a loss.
+        echoes_offset: an ACK carries the request's offset; None: where the server was seen to do so.
+        backoff: the share of the time without progress by which the wait grows.
+        work: seconds that the slowest server works at it, beyond the round trip.
+        usual_work: seconds that a usual server works at it; the first transmission waits for so long.
     """
 
-    family: str
+    floor: float
     same_seq: bool
+    bulk: bool = False
     ordered: bool = False
-    echoes_offset: bool = False
-    free_sends: int = 1
-    slow_from: int = 1 << 30
-    slowest: float = 0.0
+    echoes_offset: bool | None = False
+    backoff: float = 0.5
+    work: float = 0.0
+    usual_work: float = 0.0
 
 
-FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, "work": 0.3}
-"""Least retransmission timeout of each family in seconds."""
-
-READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
-WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
-_LIST = Manner("list", same_seq=False, ordered=True, slow_from=4, slowest=2.5)
-_PATH = Manner("path", same_seq=True, free_sends=4)
-_SLOW = Manner("slow", same_seq=True, slow_from=2, slowest=40.0)
+READ_MANNER = Manner(0.05, same_seq=False, bulk=True, ordered=True, echoes_offset=True, backoff=0.25)
+WRITE_MANNER = READ_MANNER._replace(echoes_offset=None)
+_LIST = Manner(0.25, same_seq=False, ordered=True, backoff=1.0)
+_PATH = Manner(0.1, same_seq=True)
+WORK_FLOOR = 0.3
+"""The least seconds to wait for an answer where the server has work to do."""
 
 MANNERS: dict[int, Manner] = dict.fromkeys(range(256), _PATH) | {
     Opcode.READ_FILE: READ_MANNER,
     Opcode.WRITE_FILE: WRITE_MANNER,
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
-    Opcode.CALC_FILE_CRC32: _SLOW,
 }
 """How requests with each opcode are repeated; those not named here are taken to have side effects."""
 
 
-class Transmission(NamedTuple):
-    """An earlier transmission: its order and time, whether its seq was sent once only, and whether later
-    answers had seemed to prove it lost."""
-
-    order: int
-    sent_at: float
-    single: bool
-    outrun: bool
-
-
 @dataclass(slots=True, eq=False)
 class Request:
-    """A request, and what became of it so far.
+    """A request under one seq, and what became of it so far.
 
-    follows: carries the engine's session. aliases: earlier transmissions by the seq of their replies.
-    seq, order, sent_at, single, outrun: of the present transmission (see Transmission).
+    Attributes:
+        follows: the request carries the engine's session.
+        outstanding: the request is in flight: neither answered nor lost.
+        owed: how many answers may still come, one for each transmission.
+        repeated: the request went out more than once.
+        passed: a later request was answered, so this one is lost soon.
+        stale: no answer will come under this seq, because the server replays another one.
+        seq, order, sent_at, timer: of the last transmission. first_sent: of the first one.
     """
 
     op: Operation
@@ -88,13 +84,11 @@ class Request:
     size: int
     data: bytes = b""
     follows: bool = False
-    aliases: dict[int, Transmission] | None = None
-    flying: bool = False
-    fresh_seq: bool = False
-    sends: int = 0
-    replays: int = 0
-    single: bool = True
-    outrun: bool = False
+    outstanding: bool = False
+    owed: int = 0
+    repeated: bool = False
+    passed: bool = False
+    stale: bool = False
     # Set by each transmission.
     seq: int = field(init=False)
     order: int = field(init=False)
@@ -102,41 +96,54 @@ class Request:
     first_sent: float = field(init=False)
     timer: float = field(init=False)
 
+    @property
+    def stop(self) -> int:
+        """Return the offset behind the last byte."""
+        return self.offset + self.size
+
+    def anew(self) -> Request:
+        """Return the same request, to go out under another seq."""
+        return Request(
+            self.op, self.opcode, self.manner, self.session, self.offset, self.size, self.data, self.follows
+        )
+
     def fits(self, reply: Payload, traits: Traits) -> bool:
-        """Whether this may be an answer to this request, whose seq and opcode it carries."""
+        """Return whether this may be an answer to this request, whose seq and opcode it carries."""
         if traits.ack_carries_own_session and reply.session != self.session and not self.follows:
             return False
         if reply.opcode == Opcode.ACK:
-            echoed = self.manner.echoes_offset or (self.manner.family == "write" and traits.write_ack_offset)
+            echoed = self.manner.echoes_offset
+            echoed = traits.write_ack_offset if echoed is None else echoed
             return reply.offset == self.offset or not echoed
         return reply.opcode == Opcode.NAK
 
 
-def encode(requests: Sequence[Request]) -> list[bytes]:
-    """Return the 251 wire bytes of each under its present seq; its data must fit.
+def encode(requests: Sequence[Request], *, unheard: bool) -> list[bytes]:
+    """Return the 251 wire bytes of each under its seq; its data must fit. unheard: answers were due for long.
 
     After a frame whose length was damaged, a parser takes up to 255 bytes of the next frames for the rest of
-    it. So every second of the later repetitions has full length, by a last byte that no server reads.
+    it. So, where answers are overdue, two of four requests have full length, by a last byte that no server
+    reads. The others pass radios that drop long frames, also where long and short ones alternate.
     """
     wires = []
     for r in requests:
         wire = _pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data)
-        if r.sends >= _LONG_FROM and r.sends % 2 and len(r.data) < MAX_DATA - 1:
+        if unheard and r.order & 2 and len(r.data) < MAX_DATA - 1:
             wire = wire[:-1] + b"\xff"
         wires.append(wire)
     return wires
 
 
 Run: TypeAlias = list[tuple[Request, bytes]]
-"""Requests of one operation and opcode that went out together, once, with the data of their ACKs."""
+"""Requests of one operation and opcode that went out together, with the data of their ACKs."""
 
 
-def nak_of(request: Request, reply: Payload) -> FtpNak:
+def nak_of(request: Request, reply: Payload, *, retransmitted: bool = False) -> FtpNak:
     """Return the error that a NAK stands for; one without data has code 0."""
     data = reply.data
     code = data[0] if data else NakCode.NONE
     errno = data[1] if code == NakCode.FAIL_ERRNO and len(data) > 1 else None
-    return FtpNak(request.opcode, code, errno, retransmitted=request.sends > 1)
+    return FtpNak(request.opcode, code, errno, retransmitted=retransmitted)
 
 
 class Port(Protocol):
@@ -145,8 +152,8 @@ class Port(Protocol):
     session: int
     traits: Traits
 
-    def timeout(self, family: str) -> float:
-        """Return the present retransmission timeout of a family, in seconds."""
+    def timeout(self, manner: Manner) -> float:
+        """Return how many seconds an answer is waited for at present."""
         ...
 
     def learn_session_echo(self, echoed: bool) -> None:
@@ -157,9 +164,10 @@ class Port(Protocol):
 class Operation:
     """A state machine which the engine asks for requests and tells of replies.
 
-    The engine sets `progress_at` (inf while nothing is wanted of the server) and fails the operation
-    with RequestTimeout when there was no progress for `patience` seconds (inf: the engine's deadline).
-    `timer` is the time at which `on_timer` is to be called. An operation ends by `finish` or `fail`, once.
+    The operation reports its `progress`; `progress_at` is inf while nothing is wanted of the server. The
+    engine fails an operation with RequestTimeout when there was no progress for `patience` seconds (inf: the
+    engine's deadline). `timer` is the time at which `on_timer` is to be called. An operation ends by `finish`
+    or `fail`, once.
     """
 
     urgent = True
@@ -174,9 +182,9 @@ class Operation:
     paced = True
     """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
-    alone = False
-    """Whether nothing else goes out until it is answered: then a repetition is answered by the reply to the
-    first one, which the server still has (servers.md 2), and is not carried out again."""
+    exclusive = False
+    """Whether nothing else goes out until it is answered: the server remembers only its last reply, so it
+    answers a repetition from memory and does not carry it out again (servers.md 2)."""
 
     done = False
     error: MavftpfsError | None = None
@@ -204,13 +212,20 @@ class Operation:
             self.progress_at = now
         return True
 
+    def progress(self, now: float) -> None:
+        """Note that the operation got further, or that it waited for something else than the server."""
+        self.progress_at = now
+
     def next_requests(self, most: int, now: float) -> list[Request]:
-        """Return some of the next new requests, at most `most` (at least one) and all of one opcode; none if
-        there is none for now."""
+        """Return some of the next requests, at most `most` (at least one) and all of one opcode; none if
+        there is none for now. A request that went out before goes out again under its seq."""
         raise NotImplementedError
 
+    def on_lost(self, request: Request, now: float) -> None:
+        """A request is lost: what it was for is to be done again."""
+
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Take the believed ACK or NAK to `request`."""
+        """Take the believed ACK or NAK to `request`, perhaps to one that was taken to be lost."""
         raise NotImplementedError
 
     def on_run(self, run: Run, now: float) -> None:
@@ -220,10 +235,6 @@ class Operation:
     def on_paths(self) -> None:
         """Requests with a path go out, or are on their way, beside this one. It is told only where these
         disturb it (see `pathgate`)."""
-
-    def takes_back(self, request: Request, now: float) -> bool:
-        """Return whether the bytes of a lost request are asked for by other requests in its place."""
-        return False
 
     def on_burst_sent(self, request: Request, now: float) -> int:
         """A BurstReadFile of this operation went out under request.seq; return how many packets may come."""

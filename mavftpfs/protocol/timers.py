@@ -1,116 +1,105 @@
-"""How long to wait for which reply. Layer: protocol; pure.
+"""How long to wait for a reply before it counts as lost. Layer: protocol; pure.
 
-One estimator for each family of opcodes, because a listing of a big directory or a checksum takes seconds
-where a read takes milliseconds.
+There are two estimators of the round trip: of chunks of files, and of single requests, because a listing of a
+big directory takes seconds where a read takes milliseconds. A request is lost when its timer runs out. It is
+lost sooner if a later one was answered: servers answer in order, so a round trip and an eighth are enough
+(`Reordering`). Waits grow with the time that passed without progress. No try is counted.
 """
 
 from __future__ import annotations
 
 from math import inf
 
-from mavftpfs.protocol.payload import Opcode
-from mavftpfs.protocol.requests import FLOORS, Manner, Request
+from mavftpfs.protocol.requests import Manner, Request
 
 INITIAL_RTO = 1.0
-"""Seconds to wait while no round trip is known, if nothing better is."""
+"""Seconds to wait while no round trip is known. A request with a seq of its own waits half as long: after a
+needless repetition its answer tells the round trip all the same, and a second execution changes nothing."""
 
 LONGEST_BACK_OFF = 3.0
-"""Seconds between two tries that doubling reaches at most: a link that comes back should not wait longer."""
-_FREE_SILENCES = 2
-_MAX_DOUBLINGS = 7
+"""Seconds between two tries that growing reaches at most: a link that comes back should not wait longer."""
 
-_FIRST_WAITS = {"list": 0.5}
-"""Seconds to wait while no round trip is known, where that is not INITIAL_RTO.
-
-A mount begins with a listing, and a user waits if it is lost. Each transmission of a listing has its own seq.
-So after a needless repetition the answer tells the round trip all the same, and a second execution changes
-nothing.
-"""
-
-_MOVING = ("data", "write")
-_WORK = "work"
 _NO_WORK = 0.1
 """Seconds of work that count as none: a request that takes no longer measures the way and the server's
 readiness."""
-_USUAL_PACE = 0.1
-"""Usual cards read a megabyte per second and more. A checksum is asked for again when a usual card would have
-answered. That is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md
-2). MAVSDK computes it again, but it is a computer."""
 
-_USUAL_SENDS = 3
-"""So many transmissions go out like that; then the slowest card gets its time."""
+EIGHTH, MOST_LATE = 0.125, 1.0
+"""Shares of a round trip, the least and the most, by which an answer may be later than usual before its
+request counts as lost, where a later request was answered."""
+
+AT_ONCE = 0.001
+"""Seconds: answers that are so much later are not late. Timers and batches are not more precise."""
+
+FADE = 2.0
+"""Seconds after which an eighth that was added counts no more."""
 
 
 class RttEstimator:
-    """Smoothed round-trip time, its variation, and the retransmission timeout of one family; all in seconds.
+    """Smoothed round-trip time, its variation, and the retransmission timeout; all in seconds.
 
-    RFC 6298 with Karn's rule (the caller gives only samples that belong to one transmission) and two changes.
-    The floor is small, because a tail loss on a fast link would otherwise cost 1 s. And there is always half
-    a round trip of slack above the mean.
-
-    Args:
-        floor: least timeout. first: the timeout before the first sample, if the floor is not more.
+    RFC 6298 with Karn's rule (the caller gives only samples that belong to one transmission), but without its
+    floor of 1 s. And there is always half a round trip of slack above the mean.
     """
 
-    def __init__(self, floor: float, first: float = INITIAL_RTO) -> None:
-        self.floor = floor
-        self._silences = 0
-        self.unfloored = first
-        self.rto = max(first, floor)
-        """How long to wait for a reply before it is asked again, backed off after silences."""
-        self.samples = 0
+    def __init__(self) -> None:
+        self.rto = INITIAL_RTO
+        self.known = False
         self.smoothed = 0.0
         self.variation = 0.0
 
     def sample(self, rtt: float) -> None:
-        """Take one round trip that provably belongs to one transmission; ends a back-off."""
-        if self.samples:
+        """Take one round trip that provably belongs to one transmission."""
+        if self.known:
             error = rtt - self.smoothed
             self.smoothed = smoothed = self.smoothed + error * 0.125
             self.variation += ((error if error > 0 else -error) - self.variation) * 0.25
         else:
             self.smoothed = smoothed = rtt
             self.variation = rtt / 2
-        self.samples += 1
-        self._silences = 0
+            self.known = True
         slack = 4 * self.variation
         half = smoothed / 2
-        self.unfloored = rto = smoothed + (slack if slack > half else half)
-        self.rto = rto if rto > self.floor else self.floor
+        self.rto = smoothed + (slack if slack > half else half)
 
-    def on_silence(self) -> None:
-        """Nothing was heard for a whole timeout; from the third in a row on, each doubles it.
 
-        Not from the first: at 20 % loss each way a lone request goes unanswered every third time.
-        """
-        self._silences += 1
-        rto = max(self.unfloored, self.floor)
-        doublings = self._silences - _FREE_SILENCES
-        if doublings > 0 and rto < LONGEST_BACK_OFF:
-            rto = min(rto * (1 << min(doublings, _MAX_DOUBLINGS)), LONGEST_BACK_OFF)
-        self.rto = rto
+class Reordering:
+    """By how much an answer may be later than those to later requests, in round trips.
+
+    Each answer to what was taken to be lost adds an eighth, and that fades (as in RACK, RFC 8985).
+    """
+
+    def __init__(self) -> None:
+        self._late, self._at = EIGHTH, 0.0
+
+    def share(self, now: float) -> float:
+        """Return the share of a round trip to wait beyond it."""
+        return max(EIGHTH, self._late - EIGHTH * (now - self._at) / FADE)
+
+    def on_needless(self, now: float) -> None:
+        """Note that an answer came to what was taken to be lost."""
+        self._late, self._at = min(MOST_LATE, self.share(now) + EIGHTH), now
 
 
 class Timers:
-    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first. moving: the
-    estimator of the data that moved last, read or written."""
+    """The round trips of one server. bulk: of chunks of files. single: of all other requests."""
 
     def __init__(self) -> None:
-        self.of = {
-            family: RttEstimator(floor, _FIRST_WAITS.get(family, INITIAL_RTO))
-            for family, floor in FLOORS.items()
-        }
-        self.moving = self.of["data"]
-        self._at = self._sent_at = -inf
-        self._manner: Manner | None = None
+        self.bulk, self.single = RttEstimator(), RttEstimator()
+        self.reordering = Reordering()
+        self._last = (-inf, -inf, False)
+        self._rtt = 0.0
 
-    def timeout(self, family: str) -> float:
-        """Return the present retransmission timeout of a family of opcodes, in seconds."""
-        timer = self.of[family]
-        if timer.samples:
-            return timer.rto
-        known = (other.unfloored for other in self.of.values() if other.samples)
-        return max(min(known, default=INITIAL_RTO), FLOORS[family])
+    def _estimator(self, manner: Manner) -> RttEstimator:
+        """Return what is known for this manner, or at least for the other one."""
+        own, other = (self.bulk, self.single) if manner.bulk else (self.single, self.bulk)
+        return own if own.known or not other.known else other
+
+    def timeout(self, manner: Manner) -> float:
+        """Return how many seconds to wait for the reply to a first transmission, work aside."""
+        estimator = self._estimator(manner)
+        if estimator.known or manner.same_seq:
+            return max(estimator.rto, manner.floor)
+        return INITIAL_RTO / 2
 
     def sample(self, request: Request, now: float) -> float:
         """Return the round trip of a transmission that was answered, and learn from it.
@@ -118,39 +107,26 @@ class Timers:
         What was sent in one batch and answered in one batch is one sample: a hundred equal ones would say
         that round trips never vary.
         """
-        sent_at = request.sent_at
-        if now != self._at or sent_at != self._sent_at or request.manner is not self._manner:
-            self._at, self._sent_at, self._manner = now, sent_at, request.manner
-            if request.manner.family == _WORK and request.manner.slowest > _NO_WORK:
-                return now - sent_at  # most of it was work
-            timer = self.of[request.manner.family]
-            timer.sample(now - sent_at)
-            if request.manner.family in _MOVING:
-                self.moving = timer
-            if timer.samples == 1:
-                # A family without samples would wait 1 s. Start it from another family's first sample, which
-                # allows for three round trips.
-                for other in self.of.values():
-                    if not other.samples and timer.unfloored < other.unfloored:
-                        other.unfloored = timer.unfloored
-                        other.rto = max(timer.unfloored, other.floor)
-        return now - sent_at
-
-    def wait(self, request: Request) -> float:
-        """Return how long to wait for the reply to this transmission of a request, in seconds."""
         manner = request.manner
-        timer = self.of[manner.family]
-        plain, rto = max(timer.unfloored, timer.floor), timer.rto
-        slow = request.sends >= manner.slow_from
-        if slow and manner.family == _WORK:
-            # The way and the work take their times one after the other.
-            work = manner.slowest
-            if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
-                work = max(work * _USUAL_PACE, min(work, _NO_WORK))
-            plain, rto = plain + work, rto + work
-        # Under the same seq a repetition does not tell the round trip. If that is not known yet, it may be
-        # long.
-        free = manner.free_sends if timer.samples or not manner.same_seq else 1
-        doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
-        wait = max(rto, min(plain * (1 << doublings), LONGEST_BACK_OFF))
-        return max(wait, manner.slowest) if slow and manner.family != _WORK else wait
+        rtt = now - request.sent_at
+        moment = (now, request.sent_at, manner.bulk)
+        if moment != self._last and manner.work <= _NO_WORK:  # else most of it was work
+            self._last = moment
+            (self.bulk if manner.bulk else self.single).sample(rtt)
+        self._rtt = rtt
+        return rtt
+
+    def wait(self, manner: Manner, quiet: float) -> float:
+        """Return how many seconds to wait for the reply to a request that goes out.
+
+        quiet: seconds in which its operation made no progress. Under the same seq a repetition does not tell
+        the round trip. If that is not known yet, it may be long.
+        """
+        backoff = manner.backoff if self._estimator(manner).known else 1.0
+        wait = max(self.timeout(manner), min(quiet * backoff, LONGEST_BACK_OFF))
+        return wait + min(manner.work, max(manner.usual_work, quiet))
+
+    def passed_wait(self, now: float) -> float:
+        """Return how many seconds after its transmission a request is lost, if a later one was answered."""
+        rtt = max(self._rtt, self.bulk.smoothed)
+        return max((1.0 + self.reordering.share(now)) * rtt, rtt + AT_ONCE)

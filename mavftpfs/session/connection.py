@@ -201,7 +201,7 @@ class Connection:
                 "received_bytes": link.stats.received_bytes,
                 "sent_bytes": link.stats.sent_bytes,
                 "requests": stats.requests,
-                "retransmissions": stats.retransmissions,
+                "retransmissions": stats.lost,
                 "reopened": link.stats.reopened,
                 "source": link.description,
                 "address": None if self.driver.peer is None else readable_address(self.driver.peer),

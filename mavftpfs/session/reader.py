@@ -66,7 +66,7 @@ class FileStream(SessionUser):
             self._transfer.want(start, stop, demand)
         else:
             self._wants.add(self._sink.missing(start, stop), demand=demand)
-        if self.waiting_since is None and not self._wants.demand.empty:
+        if self.waiting_since is None and not self._wants.demand.todo.empty:
             self.waiting_since = self._scheduler.clock()
             self._scheduler.limit_wait(self)
         self._wanted.set()
@@ -74,11 +74,8 @@ class FileStream(SessionUser):
 
     def drop(self, *, demand: bool = True) -> None:
         """Ask for nothing more; demand: False: no readahead. What is on its way still comes."""
-        if self._transfer is not None:
-            self._transfer.drop(demand=demand)
-            return
-        self._wants.clear(demand=demand)
-        if self._wants.demand.empty and self.opened.ended:
+        self._wants.drop(demand=demand)
+        if self._transfer is None and self._wants.demand.todo.empty and self.opened.ended:
             self.waiting_since = None
 
     def close(self) -> None:
@@ -95,7 +92,7 @@ class FileStream(SessionUser):
     @property
     def idle(self) -> bool:
         """See SessionUser."""
-        return self.closed or (self.opened.ended and self._wants.empty)
+        return self.closed or (self.opened.ended and self._wants.idle)
 
     def goes_on(self, session: OpenSession) -> bool:
         """See SessionUser."""
@@ -147,7 +144,7 @@ class FileStream(SessionUser):
                     self._fail(error)
             except MavftpfsError as error:
                 self._fail(error)
-            if not self._wants.demand.empty or not self.opened.ended:
+            if not self._wants.demand.todo.empty or not self.opened.ended:
                 self.waiting_since = server.clock()
 
     async def _open(self, turn: Turn) -> None:
@@ -199,7 +196,7 @@ class FileStream(SessionUser):
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
                     # burst what the link holds, and the answer finds no room there.
-                    transfer.by_requests = engine.in_flight > transfer.in_flight
+                    transfer.by_requests = engine.serves_others(transfer)
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 driver.kick()
                 await server.sleep(_OFTEN)
@@ -207,7 +204,7 @@ class FileStream(SessionUser):
                     raise SessionLost("no answer for a while during a read", by_server=False)
         finally:
             server.transfer = self._transfer = None
-            transfer.give_back()
+            transfer.finish()
             driver.cancel(transfer)
             self.on_turn(began, server.clock())
         if transfer.error is not None:

@@ -361,7 +361,7 @@ class Store:
         async with self._changing(old, new, below=True, in_flight=completes):
             # NuttX before October 2022 removes the file under the new name also when there is none under the
             # old one: done twice, nothing is left (servers.md 9).
-            request = partial(Simple, Opcode.RENAME, data, alone=is_on_nuttx(new))
+            request = partial(Simple, Opcode.RENAME, data, exclusive=is_on_nuttx(new))
             await self._perform(old, request, partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():

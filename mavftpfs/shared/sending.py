@@ -1,7 +1,7 @@
 """What of a file is to be sent, is on its way, and is known to be on the card. Layer: shared; pure.
 
-The cache makes a `SendBuffer` for each attempt to send a file, and tells it of changes. The session takes
-chunks from it, and tells it what became of them. Each attempt has its own buffer, so an upload of an earlier
+The cache makes a `SendBuffer` for each attempt to send a file, and reports changes to it. The session takes
+chunks from it, and reports what became of them. Each attempt has its own buffer, so an upload of an earlier
 attempt changes nothing of the present one.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.ranges import Ranges
 
 AHEAD = 64 * 1024
 """Bytes fetched at once, since chunks are small."""
@@ -25,13 +26,14 @@ class SendBuffer:
     copies of one byte could reach the card in the wrong order.
 
     Attributes:
-        todo: bytes that are to be handed out. acked: bytes ACKed since the file was last closed. proven:
-            bytes ACKed before it was last closed. All other bytes are on their way.
+        ranges: bytes that are to be sent, and bytes that are on their way. acked: bytes ACKed since the file
+            was last closed. proven: bytes ACKed before it was last closed.
         has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
         begun: the file was made, or emptied, for it: CreateFile went out.
-        handed_out: one past the highest byte that ever was.
+        handed_out: one past the highest byte that was ever handed out.
         overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
-        reached: one past the highest byte that was ACKed; after a rollback, one past the highest proven byte.
+        reached: one past the highest byte that was ACKed; after the session was lost, one past the highest
+            proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
     """
 
@@ -40,7 +42,8 @@ class SendBuffer:
     ) -> None:
         """`progress(count)` is called for each ACK, with its number of bytes."""
         self.size = size
-        self.todo = ExtentSet([(0, size)])
+        self.ranges = Ranges()
+        self.ranges.todo.add(0, size)
         self.acked = ExtentSet()
         self.proven = ExtentSet()
         self.begun = self.has_checkpoint = self.overtaken = self.growing = False
@@ -59,9 +62,9 @@ class SendBuffer:
         """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
         self.overtaken |= start < self.handed_out
         if size > self.size:
-            self.todo.add(self.size, size)
+            self.ranges.todo.add(self.size, size)
         else:
-            self.todo.discard(size, self.size)
+            self.ranges.on_done(size, self.size)
         self.size = size
         if start < self._ahead[0] + len(self._ahead[1]):
             self._ahead = (0, b"")
@@ -82,24 +85,22 @@ class SendBuffer:
         start, stop = found
         at, ahead = self._ahead
         if start < at or at + len(ahead) < stop:
-            first = self.todo.first()
+            first = self.ranges.todo.first()
             assert first is not None
             at, ahead = start, self._read(start, max(stop, min(first[1], start + AHEAD)))
             self._ahead = (at, ahead)
-        self.todo.discard(start, stop)
+        self.ranges.take(start, stop)
         self.handed_out = max(self.handed_out, stop)
         return start, ahead[start - at : stop - at]
 
-    def on_acked(self, offset: int, count: int) -> None:
-        """These bytes were ACKed as written."""
-        self.acked.add(offset, offset + count)
-        self.reached = max(self.reached, offset + count)
+    def on_acked(self, start: int, stop: int) -> None:
+        """These bytes were ACKed as written. Those that were not ACKed before are progress."""
+        before = self.acked.total
+        self.ranges.on_done(start, stop)
+        self.acked.add(start, stop)
+        self.reached = max(self.reached, stop)
         if self._progress is not None:
-            self._progress(count)
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        """These bytes were not ACKed. A request that carries them may still arrive: with the same bytes."""
-        self.todo.add(offset, offset + count)
+            self._progress(self.acked.total - before)
 
     def check_point(self) -> None:
         """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
@@ -109,20 +110,21 @@ class SendBuffer:
         self.acked = ExtentSet()
 
     def roll_back(self) -> None:
-        """The session was lost: what was ACKed since the last Terminate is sent again."""
+        """The session was lost, and all that is not proven with it: that is to be sent again."""
         self.acked = ExtentSet()
         self.reached = self.proven.end
-        self.todo = ExtentSet(self.proven.missing(0, self.size))
+        self.ranges = Ranges()
+        for start, stop in self.proven.missing(0, self.size):
+            self.ranges.todo.add(start, stop)
 
     def start_over(self) -> None:
-        """The file is made anew: all of it is sent."""
-        self.begun, self.has_checkpoint, self.reached = True, False, 0
-        self.acked, self.proven = ExtentSet(), ExtentSet()
-        self.todo = ExtentSet([(0, self.size)])
+        """The file is made anew, so nothing of it is proven."""
+        self.begun, self.has_checkpoint, self.proven = True, False, ExtentSet()
+        self.roll_back()
 
     def _next(self, limit: int) -> tuple[int, int] | None:
         """Return the next bytes to hand out."""
-        found = self.todo.first()
+        found = self.ranges.todo.first()
         if found is None or self.overtaken:
             return None
         start, stop = found[0], min(found[1], found[0] + limit)

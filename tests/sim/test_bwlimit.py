@@ -125,4 +125,4 @@ async def test_the_slowest_limit_is_slow_and_no_time_out() -> None:
         assert (
             connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 1
         )  # waiting for the limit is no silence
-        assert connection.engine.stats.retransmissions == 0
+        assert connection.engine.stats.lost == 0

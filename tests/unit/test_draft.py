@@ -157,8 +157,8 @@ class DraftMachine(RuleBasedStateMachine):
         count = min(keep, len(data))
         self.remote.extend(bytes(max(0, offset + count - len(self.remote))))
         self.remote[offset : offset + count] = data[:count]
-        sending.on_acked(offset, count)
-        sending.on_unsent(offset + count, len(data) - count)
+        sending.on_acked(offset, offset + count)
+        sending.ranges.on_lost(offset + count, offset + len(data))
 
     @rule(everything=st.booleans())
     def lose_session(self, everything: bool) -> None:

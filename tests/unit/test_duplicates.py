@@ -122,5 +122,5 @@ def test_little_is_remembered() -> None:
         other = ask(engine, Opcode.CREATE_DIRECTORY, now)
         again(engine, now + 5.0)
         engine.receive(ack(other), now + 5.1)
-    assert len(engine._ledger.duplicates._expected) == 1024
-    assert len(engine._ledger.duplicates._sent) == 1024
+    assert len(engine._ledger._table) == 1024
+    assert len(engine._ledger._sent) == 1024

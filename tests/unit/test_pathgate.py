@@ -122,7 +122,7 @@ def test_a_refused_write_is_sent_again_behind_a_listing_of_the_root() -> None:
         assert card.sends(now) == [], "the other one is not answered yet"
         card.engine.receive(nak(second, NakCode.FILE_PROTECTED), now)
         assert card.sends(now) == [Opcode.LIST_DIRECTORY]
-        assert Opcode.WRITE_FILE in card.answer(6.0)
+        assert Opcode.WRITE_FILE in card.answer(now + 0.1)
         assert {request.offset for request in card.out} == {first.offset, second.offset}
         card.answer(now + 0.2)
     for now in (3.0, 4.0, 5.0):
@@ -185,14 +185,16 @@ def test_a_lost_write_goes_out_again_behind_a_listing_of_the_root() -> None:
     assert Opcode.WRITE_FILE in card.answer(6.0)
 
 
-def test_nothing_goes_out_behind_what_goes_alone() -> None:
+def test_nothing_goes_out_behind_an_exclusive_request() -> None:
     engine = Engine(random.Random(3), Flow(limit=4))
     engine.start(Simple(Opcode.READ_FILE, session=1), 0.0)
-    assert len(sent(engine, 0.0)) == 1
-    engine.start(Simple(Opcode.RENAME, b"/fs/a", alone=True), 0.1)
+    (read,) = sent(engine, 0.0)
+    engine.start(Simple(Opcode.RENAME, b"/fs/a", exclusive=True), 0.1)
     engine.start(Simple(Opcode.READ_FILE, session=1), 0.1)
     (rename,) = sent(engine, 0.1)
     assert rename.opcode == Opcode.RENAME
+    engine.receive(ack(read), 0.2)
+    assert sent(engine, 0.2) == []
     engine.receive(ack(rename), 0.3)
     assert [request.opcode for request in sent(engine, 0.3)] == [Opcode.READ_FILE]
 

@@ -109,16 +109,16 @@ def test_demand_goes_before_readahead_and_promotes_it() -> None:
     assert reader.sink.repeats == 0
 
 
-@pytest.mark.parametrize(("demand", "left"), [(True, []), (False, [(0, 239)])])
+@pytest.mark.parametrize(("demand", "left"), [(True, []), (False, [(0, 100)])])
 def test_for_what_was_dropped_on_its_way_no_program_waits(demand: bool, left: list[tuple[int, int]]) -> None:
     reader = Reader(limit=2)
     reader.transfer.want(0, 478, False)
     assert len(reader.sent()) == 2
     reader.transfer.want(0, 100, True)
-    reader.transfer.drop(demand=demand)
+    reader.transfer.wants.drop(demand=demand)
     assert reader.transfer.demanded is not demand
-    reader.transfer.give_back()
-    assert list(reader.transfer.wants.demand) == left
+    reader.transfer.finish()
+    assert list(reader.transfer.wants.demand.todo) == left
 
 
 # --- replies to ReadFile
@@ -144,7 +144,7 @@ def test_where_the_file_ends_early_it_is_to_be_opened_again(eof: bool) -> None:
     reader.engine.receive(nak(request, NakCode.EOF) if eof else ack(request), 0.1)
     assert isinstance(reader.transfer.error, SessionLost)
     assert not reader.transfer.error.by_server
-    assert reader.transfer.wants.demand == ExtentSet([(0, 1000)])
+    assert reader.transfer.wants.demand.todo == ExtentSet([(0, 1000)])
     assert reader.engine.take_finished() == [reader.transfer]
 
 
@@ -159,7 +159,7 @@ def test_a_lost_session_leaves_the_wants(codes: tuple[int, ...]) -> None:
     error = reader.transfer.error
     assert isinstance(error, SessionLost)
     assert error.by_server
-    assert reader.transfer.wants.demand == ExtentSet([(239, 1000)])
+    assert reader.transfer.wants.demand.todo == ExtentSet([(239, 1000)])
 
 
 def test_other_refusals_are_the_callers() -> None:
@@ -169,7 +169,7 @@ def test_other_refusals_are_the_callers() -> None:
     error = reader.transfer.error
     assert isinstance(error, FtpNak)
     assert error.server_errno == 5
-    assert reader.transfer.wants.demand == ExtentSet([(0, 100)])
+    assert reader.transfer.wants.demand.todo == ExtentSet([(0, 100)])
 
 
 # --- bursts
@@ -228,7 +228,7 @@ def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
 @pytest.mark.holds("fault burst end")
 def test_the_flag_and_a_short_quiet_end_it() -> None:
     reader = Reader(bursts=True)
-    reader.engine._timers.of["data"].sample(0.05)
+    reader.engine._timers.bulk.sample(0.05)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()
     stream(reader, request, [0, 1, 2], complete=2)
@@ -272,5 +272,5 @@ def test_a_burst_without_session(code: int) -> None:
     reader.transfer.want(0, SIZE, True)
     reader.engine.receive(burst_nak(reader.sent()[0], 0, code), 0.1)
     assert isinstance(reader.transfer.error, SessionLost)
-    assert reader.transfer.wants.demand == ExtentSet([(0, SIZE)])
+    assert reader.transfer.wants.demand.todo == ExtentSet([(0, SIZE)])
     assert not burst_runs(reader)
