@@ -1,4 +1,4 @@
-"""`mavftpfs sim`: its arguments, its signals, and what it says."""
+"""`mavftpfs sim`: its arguments, its signals, and its output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Somebody else says that he is the vehicle, or takes its place: nothing of one reaches the other."""
+"""Another sender claims to be the vehicle, or takes its place: no bytes of one reach the other."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(caplog: pytest.Log
 async def test_another_vehicle_that_takes_the_address_is_not_read(
     tells: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is one that tells no id: ours told it."""
+    """Nor is one that tells no id, because the mounted one told its own."""
     scene = Crowd()
     if not tells:
         monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)

@@ -1,4 +1,4 @@
-"""What a cold `ls` or a small read waits during a bulk copy, on virtual time (docs/benchmarks.md, promise 7).
+"""The wait of a cold `ls` or small read during a bulk copy, on virtual time (docs/benchmarks.md, promise 7).
 
 p95 <= 3 round trips + 0.3 s + bytes asked for / rate beside a download, and one round trip more beside an
 upload, because the upload waits for its last ACK before it closes its file. For every server, on links of
@@ -137,7 +137,7 @@ ROUND_TRIPS = {"download": 3, "upload": 4}
 """Round trips of the bound, by the way that the copy goes."""
 
 FRAMES = {"ls": 3, "read": 3}
-"""What somebody does beside the copy, and how many full frames it takes."""
+"""The actions beside the copy, and how many full frames each takes."""
 
 DOWNLOADS = [
     *((profile, "radio", what) for profile in sorted(PROFILES) for what in FRAMES),
@@ -191,7 +191,7 @@ async def test_nobody_waits_long_at_a_serial_port(way: str, what: str, link: str
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("profile", "link"), [("px4-nuttx", FAR), ("ardupilot", SLOW)])
 async def test_an_upload_goes_on_beside_endless_small_reads(profile: str, link: LinkSettings) -> None:
-    """Three readers without a pause: one that used little always waits. The upload once sent nothing."""
+    """Three readers never pause, so that one of low usage always waits. The upload once sent nothing."""
     copy = Copy(profile, link)
     root = copy.root
     async with copy.rig.connected() as connection, trio.open_nursery() as nursery:

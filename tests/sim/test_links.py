@@ -34,7 +34,7 @@ HOST = "127.0.0.1"
 
 @asynccontextmanager
 async def opened(source: str) -> AsyncIterator[Link]:
-    """Open a link; the test ends in time whatever happens."""
+    """Open a link; a time-out ends a test that hangs."""
     with trio.fail_after(120):
         async with open_link(parse_source(source)) as link:
             yield link
@@ -342,7 +342,7 @@ async def test_frames_that_go_out_together_are_one_write() -> None:
 
 
 async def test_a_frame_that_was_begun_is_finished() -> None:
-    """Whatever the limit on what waits: a hole in a stream costs the next frame too."""
+    """The limit on waiting bytes cuts no frame, because a hole in a stream costs the next frame, too."""
     frames = [bytes([n]) * 1000 for n in range(20)]
     async with opened_pty(9600) as (link, master):
         link.send(frames)
@@ -386,7 +386,7 @@ async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:
 
 
 async def test_a_flood_starves_nobody() -> None:
-    """Whoever receives without end still lets other tasks run after each batch."""
+    """A task that receives without end lets other tasks run after each batch."""
     ran = 0
 
     async def bystander() -> None:

@@ -55,7 +55,7 @@ async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
 
 
 async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
-    """They are two places: mv(1) copies then, and removes."""
+    """They are two devices: mv(1) then copies and removes."""
     await write_file(tree, SWAP, b"local")
     for old, new in ((SWAP, FILE), (SWAP, b"/scripts/new"), (FILE, SWAP), (b"/scripts", TRASH)):
         with pytest.raises(CrossDevice):
@@ -65,7 +65,7 @@ async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tre
 
 
 async def test_a_trash_is_refused(here: Rig, tree: Tree) -> None:
-    """It would be lost with the mount. File managers offer to delete, then."""
+    """The trash would be lost with the mount. After the refusal file managers offer to delete."""
     with pytest.raises(NotSupported):
         await tree.mkdir(TRASH)
     with pytest.raises(NotFound):

@@ -1,4 +1,4 @@
-"""Missions as texts, over simulated links: what is read, and what a vehicle makes of what is saved."""
+"""Missions as texts, over simulated links: reading, and saving on each kind of vehicle."""
 
 from __future__ import annotations
 

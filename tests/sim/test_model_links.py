@@ -1,8 +1,8 @@
 """Random sequences of calls on a few files against a model: every kind of server, real requests, bad links.
 
 Everything between the calls of a program and the card is the real thing: caches, session, engine, frames. The
-vehicle and the link are simulated, time is virtual. What one call in one sequence is depends on the drawn
-example alone, trio's order of tasks included (which hypothesis seeds), so what fails once fails again.
+vehicle and the link are simulated, time is virtual. The drawn example alone decides each call in a
+sequence, trio's order of tasks included (which hypothesis seeds), so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ ONCE = (Phase.generate,)
 
 
 def varied(sequence: list[tuple[Any, ...]]) -> bool:
-    """Return whether there is something to it: hypothesis begins with a hundred times the same call."""
+    """Return whether an example has variety: hypothesis begins with a hundred times the same call."""
     return len({call[0] for call in sequence}) > 5
 
 
@@ -66,7 +66,7 @@ def mount(here: Rig, seed: int) -> Tree:
 
 
 async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> None:
-    """Make the calls on both; in the end the card is the model and no session is open."""
+    """Make the calls on both; in the end the card equals the model and no session is open."""
     async with rig(profile, START, link=link, seed=seed) as here:
         here.put_directory(b"/d/sub")
         model = Model(mount(here, seed), here.files, (RequestTimeout, FtpNak))
@@ -166,7 +166,7 @@ def files_below(here: Rig, folder: bytes) -> dict[bytes, bytes]:
 
 
 async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed: int) -> None:
-    """Have them work side by side in trouble; when it is over the card is what each of them wrote."""
+    """Run the programs side by side in trouble; afterwards the card has what each of them wrote."""
     async with rig(profile, link=TROUBLED, seed=seed, telemetry=1200.0) as here:
         tree = mount(here, seed)
         models = []

@@ -1,4 +1,4 @@
-"""Open files: what their readers see, files that lose their name, and files that others replaced.
+"""Open files: the bytes that readers get, files that lose their name, and files that others replaced.
 
 A vehicle that replaces a file between two sessions of its server: test_replaced.
 """
@@ -50,7 +50,7 @@ def tree(here: Rig) -> Tree:
 @pytest.mark.parametrize(("mode", "on_its_way"), [("window", 6000), ("burst", 40_000)])
 @pytest.mark.parametrize("how", ["interrupted", "closed"])
 async def test_nothing_more_is_fetched_once_nobody_reads(how: str, mode: ReadMode, on_its_way: int) -> None:
-    """A radio that carries 15 kB/s; the program gives up in the middle of what it asked for.
+    """Over a radio of 15 kB/s, a program gives up in the middle of the bytes that it asked for.
 
     on_its_way: bytes; a burst has up to 38 kB.
     """
@@ -216,7 +216,7 @@ async def test_growth_shows_when_a_file_is_opened_too(here: Rig, tree: Tree) -> 
     ("how", "profile"), [("unlink", each) for each in KINDS] + [("rename over", each) for each in RENAMING]
 )
 async def test_a_file_that_lost_its_name_reads_no_other_file(how: str, profile: str) -> None:
-    """Its bytes are on no card any more. What has the name by now has as many."""
+    """The card no longer has its bytes. The file that has the name now has as many."""
     async with rig(profile, {FILE: DATA * 5, OTHER: DATA[::-1] * 5}, link=LinkSettings(delay=0.05)) as here:
         tree = here.mount()
         reader, writer = await tree.open(FILE), await tree.open(FILE, write=True)
@@ -310,7 +310,7 @@ async def assert_filled(file: OpenFile) -> None:
 
 @pytest.mark.parametrize("over", [False, True])
 async def test_a_file_without_a_name_waits_for_no_vehicle(here: Rig, over: bool) -> None:
-    """Nor does it hold another writer back."""
+    """Another writer does not wait for it either."""
     tree = here.mount()
     nameless = await tree.create(NEW, exclusive=True)
     if over:
@@ -361,7 +361,7 @@ async def require_lost(reader: OpenFile) -> None:
 
 @pytest.mark.holds("promise 5")
 async def test_all_older_versions_are_lost(there: Rig) -> None:
-    """Also the one that was opened before the file grew."""
+    """So is the version that a program opened before the file grew."""
     tree = there.mount()
     first = await opened(tree)
     there.put(FILE, OLD + OLD, THEN + 200)
@@ -382,7 +382,8 @@ async def test_all_older_versions_are_lost(there: Rig) -> None:
 @pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])
 async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(there: Rig, look: str) -> None:
-    """That one changed nothing of it, and cannot any more; nobody is told that this came to the vehicle."""
+    """The writer changed nothing of the lost file, and can no longer; no program is told that it was
+    delivered."""
     tree = there.mount()
     writer = await opened(tree, write=True)
     there.put(FILE, LATER[:-100], THEN + 200)
@@ -429,7 +430,7 @@ async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one
 async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_new_one(
     there: Rig, smaller: bool
 ) -> None:
-    """The kernel keeps what it got by one name, for all programs."""
+    """The kernel caches pages by name, for all programs."""
     tree = there.mount()
     writer = await tree.open(FILE, write=True)
     await writer.write(0, b"mid")

@@ -1,9 +1,9 @@
 """Calls that overlap: with the release of a file, with its delivery, with changes of its name.
 
-A file that is removed, renamed over or emptied while it is on its way: what sends it is called off. A local
-disk does that at once, whatever the size, and fsync and close of what lost its name succeed. Here it costs a
-few round trips, at any moment of a delivery; the old file stays until there is another one, and nothing of
-what is gone comes back or stays on the card.
+If a program removes, renames over or empties a file while the mount delivers it, the mount cancels the
+delivery. A local disk does that at once, whatever the size, and fsync and close of a file without a name
+succeed. Here it costs a few round trips, at any moment of a delivery; the old file stays until there is
+another one, and nothing of a removed file comes back or stays on the card.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ async def begun(tree: Tree, path: bytes, data: bytes = DATA) -> OpenFile:
 
 @asynccontextmanager
 async def in_the_middle(file: OpenFile, waiting: int = 1, *, after: float = 1.05) -> AsyncIterator[None]:
-    """Enter when so many waited for the delivery for so many seconds; leaving waits for its end."""
+    """Enter when so many tasks have waited so many seconds for the delivery; leaving waits for its end."""
     async with trio.open_nursery() as nursery:
         for _ in range(waiting):  # one delivers, the others wait for their turn
             nursery.start_soon(file.fsync)
@@ -58,7 +58,7 @@ async def in_the_middle(file: OpenFile, waiting: int = 1, *, after: float = 1.05
 
 
 async def settle(here: Rig, tree: Tree) -> None:
-    """Let everything happen that follows by itself; nothing of ours stays."""
+    """Wait for everything that follows by itself; no temporary file stays."""
     for _ in range(2):
         await trio.sleep(8)
         tree.forget_caches()
@@ -105,7 +105,7 @@ CHANGES: dict[str, tuple[Callable[[Tree], Awaitable[None]], bytes, bytes]] = {
 
 
 async def program(tree: Tree, opening: str, later: float, change: str) -> None:
-    """Open at that time, use it and close; that the file is gone is the only excuse."""
+    """Open at that time, use the file and close; the only error allowed is that the file is gone."""
     await trio.sleep(later)
     try:
         file = await OPENINGS[opening](tree)
@@ -127,7 +127,7 @@ async def program(tree: Tree, opening: str, later: float, change: str) -> None:
 async def test_a_file_is_opened_before_or_after_its_name_is_changed(
     profile: str, opening: str, change: str
 ) -> None:
-    """Not meanwhile: the opened file would be neither the old one nor the new one."""
+    """An open in between would be of neither the old file nor the new one."""
     act, left, base = CHANGES[change]
     for later in (-6, -3, 1, 3, 5):
         async with rig(profile, {FILE: OLD, OTHER: LATER}, link=FAR) as here:
@@ -145,7 +145,7 @@ async def test_a_file_is_opened_before_or_after_its_name_is_changed(
 
 @pytest.mark.holds("fault overlap")
 async def test_a_reader_never_gets_bytes_of_what_replaces_its_file() -> None:
-    """Its file was delivered by another handle, so it opens it anew at the next read: at any moment."""
+    """Another handle delivered the file, so the next read opens it anew: at any moment."""
     for later in range(0, 30, 3):
         async with rig("px4", {FILE: OLD, OTHER: LATER}, link=FAR) as here:
             tree = here.mount()
@@ -358,7 +358,7 @@ async def test_a_name_goes_at_any_request_of_its_delivery(
     ids=lambda value: len(value) if isinstance(value, bytes) else None,
 )
 async def test_emptied_at_any_request_of_its_delivery(profile: str, write: Write, then: bytes) -> None:
-    """By O_TRUNC; something else is written then."""
+    """The program empties by O_TRUNC, and then writes something else."""
 
     async def act(tree: Tree, file: OpenFile, delivered: trio.Event) -> float:
         began = trio.current_time()
@@ -384,7 +384,7 @@ RADIO = LinkSettings(rate=6000.0, delay=0.05)
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("profile", ["px4-nuttx", "mavsdk"])
 async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> None:
-    """What was accepted is on the card then, and the program goes on; on some servers that means all anew."""
+    """Then the card has the accepted bytes, and the program goes on; some servers get all bytes again."""
     piece = content(32768)
     async with rig(profile, {b"/d/z": b""}, link=LinkSettings(rate=20_000.0, delay=0.05)) as here:
         tree = here.mount()
@@ -406,7 +406,7 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str) -> Non
 
 @pytest.mark.parametrize("profile", RENAMING)
 async def test_the_old_file_stays_while_nobody_waits(profile: str) -> None:
-    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
+    """The mount cancels for good a delivery that it retries by itself, after the link was cut."""
     async with rig(profile, {FILE: BYTES}, link=RADIO) as here:
         tree = here.mount()
         await tree.list(b"/d")
@@ -429,7 +429,7 @@ async def test_the_old_file_stays_while_nobody_waits(profile: str) -> None:
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("path", [NEW, FILE])
 async def test_a_removal_that_was_given_up_loses_nothing(slow: Rig, path: bytes) -> None:
-    """It had ended the upload: what that left on the vehicle is ours."""
+    """The removal had ended the upload, so the file that the upload left on the vehicle is this mount's."""
     tree, data = slow.mount(), content(70_000)
     file = await begun(tree, path, data)
     await trio.sleep(1.05)
@@ -492,7 +492,7 @@ async def test_emptying_calls_off_a_delivery_that_waits_for_its_path(profile: st
 async def test_what_was_taken_back_may_have_got_its_place(
     profile: str, old: bytes, new: bytes, nth: int
 ) -> None:
-    """Nobody knows whether the card has what it had before: that is not to be taken for delivered."""
+    """Whether the card has the old file is unknown, so the mount must not count the new one as delivered."""
     async with rig(profile, {FILE: old}, options=QUICK) as here:
         tree = here.mount()
         file = await tree.open(FILE, write=True)

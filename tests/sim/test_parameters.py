@@ -1,4 +1,4 @@
-"""Parameters as texts, over simulated links: what is read is what the vehicle has, what is saved holds."""
+"""Parameters as texts, over simulated links: a read gives the vehicle's values, and a save sets them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def numbers(here: Rig) -> dict[str, float]:
 
 
 def assert_nothing_written_back(here: Rig, before: dict[str, float], *but: str) -> None:
-    """What drifts has drifted on, and all others are what they were."""
+    """Check that drifting values drifted on, and that no other value changed."""
     drifting = {one.name.decode() for one in table_of(here).visible(here.server.firmware.now) if one.drift}
     for name, value in numbers(here).items():
         if name not in but:
@@ -84,7 +84,7 @@ async def vehicle(
 
 @dataclass(eq=False)
 class Editor:
-    """A program, told from others by itself, that reads a text and saves it."""
+    """A program of its own that reads a text and saves it."""
 
     tree: Tree
     path: bytes = ALL
@@ -141,7 +141,7 @@ def gains(count: int) -> str:
 
 
 def taken(here: Rig, count: int) -> set[str]:
-    """Return which of these the vehicle has."""
+    """Return the names of those that the vehicle has."""
     return {f"GAIN_{i:03}" for i in range(count) if number(here, f"GAIN_{i:03}") == i + 0.5}
 
 
@@ -253,7 +253,7 @@ VIM = {
     "five each time": [{f"MODE_{5 * nth + i:03}": "77" for i in range(5)} for nth in range(3)],
     "refused": [*[{"MODE_001": "rubbish"}] * (MAX_PROGRAM_READS + 2), {"MODE_001": "77"}],
 }
-"""What the user of a vim that stays open changes before each save."""
+"""The changes that a user of a running vim makes before each save."""
 
 
 @MARKS
@@ -261,8 +261,8 @@ VIM = {
 async def test_vim_writes_nothing_back_however_often_it_saves(
     profile: str, saves: list[dict[str, str]]
 ) -> None:
-    """It reads the file anew each time, and saves what it had read first: neither what was saved nor what was
-    refused meanwhile takes it that base."""
+    """vim reads the file anew each time, and saves the text that it had read first: neither a save nor a
+    refusal in between takes that base away."""
     async with vehicle(profile, parameters=many(drifting=1)) as (here, tree):
         vim = await Editor(tree).read()
         for edits in saves:
@@ -284,7 +284,7 @@ async def test_vim_writes_nothing_back_however_often_it_saves(
 @MARKS
 @pytest.mark.parametrize("bad", ["MODE_002,rubbish", "CLAMPED,70"])
 async def test_an_editor_that_puts_back_its_backup_after_a_failed_save(profile: str, bad: str) -> None:
-    """vim does: what failed stays said, and nothing else is set than what the failed save had set."""
+    """vim does so. The error stays readable; the vehicle gets no value that the failed save did not set."""
     table = [*many(), parameter("CLAMPED", FLOAT, 1, limits=(0, 10))]
     async with vehicle(profile, parameters=table) as (here, tree):
         editor = await Editor(tree).read()
@@ -329,7 +329,7 @@ async def test_many_programs_that_read_and_end_take_no_editor_its_base() -> None
 
 
 async def test_what_a_program_reads_again_is_its_base() -> None:
-    """Others set it, the program saw that, and goes back to what it had read first."""
+    """Others set a value, the program saw that, and goes back to the text that it had read first."""
     async with vehicle("px4-2026", parameters=many(drifting=0)[:-1]) as (here, tree):
         editor = await Editor(tree).read()
         first = list(editor.lines)
@@ -435,7 +435,7 @@ async def test_bad_lines_are_named_and_nothing_is_sent(text: str, said: str) -> 
 
 
 async def test_half_a_last_line_sets_nothing_and_may_be_finished() -> None:
-    """A child that a program forks flushes what it inherits."""
+    """A forked child flushes the buffer that it inherits."""
     async with vehicle("ardupilot5") as (here, tree):
         file = await Editor(tree).open(write=True, truncate=True)
         await file.write(0, b"MODE_001,5\nMODE_002,7")
@@ -517,7 +517,7 @@ async def test_nothing_is_set_in_flight_nor_after_it(profile: str) -> None:
     ],
 )
 async def test_cut_in_the_middle(profile: str, opcode: Opcode, nth: int) -> None:
-    """What took is said, and the next save completes it; half a value is never set."""
+    """The message names the values that were set, and the next one sets the rest; no value is set in half."""
     async with vehicle(profile) as (here, tree):
         await tree.stat(ALL)
         await trio.sleep(2)
@@ -579,7 +579,7 @@ async def test_names_beside_the_texts_are_refused() -> None:
 
 
 async def test_300_values_over_57600_baud() -> None:
-    """It takes at most twice the time that the bytes need, and says how far it is."""
+    """The save takes at most twice the time that the bytes need, and shows its progress."""
     rate = 5760.0
     link = LinkSettings(delay=0.01, rate=rate, queue=4096)
     parameters = many(count=1329, drifting=0)

@@ -179,7 +179,7 @@ async def write_only(here: Rig, tree: Tree, writer: OpenFile) -> None:
 
 
 async def write_late(here: Rig, tree: Tree, writer: OpenFile) -> None:
-    """Nothing was read that could be compared: the time at which it was opened decides."""
+    """The program read no bytes that could be compared: the time of the open decides."""
     await wait_and_replace(here)
     await writer.write(100, MID)
 
@@ -192,7 +192,7 @@ async def write_again(here: Rig, tree: Tree, writer: OpenFile) -> None:
 
 
 async def write_and_list(here: Rig, tree: Tree, writer: OpenFile) -> None:
-    """The listing is the first one that shows a time of what was delivered, and it is the successor's."""
+    """The first listing that shows a time for the delivered file shows the successor's."""
     await writer.write(100, MID)
     await writer.fsync()
     await trio.sleep(30.0)
@@ -209,7 +209,7 @@ async def cut(here: Rig, tree: Tree, writer: OpenFile) -> None:
 @pytest.mark.parametrize("change", [read_and_write, write_only, write_late, write_again, write_and_list, cut])
 @pytest.mark.parametrize("profile", TIMED)
 async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: str, change: object) -> None:
-    """What is written whole does."""
+    """A file that is written whole does."""
     async with mounted(profile) as (here, tree):
         writer = await tree.open(PATH, write=True)
         await change(here, tree, writer)  # type: ignore[operator]
@@ -224,7 +224,7 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: 
 
 
 async def test_the_end_of_a_copy_by_turns_is_compared() -> None:
-    """Between two comparisons bytes go out unproven, but for the last."""
+    """Between two comparisons the reader gets unproven bytes, except for the last ones."""
     async with opened("ardupilot5") as (here, _, handle):
         await read_head(handle)
         handle._handle._version.compare_after = float("inf")  # type: ignore[attr-defined]

@@ -21,7 +21,7 @@ LONG = LinkSettings(delay=RTT / 2)
 PROFILES = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
 
 READY = 0.1
-"""What a server may take beside the way: ArduPilot looks at its queue every 10 ms."""
+"""Seconds that a server may take in addition to the link: ArduPilot looks at its queue every 10 ms."""
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -176,7 +176,7 @@ async def upload(profile: str, victim: int) -> float:
 @pytest.mark.holds("rule 14.38")
 @pytest.mark.parametrize("profile", taking_turns(("ardupilot", "mavsdk", "px4"), soak=("mavsdk",)))
 async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(profile: str) -> None:
-    """Question or answer. It was asked for again after 6.3 s, where the whole copy takes one or two."""
+    """Request or reply. The request was once repeated after 6.3 s, where the whole copy takes one or two."""
     usual = await upload(profile, -1)
     for victim in (0, 1):
         assert await upload(profile, victim) - usual <= 1.0

@@ -239,7 +239,7 @@ async def test_a_program_without_descriptors_left_keeps_its_port_and_shares_it_l
 async def test_a_program_that_does_not_answer_keeps_its_port(
     port: Port, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was stopped: two sockets would speak to one vehicle."""
+    """The program was stopped: with two sockets, two programs would speak to one vehicle."""
     monkeypatch.setattr(hublink, "WELCOME_PATIENCE", 0.2)
     taken = take_name(port_name(port.spec))
     assert taken is not None
@@ -249,7 +249,7 @@ async def test_a_program_that_does_not_answer_keeps_its_port(
 
 
 async def test_a_program_that_ends_while_it_is_asked_is_waited_for(port: Port) -> None:
-    """It may be killed between being asked and starting the hub."""
+    """A kill may hit the program between the question and the start of the hub."""
 
     async def end(name: socket.socket) -> None:
         for _ in range(2):

@@ -47,7 +47,7 @@ LONG = 20_000.0
 
 
 class Day:
-    """A vehicle, the computer that is with it, and what that does."""
+    """A vehicle, and the companion computer whose watch downloads its logs."""
 
     def __init__(self, local: Path, profile: str = "px4", link: LinkSettings = RADIO) -> None:
         self.rig = Rig(profile, link=link)
@@ -88,7 +88,7 @@ class Day:
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Have the watch run during the body; a second time is another process."""
+        """Run the watch during the body; a second time stands for another process."""
         hand_on = self._hand_on
         watch = Watch(Wish(self.local, selection=self.selection), self.said.append, hand_on)
         async with trio.open_nursery() as nursery:

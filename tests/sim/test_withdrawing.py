@@ -1,4 +1,4 @@
-"""A program that gives up what it wrote: nothing of it comes later, and it is told what is there."""
+"""A program that withdraws a file: nothing of it is sent later, and the program learns what the card has."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ async def opened(tree: Tree, path: bytes) -> OpenFile:
 async def test_what_could_not_be_delivered_never_comes(
     here: Rig, tree: Tree, path: bytes, after: int
 ) -> None:
-    """The link is cut before, or while, it is sent."""
+    """The link is cut before, or while, the mount sends the file."""
     file = await opened(tree, path)
     here.faults.cut_after(after)
     await file.write(0, NEW)
@@ -64,7 +64,7 @@ async def test_what_could_not_be_delivered_never_comes(
 
 @pytest.mark.parametrize("path", [FILE, FRESH])
 async def test_an_interrupted_name_is_looked_at(here: Rig, tree: Tree, path: bytes) -> None:
-    """Nobody answers the rename that gives it its name."""
+    """The vehicle does not answer the rename that gives the file its name."""
     if not here.renames:
         return
     file = await opened(tree, path)
