@@ -20,7 +20,7 @@ from mavftpfs.client.fetch import (
     local_disk,
     part_of,
 )
-from mavftpfs.client.files import Found, Session, walk
+from mavftpfs.client.files import Found, walk
 from mavftpfs.client.names import fixed_part, matching, matching_files
 from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.shared.errors import (
@@ -126,8 +126,8 @@ class Downloads:
                 plain = names == [path]
                 top = split(path)[0] if plain else fixed_part(path)
                 for name in names:
-                    place = Place(name, top, path if plain else top, local, into or not alone)
-                    found += await self._found(place, selection, recursive=recursive)
+                    place = Place(top, path if plain else top, local, into or not alone)
+                    found += await self._found(name, place, selection, recursive=recursive)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=alone)
         found = list(dict.fromkeys(found))
@@ -149,20 +149,33 @@ class Downloads:
             return True
         return False
 
-    async def _found(self, place: Place, selection: Selection, *, recursive: bool) -> list[Wanted]:
-        """Make the local directories for the files of a path, and return the files."""
-        session, path = self.fetcher.session, place.path
-        stat = await session.files.stat(path)
-        if stat.kind is EntryKind.FILE:
-            if not selection.takes(place.below_source(path)):
-                return []
-            return [wanted_file(path, place.of_file(), session.on_vehicle(path), stat)]
-        if not recursive:
-            raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
-        found, unlisted = await walk(session.files, path)
-        for unreadable, error in unlisted:
-            self.fail(unreadable, error)
-        return _made(session, place, found, selection)
+    async def _found(
+        self, path: bytes, place: Place, selection: Selection, *, recursive: bool
+    ) -> list[Wanted]:
+        """Return the wanted files of a path, and make the local directories that they need; without patterns
+        in `selection` also those that stay empty."""
+        session, stat = self.fetcher.session, await self.fetcher.session.files.stat(path)
+        found: Found = [(b"", stat)]
+        if stat.kind is EntryKind.DIRECTORY:
+            if not recursive:
+                raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
+            below, unlisted = await walk(session.files, path)
+            found += below
+            for unreadable, error in unlisted:
+                self.fail(unreadable, error)
+        wanted = []
+        for inner, one in found:
+            remote = join(path, inner) if inner else path
+            local = place.of(remote, alone=stat.kind is EntryKind.FILE)
+            with local_disk(local):
+                if one.kind is EntryKind.DIRECTORY:
+                    if not selection.by_name:
+                        local.mkdir(parents=True, exist_ok=True)
+                elif selection.takes(_below(remote, place.source) or split(remote)[1]):
+                    if local != place.local:
+                        local.parent.mkdir(parents=True, exist_ok=True)
+                    wanted.append(wanted_file(remote, local, session.on_vehicle(remote), one))
+        return wanted
 
     async def _matching(self, path: bytes, *, recursive: bool = False) -> list[bytes]:
         files = self.fetcher.session.files
@@ -227,30 +240,19 @@ class Downloads:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a path of the vehicle goes. `local` stands for the directory `top` above it; into: as a
-    directory, which is made. source: the directory or file that was asked for; for a pattern, `top`."""
+    """Where paths of the vehicle go. `local` stands for the directory `top`; into: as a directory, which is
+    made. source: the directory or file that was asked for; for a pattern, `top`."""
 
-    path: bytes
     top: bytes
     source: bytes
     local: Path
     into: bool
 
-    @property
-    def whole(self) -> Path:
-        """The local path, if `local` is a directory."""
-        return self.local / os.fsdecode(_below_top(self.path, self.top))
-
-    def below_source(self, path: bytes) -> bytes:
-        """Return the path of a file below the source, by which it is chosen."""
-        return _below_top(path, self.source) or split(path)[1]
-
-    def of_file(self) -> Path:
-        """Return where one file goes."""
-        if self.into:
-            with local_disk(self.local):
-                self.whole.parent.mkdir(parents=True, exist_ok=True)
-        return self.whole if self.local.is_dir() else self.local
+    def of(self, path: bytes, *, alone: bool) -> Path:
+        """Return where a path goes; alone: `local` may be the name of the file."""
+        if alone and not (self.into or self.local.is_dir()):
+            return self.local
+        return self.local / os.fsdecode(_below(path, self.top))
 
 
 def _require_apart(wanted: Iterable[Wanted]) -> None:
@@ -265,26 +267,8 @@ def _require_apart(wanted: Iterable[Wanted]) -> None:
         names[one.local] = one.name
 
 
-def _below_top(path: bytes, top: bytes) -> bytes:
+def _below(path: bytes, top: bytes) -> bytes:
     return path.removeprefix(top).lstrip(b"/")
-
-
-def _made(session: Session, place: Place, found: Found, selection: Selection) -> list[Wanted]:
-    """Make the directories below a directory, and return its files; if these are chosen by name, make only
-    the directories that they need."""
-    files, top = [], place.whole
-    with local_disk(top):
-        if not selection.by_name:
-            top.mkdir(parents=True, exist_ok=True)
-        for below, stat in found:
-            remote, local = join(place.path, below), top / os.fsdecode(below)
-            if stat.kind is EntryKind.DIRECTORY:
-                if not selection.by_name:
-                    local.mkdir(exist_ok=True)
-            elif selection.takes(place.below_source(remote)):
-                local.parent.mkdir(parents=True, exist_ok=True)
-                files.append(wanted_file(remote, local, session.on_vehicle(remote), stat))
-    return files
 
 
 def named(name: str, error: MavftpfsError) -> str:
