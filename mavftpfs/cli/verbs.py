@@ -1,4 +1,4 @@
-"""What each one-shot verb does with its words, and what it prints; `cli` parses them. Layer: cli."""
+"""The one-shot verbs: call the client with the parsed words, and print the result. Layer: cli."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mavftpfs sync --watch`: what it prints, and the command that it runs for each log. Layer: cli."""
+"""`mavftpfs sync --watch`: its lines for people, and its command for each log. Layer: cli."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mavftpfs.shared.readable import readable, readable_time
 EXEC_LIMIT = 600.0
 """Seconds for the command of --exec."""
 _LAST_WORDS = 1.0
-"""Seconds to read its last output, after it ended."""
+"""Seconds to read the command's last output, after it ended."""
 _KILL_AFTER = 5.0
 """Seconds between SIGTERM and SIGKILL."""
 
@@ -36,7 +36,7 @@ Work = Callable[[Target], Coroutine[Any, Any, None]]
 
 
 def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> int:
-    """Bring logs until SIGINT or SIGTERM; run: runs what is done with SOURCE.
+    """Download logs until SIGINT or SIGTERM; run: runs the work on SOURCE.
 
     Raises:
         UsageError: LOCAL or the options are wrong.
@@ -92,7 +92,7 @@ async def run_command(command: str, file: Path, *, limit: float) -> str:
 
 
 async def _pass_on(process: trio.Process) -> None:
-    """Print what a command says, above the progress."""
+    """Print the output of a command, above the progress."""
     assert process.stdout is not None
     rest = b""
     async for data in process.stdout:

@@ -35,11 +35,11 @@ from mavftpfs.shared.model import EntryKind, join, split
 from mavftpfs.shared.readable import name_text
 
 MAX_TIMEOUTS = 2
-"""A run ends after so many files in a row whose requests timed out: the others would time out, too."""
+"""Files in a row whose requests timed out, after which a run ends: the others would time out, too."""
 
 
 class Reports:
-    """What a run of downloads tells while it goes on; by itself nothing."""
+    """Receives the news of a run of downloads; this base class ignores them."""
 
     def begins(self, wanted: Wanted) -> None:
         """A file begins. An error of this call ends the run."""
@@ -108,13 +108,13 @@ class Downloads:
     ) -> None:
         """Fetch files, and with `recursive` directories; names may be patterns.
 
-        One file goes into `local` if that is a directory, else it gets that name. All else goes into `local`,
-        which is made. Files that match a pattern go there with their directories, from the first wildcard on.
-        The patterns of `selection` see the same paths below `local`.
+        A single file goes into `local` if that is a directory; otherwise it gets that name. Everything else
+        goes into `local`, which is made. Files that match a pattern keep their directories from the first
+        wildcard on. The patterns of `selection` see the same paths below `local`.
 
         Raises:
             UsageError: two files would get one local name. NotFound: `selection` takes no file. In both cases
-            nothing was fetched. Else as Fetcher.fetch where only one file is asked for, else as `sync`.
+            nothing was downloaded. For a single file as Fetcher.fetch, otherwise as `fetch_all`.
         """
         alone, refreshed = len(paths) == 1, self.fetcher.session.mountpoint is None
         found: list[Wanted] = []
@@ -138,8 +138,8 @@ class Downloads:
         await self.fetch_all(apart(found), alone=alone)
 
     async def _refreshed_for(self, path: bytes) -> bool:
-        """Have a mount ask the vehicle again if it does not know a path: the file may be newer than what the
-        mount listed before. Return whether the mount did."""
+        """Have a mount list again if it does not know a path: the file may be newer than its last listing.
+        Return whether the mount did."""
         files = self.fetcher.session.files
         try:
             if await matching(files, path) == [path]:
@@ -182,7 +182,7 @@ class Downloads:
         return await (matching(files, path) if recursive else matching_files(files, path, self.reports.says))
 
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
-        """Hand on the bytes of files, one behind the other.
+        """Pass on the bytes of files, one behind the other.
 
         Raises:
             As Fetcher.write_to where only one file is asked for; LinkError always.

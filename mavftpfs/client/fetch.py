@@ -45,7 +45,7 @@ from mavftpfs.shared.readable import name_text, readable_size
 LEAST_READ, LARGEST_READ = 2048, 128 * 1024
 """Bytes of one read."""
 QUICK, SLOW = 0.25, 1.0
-"""Seconds: a read that took less is followed by a larger one, one that took more by a smaller one."""
+"""Seconds: after a read that took less the next one is larger, after one that took more it is smaller."""
 
 EARLIEST = 946_684_800
 """2000-01-01 UTC: an earlier time tells people nothing."""
@@ -57,10 +57,10 @@ def known_time(mtime: int) -> int | None:
 
 
 def next_read_size(size: int, took: float) -> int:
-    """Return how much to read next, after `size` bytes took so many seconds.
+    """Return how many bytes to read next, after `size` bytes took so many seconds.
 
-    After each read the bytes are safe in the .part, and the screen shows them. On a radio that should be
-    about every second.
+    After each read the bytes are safe in the .part, and the screen shows them. On a radio a read should take
+    about a second.
     """
     if took < QUICK:
         return min(size * 2, LARGEST_READ)
@@ -69,7 +69,7 @@ def next_read_size(size: int, took: float) -> int:
 
 PART_SUFFIX = ".part"
 MAX_RETURNS = 20
-"""How often a vehicle may vanish and return while one file is fetched."""
+"""How often a vehicle may vanish and return during one download."""
 
 
 class LocalDiskFull(UsageError):
@@ -77,7 +77,7 @@ class LocalDiskFull(UsageError):
 
 
 class StillGrowing(MavftpfsError):
-    """The vehicle is writing the file; the bytes that came so far are kept as its .part.
+    """The vehicle is writing the file; the bytes that arrived so far stay as its .part.
 
     Attributes:
         came: the bytes that are here.
@@ -94,11 +94,11 @@ class NotProvenYet(MavftpfsError):
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
+    """A file to download. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
-    part: where it lies until it is whole. keep_old: a local file of that name may be the beginning of this
-    one; if it is not, it is renamed to NAME.~1~. growing: the vehicle still writes it: what it
-    has now stays a .part.
+    part: the local file that holds the bytes until all are here. keep_old: a local file of that name may be
+    the beginning of this one; if it is not, it is renamed to NAME.~1~. growing: the
+    vehicle still writes the file, so its present bytes stay a .part.
     """
 
     remote: bytes
@@ -117,7 +117,7 @@ class Wanted:
 
     @property
     def begun(self) -> int:
-        """Bytes from which the fetch can go on: of the .part, or of a local file that may be the
+        """Bytes from which the download can resume: of the .part, or of a local file that may be the
         beginning."""
         part = _size(self.part)
         if 0 < part <= self.size:
@@ -163,14 +163,14 @@ class Fetched:
 
 
 def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
-    """Return where a file lies until it is whole. finals: the final names of all files of the run."""
+    """Return the name of the .part of a file. finals: the final names of all files of the run."""
     part = local.with_name(local.name + PART_SUFFIX)
     return part if part not in finals else local.with_name(f"{local.name}.mavftpfs{PART_SUFFIX}")
 
 
 @contextmanager
 def local_disk(place: Path) -> Iterator[None]:
-    """Turn an error of the local disk into one of ours, which says so in a line."""
+    """Turn an error of the local disk into a UsageError with a line for people."""
     try:
         yield
     except OSError as exc:
@@ -210,14 +210,14 @@ class Part:
         self._file.truncate(size)
 
     def append(self, data: bytes | memoryview) -> None:
-        """Add bytes; they are in the file when this returns, so that nothing is lost by a kill."""
+        """Add bytes. They are in the file when this returns, so that a kill loses nothing."""
         self._file.seek(0, os.SEEK_END)
         self._file.write(data)
         self._file.flush()
 
     def commit(self, mtime: int | None, *, keep_old: bool) -> Path | None:
-        """Give the file its name, once it is on the disk; return the new name of another file that had it.
-        mtime: None for the present time."""
+        """Sync the .part to the disk, and give it its final name; return the new name of another file that
+        had that one. mtime: None for the present time."""
         kept: Path | None = None
         os.fsync(self._file.fileno())
         if mtime is not None:
@@ -261,7 +261,7 @@ Take = Callable[[bytes | memoryview], Awaitable[None]]
 
 @dataclass(frozen=True, slots=True)
 class Fetcher:
-    """Fetches files of one session, one after the other."""
+    """Downloads files of one session, one after the other."""
 
     session: Session
     progress: Progress

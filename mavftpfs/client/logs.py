@@ -34,7 +34,7 @@ class Wish:
 
 
 class Record(Protocol):
-    """What is known of the logs that were downloaded before."""
+    """The logs that earlier runs downloaded."""
 
     async def missing(self, session: Session, logs: Sequence[Wanted]) -> list[Wanted]:
         """Return the logs to download or to verify now."""

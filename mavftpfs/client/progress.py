@@ -1,6 +1,6 @@
 """The progress of transfers, as numbers. Layer: client.
 
-Only safe bytes are counted: bytes that came, or bytes that the vehicle acknowledged.
+Only safe bytes count: those that arrived here, or that the vehicle acknowledged.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from mavftpfs.shared.speed import Speed
 
 
 class Progress:
-    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is. untouched: under the name of
-    the file that is being sent the vehicle has what it had."""
+    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is lost. untouched: the name of
+    the file that is being sent still has its old content on the vehicle."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -49,7 +49,7 @@ class Progress:
         self.size = max(self.size, here)
 
     def check(self) -> None:
-        """Note that all bytes moved, and are being compared."""
+        """Note that all bytes moved, and that the vehicle is asked for the checksum."""
         self.state = "checking"
 
     def end(self, planned: int) -> None:

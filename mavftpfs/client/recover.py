@@ -1,6 +1,6 @@
-"""Puts files that did not reach a vehicle where they belonged. Layer: client; prints nothing.
+"""Puts files that did not reach a vehicle back to their places there. Layer: client; prints nothing.
 
-Nothing is put back by itself, because the file on the vehicle may have changed since. Nothing is put on
+Only the user starts this, because the file on the vehicle may have changed since. `recover` puts nothing on
 another vehicle, or over a file that was changed since: `mavftpfs put` does that.
 """
 
@@ -35,15 +35,15 @@ async def put_back(
     progress: Progress,
     tell: Callable[[Recovered, bool], None],
 ) -> list[Recovered]:
-    """Put files where they belonged. Once it is proven that the vehicle has a file, the copy here is removed.
+    """Put files back. Remove the local copy of each file that is proven to be on the vehicle.
 
     tell: called for each file, with whether it was there already.
 
-    Returns those of other vehicles, which stay here.
+    Returns the files of other vehicles, which stay here.
 
     Raises:
         UsageError: one of them cannot be put back, and the text says why; the others were put back.
-        NotDelivered: it did not arrive.
+        NotDelivered: a file did not reach the vehicle.
     """
     others = await _of_others(session, wanted)
     hindered = [copy for copy in wanted if copy not in others and copy.hindrance]
@@ -88,7 +88,7 @@ async def _is_there(session: Session, path: bytes, copy: Recovered) -> bool:
     """Return whether the vehicle has the file with exactly these bytes.
 
     Raises:
-        UsageError: it has another file than the one that was to be replaced.
+        UsageError: the vehicle has another file than the one that was to be replaced.
     """
     try:
         found = await session.files.stat(path)

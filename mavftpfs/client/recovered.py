@@ -1,4 +1,4 @@
-"""The files below `recovered`: what did not reach a vehicle. Layer: client; prints nothing.
+"""The files below `recovered`, which did not reach a vehicle. Layer: client; prints nothing.
 
 A mount that ends with undelivered files moves them there, with a `NAME.json` beside each file
 (cache.recovery). The next mount moves there what a killed mount held.
@@ -22,7 +22,7 @@ from mavftpfs.shared.model import normalise
 class Recovered:
     """The copy here of a file that did not reach the vehicle.
 
-    facts: what was written down about it, as JSON holds it.
+    facts: the description that lies beside it as JSON.
     """
 
     file: Path
@@ -30,7 +30,7 @@ class Recovered:
 
     @property
     def path(self) -> bytes | None:
-        """Where it belongs on the vehicle, None if that was not written down."""
+        """Its path on the vehicle, None if the description does not tell that."""
         path = self.facts.get("path")
         return normalise(os.fsencode(path)) if isinstance(path, str) and path else None
 
@@ -41,15 +41,15 @@ class Recovered:
 
     @property
     def vehicle(self) -> str:
-        """The vehicle it is of, for people; "" if that was not written down."""
+        """Its vehicle, for people; "" if the description does not tell that."""
         system, uid = self.facts.get("system"), self.facts.get("uid")
         if system is None:
             return ""
         return f"vehicle {system} (id {uid})" if uid else f"vehicle {system}"
 
     def is_of_another(self, vehicle: Mapping[str, Any]) -> bool:
-        """Return whether it is of another vehicle than this one (as in `status --json`). False if one of them
-        has no unique id.
+        """Return whether the file is of another vehicle than this one (as in `status --json`). False if one
+        of them has no unique id.
 
         A board may have a long id and a short one, and only the short one goes over MAVLink 1. After one of
         them the other counts as another board's.
@@ -59,7 +59,7 @@ class Recovered:
 
     @property
     def hindrance(self) -> str:
-        """Why we cannot put it back, or ""."""
+        """Why `recover` cannot put the file back, or ""."""
         if self.path is None:
             return "where it belongs was not written down"
         if "whole" not in self.facts:
@@ -108,7 +108,7 @@ def _is_description(path: Path) -> bool:
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
-    """Return what was written down; {} if that is damaged."""
+    """Return the content of a description; {} if it is damaged."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):

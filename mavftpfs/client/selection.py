@@ -1,4 +1,4 @@
-"""Which of the vehicle's files are wanted: by pattern, by time, the newest N. Layer: client; silent."""
+"""Selects files of the vehicle: by pattern, by time, the newest N. Layer: client; silent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.readable import readable_size
 
 NO_LOG = b"LASTLOG.TXT"
-"""ArduPilot keeps the number of its last log in this file. It is no log."""
+"""The file in which ArduPilot keeps the number of its last log."""
 
 _DATE = re.compile(rb"(?<!\d)(20\d\d)-(\d\d)-(\d\d)(?:[/_T -](\d\d)[_:.-](\d\d)[_:.-](\d\d))?(?!\d)")
 _DAY_END = (23, 59, 59)
@@ -51,7 +51,7 @@ class Selection:
     def of_logs(self, logs: Iterable[Wanted]) -> list[Wanted]:
         """Return the logs that are young enough, the newest first.
 
-        A log is left out by `since` only if its time is known: another one may be new.
+        `since` leaves a log out only if the time of the log is known: another one may be new.
         """
         young = [log for log in newest_first(logs) if not self._is_older(log)]
         return young if self.newest is None else young[: self.newest]
