@@ -38,6 +38,8 @@ TICK = 0.25
 """Seconds between two looks at what was heard: a vehicle that is armed gets no request a second later."""
 REOPEN = 5.0
 """Seconds until a link that cannot be opened is tried again."""
+SILENCE = 3600.0
+"""Seconds after which the watch prints a line although nothing happened."""
 SPARE = 1 << 20
 """Bytes that are left free on the local disk; they count as needed."""
 
@@ -66,13 +68,18 @@ class Watch:
     ) -> None:
         self._wish = wish
         self._verify: Verify = verify
-        self._complaints = Complaints(say)
-        self._say = say
+        self._print = say
+        self._said_at = trio.current_time()
+        self._complaints = Complaints(self._say)
         self._progress = progress or Progress()
         self._policies: dict[int, Policy] = {}
         self._sync: VehicleSync | None = None
         self._turn = 0
-        self.keeping = Keeping(wish.local, say, hand_on)
+        self.keeping = Keeping(wish.local, self._say, hand_on)
+
+    def _say(self, line: str) -> None:
+        self._said_at = trio.current_time()
+        self._print(line)
 
     # --- the way to the vehicles
 
@@ -96,6 +103,7 @@ class Watch:
                             await self.serve(contact)
                 except (LinkError, RequestTimeout) as exc:
                     self._complaints.tell("link", str(exc))
+                self._break_silence()
                 await trio.sleep(REOPEN)
 
     async def _run_on_link(self, target: Target) -> None:
@@ -141,6 +149,7 @@ class Watch:
             while not contact.replaced:
                 self._hear(await contact.listen())
                 self._forget_another(contact)
+                self._break_silence()
                 now = trio.current_time()
                 running: VehicleSync | None = self._sync
                 if running is not None and (running.over or not running.policy.may_transfer(now)):
@@ -203,6 +212,12 @@ class Watch:
         for system, policy in self._policies.items():
             if policy.newly_lost(now):
                 self._tell_of(system, "is lost", now)
+
+    def _break_silence(self) -> None:
+        """Tell from time to time that the watch is alive, and which vehicles are here."""
+        if trio.current_time() - self._said_at >= SILENCE:
+            here = [f"vehicle {system} is {policy.state}" for system, policy in self._policies.items()]
+            self._say(f"nothing new for an hour; {', '.join(here) or 'no vehicle was heard'}")
 
     def _tell_of(self, system: int, news: str, now: float) -> None:
         transfers = self._sync is not None and self._sync.system == system and bool(self._progress.name)

@@ -100,6 +100,11 @@ class Policy:
 
     # --- what the watch does
 
+    @property
+    def state(self) -> str:
+        """The state of the vehicle, in a word."""
+        return "lost" if self._lost else "armed" if self._armed else "disarmed"
+
     def may_transfer(self, now: float) -> bool:
         """Return whether the watch may ask the vehicle for something; if not, it cancels a sync."""
         return not self._lost and self._armed is False and now >= self._paused_until

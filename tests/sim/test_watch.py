@@ -496,6 +496,20 @@ async def test_a_vehicle_that_is_armed_while_its_files_are_opened_is_not_asked(t
     assert said == ["vehicle 1 is here, disarmed", "vehicle 1 is armed"]
 
 
+async def test_a_line_an_hour_tells_that_the_watch_is_alive(tmp_path: Path) -> None:
+    said: list[str] = []
+    contact = ArmsWhileEntered()
+    contact._news = [Heard(1, armed=True)]
+    watch = Watch(Wish(tmp_path), said.append)
+    with trio.move_on_after(3 * 3600.0):
+        await watch.serve(contact)
+    assert said == [
+        "vehicle 1 is here, armed",
+        "vehicle 1 is lost",
+        *["nothing new for an hour; vehicle 1 is lost"] * 2,
+    ]
+
+
 async def test_a_mount_tells_of_arming_restarts_and_refusals(tmp_path: Path) -> None:
     vehicle = {"system": 1, "uid": "a", "armed": False, "restarts": 3, "arming_refused": 2}
     link = {"state": "fine"}
