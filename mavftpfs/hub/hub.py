@@ -28,11 +28,10 @@ from mavftpfs.link.frames import Frame
 from mavftpfs.link.hublink import (
     PROTOCOL,
     Facts,
+    HubLink,
     hear,
-    pack_frames,
     set_buffers,
     tell,
-    unpack_frames,
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
@@ -54,8 +53,6 @@ _DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or fr
 _POLL = 0.003
 _LOOK = 1.0
 _RETRY = 2.0
-_MESSAGES = 64
-_LARGEST = 65536
 _COMPONENTS = 249
 """Our component ids are 1 to 249: each is a program's own, and none is a router's."""
 _LEAST_OUTBOX = 4096
@@ -72,25 +69,15 @@ Sent: TypeAlias = tuple[Place, Frame, NetAddress | None]
 
 @dataclass(slots=True)
 class _Client:
-    """A program of ours. number: the link id of its signatures. forward: the endpoints that it asked for."""
+    """A program that shares the port. number: the link id of its signatures. forward: the endpoints that it
+    asked for. Its link loses what its socket has no room for, as a port of its own would."""
 
     side: int
-    sock: socket.socket
+    link: HubLink
     own: Address
     number: int
     name: str
     forward: tuple[str, ...]
-
-    def send(self, frames: Sequence[bytes], origin: NetAddress | None = None) -> None:
-        """Send frames that came from an address of the port; none mean that the port was reopened. The client
-        loses those for which its socket is full, as on a port of its own."""
-        for message in pack_frames(frames, origin):
-            try:
-                self.sock.send(message)
-            except BlockingIOError:
-                pass
-            except OSError:
-                return  # its own task notices
 
 
 @dataclass(slots=True)
@@ -205,7 +192,7 @@ class Hub:
             return None
         tell(sock, {"own": client.own, "number": client.number})
         self.router.add(client.side, Kind.CLIENT, focus=BEATS if hello.get("beats") else ALL)
-        log.info("%s joined as %d/%d", client.name or "a client", *client.own)
+        log.info("%s joined as %d/%d", client.link.description, *client.own)
         return client
 
     def _admitted(self, sock: socket.socket, hello: Facts) -> _Client:
@@ -228,7 +215,8 @@ class Hub:
             raise LinkClosed(_OTHERS.format(spec.description))
         own, number = self._granted(Address(*map(int, hello["own"])), hello.get("number"))
         forward = tuple(map(str, hello.get("forward", ())))
-        client = _Client(next(self._sides), sock, own, number, str(hello.get("name", "")), forward)
+        name = str(hello.get("name", ""))
+        client = _Client(next(self._sides), HubLink(sock, name or "a client"), own, number, name, forward)
         self._clients[client.side] = client
         return client
 
@@ -258,28 +246,11 @@ class Hub:
     async def _serve(self, client: _Client) -> None:
         """Pass on what comes from a client until it leaves."""
         try:
-            with suppress(OSError):  # it was killed
-                await self._read_client(client)
+            with suppress(LinkClosed):
+                await self._read(client.side, client.link)
         finally:
             self._forget(client)
-            log.info("%s left", client.name or "a client")
-
-    async def _read_client(self, client: _Client) -> None:
-        inlet = Inlet(client.side, stream=False)
-        while True:
-            await trio.lowlevel.wait_readable(client.sock)
-            frames: list[Sent] = []
-            for _ in range(_MESSAGES):
-                try:
-                    message = client.sock.recv(_LARGEST)
-                except BlockingIOError:
-                    break
-                if not message:
-                    self._pass_on(frames)
-                    return
-                data, to = unpack_frames(message)
-                frames += [(place, frame, to) for place, frame in inlet.feed(data, None)]
-            self._pass_on(frames)
+            log.info("%s left", client.link.description)
 
     # -- endpoints
 
@@ -332,22 +303,32 @@ class Hub:
     # -- frames
 
     async def _read(self, side: int, link: Link) -> None:
-        """Pass on what comes from the port or an endpoint."""
+        """Pass on what comes from one side.
+
+        Raises:
+            LinkClosed: the other end is gone.
+        """
         inlet = Inlet(side, stream=link.is_stream)
+        names_target = side in self._clients
         address: NetAddress | None = None
         while True:
-            found: list[tuple[Place, Frame]] = []
+            found: list[Sent] = []
             with trio.move_on_after(QUIET if inlet.waiting else float("inf")) as scope:
                 for data, address in await link.receive():
-                    if data:
-                        found += inlet.feed(data, address)
-                        continue
-                    inlet.reset()
-                    for client in self._clients.values() if side == PORT else ():
-                        client.send(())
+                    if not data:
+                        inlet.reset()
+                        self._tell_reopened(side)
+                    elif names_target:
+                        found += [(place, frame, address) for place, frame in inlet.feed(data, None)]
+                    else:
+                        found += [(place, frame, None) for place, frame in inlet.feed(data, address)]
             if scope.cancelled_caught:
-                found = inlet.on_silence(address)
-            self._pass_on([(place, frame, None) for place, frame in found])
+                found = [(place, frame, None) for place, frame in inlet.on_silence(address)]
+            self._pass_on(found)
+
+    def _tell_reopened(self, side: int) -> None:
+        for client in self._clients.values() if side == PORT else ():
+            client.link.send(())
 
     def _pass_on(self, frames: Sequence[Sent]) -> None:
         """Route frames that came together, and send each destination its share at once."""
@@ -370,7 +351,7 @@ class Hub:
     def _deliver(self, target: Place, origin: NetAddress | None, frames: Sequence[bytes]) -> None:
         client = self._clients.get(target.side)
         if client is not None:
-            client.send(frames, origin)
+            client.link.send(frames, origin)
         for endpoint in self._endpoints.values():
             if endpoint.side == target.side and endpoint.link is not None:
                 endpoint.link.send(frames, target.address)

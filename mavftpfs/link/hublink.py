@@ -22,7 +22,7 @@ from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import Piece, PipeLink, Seat
 from mavftpfs.link.messages import Address
 from mavftpfs.link.ports import Busy, peer_of
-from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.link.uri import LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
 PROTOCOL = 3
@@ -127,16 +127,16 @@ class Wish:
 
 
 class HubLink(PipeLink):
-    """Implements link.base.Link by a hub, until that is gone. Made by `join`; run `run` beside it."""
+    """Implements link.base.Link between a program and the hub, at either end, until the other end is gone.
+    Run `run` beside it, unless it keeps nothing. Programs get it from `join`."""
 
-    def __init__(self, sock: socket.socket, spec: LinkSpec, welcome: Facts) -> None:
-        super().__init__(spec.description, sock, _OUTBOX_LIMIT)
-        self.is_serial = spec.kind is LinkKind.SERIAL
-        self.seat = Seat(Address(*welcome["own"]), welcome["number"])
+    def __init__(self, sock: socket.socket, description: str, outbox_limit: int = 0) -> None:
+        super().__init__(description, sock, outbox_limit)
         self._sock = sock
 
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
-        """Hand frames to the hub; drop and count what cannot be kept."""
+        """Hand frames to the other end; drop and count what cannot be kept. From the hub, `to` is where they
+        came from, and no frames mean that the port was reopened."""
         for message in pack_frames(frames, to):
             if self._outbox or not self._write(message, None):
                 self._keep(message)
@@ -162,7 +162,7 @@ class HubLink(PipeLink):
             self._sock.send(data)
         except BlockingIOError:
             return 0
-        except OSError:  # the hub is gone, as the receiver notices
+        except OSError:  # the other end is gone, as the receiver notices
             self.stats.dropped_sends += 1
             return len(data)
         self.stats.writes += 1
@@ -208,7 +208,9 @@ async def join(
             raise Refused(str(reply["refused"]))
         if "own" not in reply:
             raise Busy(f"{spec.description}: the program that had this port ended")
-        return HubLink(sock, spec, reply)
+        link = HubLink(sock, spec.description, _OUTBOX_LIMIT)
+        link.seat = Seat(Address(*reply["own"]), reply["number"])
+        return link
     except BaseException:
         sock.close()
         raise

@@ -218,7 +218,7 @@ async def test_only_the_same_port_is_shared(autojump_clock: trio.testing.MockClo
 async def test_frames_from_made_up_addresses_take_no_memory() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     set_buffers(ours)
-    link = HubLink(ours, parse_source(f"udpin:{HOST}:14550"), {"own": US, "number": 0})
+    link = HubLink(ours, f"udpin:{HOST}:14550")
     tracemalloc.start()
     try:
         for turn in range(3000):
@@ -238,7 +238,7 @@ async def test_frames_from_made_up_addresses_take_no_memory() -> None:
 async def test_that_the_port_was_reopened_is_told_between_what_came_before_and_after() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     set_buffers(ours)
-    link = HubLink(ours, parse_source(f"udpin:{HOST}:14550"), {"own": US, "number": 0})
+    link = HubLink(ours, f"udpin:{HOST}:14550")
     with theirs:
         for message in (*pack_frames([b"1"]), *pack_frames([]), *pack_frames([b"2"])):
             theirs.send(message)
