@@ -221,7 +221,7 @@ def _umount_unasked(place: str, *, lazy: bool) -> int:
 
 
 class _Delivery:
-    """What a mount that ends waits for. show: shows a line in place of the last one."""
+    """The progress of a mount that ends. show: shows a line in place of the last one."""
 
     def __init__(self, socket: Path, show: Callable[[str], None]) -> None:
         self._socket = socket

@@ -63,7 +63,7 @@ class DemoFailed(Exception):
 
 @dataclass
 class Tour:
-    """What the steps share. `proofs`: one entry for each comparison that was made."""
+    """State that the steps share. `proofs`: one entry for each comparison that was made."""
 
     console: Console
     folder: Path
@@ -71,7 +71,7 @@ class Tour:
 
     @property
     def card(self) -> Path:
-        """What lies on the vehicle's memory card."""
+        """Content of the vehicle's memory card."""
         return self.folder / "card"
 
     @property

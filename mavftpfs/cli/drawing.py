@@ -1,4 +1,4 @@
-"""What is drawn on a terminal: progress, the status, a line that changes. Layer: cli; all of it by rich.
+"""Drawing on a terminal: progress, the status, a line that changes. Layer: cli; all of it by rich.
 
 rich takes a tenth of a second to import, so each function imports what it draws with.
 """

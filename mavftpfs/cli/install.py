@@ -28,7 +28,7 @@ from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 HELPER = "mount.mavftpfs"
-"""What mount(8) runs for `-t mavftpfs`."""
+"""The program that mount(8) runs for `-t mavftpfs`."""
 MAN_WIDTH = 72
 """Columns of what a man page shows as it is."""
 

@@ -28,7 +28,7 @@ Parser = Callable[[str], Any]
 
 
 class Type(NamedTuple):
-    """What values an option takes. written: returns a value as `parse` takes it.
+    """Type of an option's values. written: returns a value as `parse` takes it.
 
     words: the only texts that are values, if there are few. is_file: values are paths on this computer.
     """

@@ -1,4 +1,4 @@
-"""What is on a link, and which components serve files. Layer: client; prints nothing."""
+"""Components on a link, and which of them serve files. Layer: client; prints nothing."""
 
 from __future__ import annotations
 

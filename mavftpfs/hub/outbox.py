@@ -1,4 +1,4 @@
-"""What waits to go out over the port, and which frame is next. Layer: hub; pure.
+"""The queue of frames for the port, and which one is next. Layer: hub; pure.
 
 Each side has a queue, and the sides take turns: a frame of a ground station waits for one frame of each other
 side, whatever is queued there. On a serial port no more is handed to the kernel than the line carries in

@@ -32,7 +32,7 @@ _MOST_PLANS = 4096
 
 
 class Kind(Enum):
-    """What a side is."""
+    """Kind of a side."""
 
     PORT = "port"
     ENDPOINT = "endpoint"

@@ -45,7 +45,7 @@ class Place(NamedTuple):
 
 
 class Belief(Enum):
-    """What a frame is, by its sender and the place that it comes from."""
+    """Verdict on a frame, by its sender and the place that it comes from."""
 
     KNOWN = "believed"
     NEW = "believed, and its sender is at a new place"

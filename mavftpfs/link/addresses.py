@@ -18,7 +18,7 @@ PATIENCE = 5.0
 _MOST_SENDERS = 256
 
 NetAddress: TypeAlias = tuple[Any, ...]
-"""What a socket calls its peer: host, port, and more for IPv6. A TCP peer is known by its host alone."""
+"""A socket's name for its peer: host, port, and more for IPv6. A TCP peer is known by its host alone."""
 
 
 @dataclass(slots=True)

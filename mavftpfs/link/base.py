@@ -1,4 +1,4 @@
-"""What a link is to the layers above, and what links over a descriptor have in common. Layer: link.
+"""The interface of links, and the base of links over a descriptor. Layer: link.
 
 A link moves bytes and does not interpret them. When a peer goes away and comes back, the link reopens by
 itself and says so. LinkClosed means that it will never work again.
@@ -23,7 +23,7 @@ MAX_DATAGRAM = 1400
 """Bytes: below any usual MTU, and far below PX4's receive buffer (31 frames in one datagram were cut)."""
 
 Piece: TypeAlias = tuple[bytes, NetAddress | None]
-"""What arrived together, and the address that sent it; None where there is only one sender."""
+"""Bytes that arrived together, and the address that sent them; None where there is only one sender."""
 
 REOPENED: Piece = (b"", None)
 """The piece that says: the link was reopened, so the rest of a half-received frame does not come."""

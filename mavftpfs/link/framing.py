@@ -91,7 +91,7 @@ def is_known(message_id: int) -> bool:
 
 
 class Verdict(Enum):
-    """What begins at a place in what was received."""
+    """Verdict on the bytes at one place."""
 
     WHOLE = "whole"  # a frame whose CRC fits, or that no CRC is known for
     DAMAGED = "damaged"  # it has a frame's bounds, and another CRC

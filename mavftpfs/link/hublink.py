@@ -112,8 +112,8 @@ def set_buffers(sock: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What a program wants of a port: the address that it would like, the endpoints for `forward=`, its name
-    for people. beats: it wants only heartbeats."""
+    """A program's wishes for a port: the address that it would like, the endpoints for `forward=`, its name
+    for people. beats: the program wants only heartbeats."""
 
     own: Address
     forward: tuple[str, ...] = ()
@@ -122,7 +122,7 @@ class Wish:
 
     @property
     def needs_hub(self) -> bool:
-        """Whether it wants what only a hub does, even if no other program wants the port."""
+        """Whether only a hub can do that, even if no other program wants the port."""
         return self.beats or bool(self.forward)
 
 

@@ -1,4 +1,4 @@
-"""What the framing understands of MAVLink, as plain values. Layer: link; pure, no pymavlink.
+"""MAVLink messages that the framing understands, as plain values. Layer: link; pure, no pymavlink.
 
 Every other message is `Other`: traced, never an error.
 """
@@ -132,7 +132,7 @@ class StatusText:
 
     @property
     def refuses_to_arm(self) -> bool:
-        """Whether it says that the vehicle refuses to be armed."""
+        """Whether the text says that the vehicle refuses to be armed."""
         return self.text.startswith(_DENIALS)
 
 

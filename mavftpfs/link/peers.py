@@ -1,4 +1,4 @@
-"""What a heartbeat says of its sender, in words. Layer: link; pure."""
+"""Words for the sender of a heartbeat. Layer: link; pure."""
 
 from __future__ import annotations
 

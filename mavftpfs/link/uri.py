@@ -1,4 +1,4 @@
-"""What SOURCE means, and why a link could not be opened. Layer: link; pure.
+"""SOURCE parsed, and the reasons why a link could not be opened. Layer: link; pure.
 
     udpin:0.0.0.0:14550  udp:...  udpout:host:port  tcp:host:port  tcpin:host:port  /dev/ttyUSB0,57600
     udpin://0.0.0.0:14550  udpout://  tcp://  tcpout://  tcpin://  serial:///dev/ttyUSB0:57600
@@ -40,7 +40,7 @@ class LinkKind(Enum):
 
     @property
     def is_udp(self) -> bool:
-        """Whether it carries datagrams; all others are streams."""
+        """Whether the link carries datagrams; all others are streams."""
         return self in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
 
 
