@@ -102,7 +102,7 @@ async def run_hub(spec: LinkSpec) -> None:
     name = port_name(spec)
     first = call(name, spec)
     if first is None:
-        return  # the program that started us ended
+        return  # the program that started the hub ended
     with first:
         set_buffers(first)
         tell(first, {"protocol": PROTOCOL, "hub": os.getpid()})

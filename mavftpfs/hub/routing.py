@@ -1,7 +1,7 @@
 """Where each frame goes. Layer: hub; pure.
 
 Frames come from *sides* and go to sides: the port that SOURCE names, endpoints, and clients, which are
-programs of ours. Only a frame that `senders` believes goes anywhere.
+mavftpfs programs. Only a frame that `senders` believes goes anywhere.
 
 - A frame with a target goes where the target is. A frame for all, or for a target that was never heard, goes
   to all places of the port and of the endpoints. No frame goes to a side where its sender is.

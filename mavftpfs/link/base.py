@@ -53,7 +53,7 @@ class Link(Protocol):
     """A byte or datagram pipe.
 
     Attributes:
-        seat: the place on a shared port, None on a port of our own. It may change when the link is reopened.
+        seat: the place on a shared port, None on another one. It may change when the link is reopened.
     """
 
     stats: LinkStats

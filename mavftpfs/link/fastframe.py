@@ -50,7 +50,7 @@ def _empty_body(seq: int, route: bytes) -> bytes:
 
 
 class FtpFrameCodec:
-    """Builds and parses frames of message 110; `source` is our address and may be changed."""
+    """Builds and parses frames of message 110; `source`, this program's address, may be changed."""
 
     def __init__(self, source: Address, crc_extra: int) -> None:
         self.source = source

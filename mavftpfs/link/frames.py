@@ -1,7 +1,7 @@
 """Whole frames and what their headers say, for programs that pass them on. Layer: link; pure.
 
 A frame is passed on as it came, byte for byte. What is read of it: its bounds, its sender, its target and its
-kind. Frames of other dialects have a CRC that cannot be checked, or that is wrong by ours. They pass, but
+kind. Frames of other dialects have a CRC that cannot be checked, or looks wrong. They pass, but
 nothing is learned from them: rubbish looks the same.
 """
 

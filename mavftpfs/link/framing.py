@@ -205,11 +205,11 @@ class Framer(FrameBuffer[Message]):
     """Both directions of one connection.
 
     Args:
-        source: our address in the frames we send.
+        source: the address of this program in the frames that it sends.
         stream: whether `feed` gets pieces of a stream instead of datagrams.
         signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
-            or the vehicle refuses us.
+            or the vehicle refuses the frames.
         on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
     """
 
@@ -236,7 +236,7 @@ class Framer(FrameBuffer[Message]):
 
     @property
     def source(self) -> Address:
-        """Our address in the frames we send; may be changed."""
+        """The address of this program in the frames that it sends; may be changed."""
         return Address(self._sender.srcSystem, self._sender.srcComponent)
 
     @source.setter
@@ -246,7 +246,7 @@ class Framer(FrameBuffer[Message]):
 
     @property
     def link_id(self) -> int:
-        """The link id in the signatures that we send, 0 to 255; may be changed."""
+        """The link id in the signatures of sent frames, 0 to 255; may be changed."""
         return int(self._sender.signing.link_id)
 
     @link_id.setter

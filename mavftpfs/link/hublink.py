@@ -171,7 +171,7 @@ class HubLink(PipeLink):
 
 
 class Refused(LinkClosed):
-    """The hub does not take us; the text says why."""
+    """The hub refuses a program; the text says why."""
 
 
 async def join(
@@ -179,7 +179,7 @@ async def join(
 ) -> HubLink:
     """Ask the program at the other end of a socket to be let in, and return the link once that is a hub.
 
-    seat: what we had until now. again: we had the port before, so the endpoints may take their time.
+    seat: the one until now. again: this program had the link before, so the endpoints may take their time.
 
     Raises:
         Refused: and why.

@@ -47,8 +47,11 @@ class Peer(NamedTuple):
 
 
 def port_name(spec: LinkSpec) -> str:
-    """Return the name of a port, the same for two SOURCEs that exclude each other. What connects to somewhere
-    excludes nobody, but a server may have a single client: so all programs of a user share it."""
+    """Return the name of a port, the same for two SOURCEs that exclude each other.
+
+    `tcp` and `udpout` exclude nobody, but all programs of a user share them, because a server may have a
+    single client.
+    """
     if spec.kind is LinkKind.SERIAL:
         text = f"serial {os.path.realpath(spec.device)}"
     elif spec.kind.listens:
@@ -59,8 +62,8 @@ def port_name(spec: LinkSpec) -> str:
 
 
 def source_port(spec: LinkSpec) -> int:
-    """Return the port from which all our programs send to one address: PX4 answers only the first that it
-    heard (servers.md 5)."""
+    """Return the port from which all mavftpfs programs send to one address, because PX4 answers only the
+    first address that it heard (servers.md 5)."""
     return _FIRST_SOURCE_PORT + int(port_name(spec).removeprefix("\0" + _PREFIX), 16) % _SOURCE_PORTS
 
 
@@ -117,7 +120,7 @@ def call(name: str, spec: LinkSpec) -> socket.socket | None:
 
 
 async def next_caller(sock: socket.socket) -> socket.socket:
-    """Return the next connection to a name that we have."""
+    """Return the next connection to a name that this program has."""
     while True:
         await trio.lowlevel.wait_readable(sock)
         try:
@@ -127,7 +130,7 @@ async def next_caller(sock: socket.socket) -> socket.socket:
 
 
 def names_in_use() -> list[str]:
-    """Return the names of all ports of this network namespace that programs of ours have."""
+    """Return the names of all ports of this network namespace that mavftpfs programs have."""
     return sorted({"\0" + found for found in re.findall(rf"@({_PREFIX}\w+)", _NAMES.read_text())})
 
 

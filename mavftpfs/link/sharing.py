@@ -30,7 +30,7 @@ from mavftpfs.shared.errors import LinkClosed
 log = logging.getLogger("mavftpfs.link")
 
 PATIENCE = 20.0
-"""Seconds for programs of ours that have the port to end, or to share it."""
+"""Seconds for the mavftpfs program that has the port to end, or to share it."""
 GRACE = 0.5
 """Seconds for a program that was killed to let go of its port."""
 HELLO_PATIENCE = 1.0
@@ -101,7 +101,7 @@ class SharedLink:
 
         Raises:
             Busy: another program has just taken the name.
-            LinkClosed: the port cannot be opened, or we need a hub and it does not start.
+            LinkClosed: the port cannot be opened, or this program needs a hub and that does not start.
         """
         name = ports.take_name(self._name)
         if name is None:
@@ -116,7 +116,7 @@ class SharedLink:
             return hub
 
     async def _hub_that_comes(self, name: socket.socket) -> socket.socket:
-        """Return the connection of the hub that comes for our port; start it when another program calls."""
+        """Return the connection of the hub that comes for the port; start it when another program calls."""
         while True:
             caller, request = await _next_call(name)
             if _is_hub(caller, request):
@@ -214,7 +214,7 @@ def _may_pass(problem: LinkClosed, waited: float) -> bool:
 
 
 async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:
-    """Return the next connection to our port's name, and what it wants."""
+    """Return the next connection to the port's name, and its request."""
     caller = await ports.next_caller(name)
     try:
         caller.setblocking(False)
@@ -225,13 +225,13 @@ async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:
 
 
 def _is_hub(caller: socket.socket, request: Facts) -> bool:
-    """Return whether the hub calls: one of this user, since it gets our port."""
+    """Return whether the hub calls: one of this user, since it gets the port."""
     return "hub" in request and ports.peer_of(caller).uid == os.getuid()
 
 
 @asynccontextmanager
 async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
-    """Open the link that a SOURCE names, alone or with other programs of ours, for the length of the body.
+    """Open the link that a SOURCE names, alone or with other mavftpfs programs, for the length of the body.
 
     Raises:
         LinkClosed: it cannot be opened; the text is one line that says what to do.
@@ -272,7 +272,7 @@ def own_environment() -> dict[str, str]:
 
 
 async def start_hub(spec: LinkSpec) -> None:
-    """Start a hub, which then calls the program that has the port: us. Return when it runs.
+    """Start a hub, which then calls this program, because it has the port. Return when the hub runs.
 
     Raises:
         LinkClosed: and why it does not.

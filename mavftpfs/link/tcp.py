@@ -53,7 +53,7 @@ async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
     """Listen. The link is usable at once, and drops what is sent before a peer connects.
 
     Raises:
-        LinkClosed: the port is taken or the address is not ours.
+        LinkClosed: the port is taken, or this computer does not have the address.
     """
     try:
         listener = await _listen(spec)

@@ -35,7 +35,7 @@ class LinkKind(Enum):
 
     @property
     def listens(self) -> bool:
-        """Whether the other end comes to us."""
+        """Whether this end waits for the other one to begin."""
         return self in (LinkKind.UDP_IN, LinkKind.TCP_IN)
 
     @property
