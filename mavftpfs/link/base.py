@@ -50,7 +50,7 @@ class Seat:
 
 
 class Link(Protocol):
-    """A byte or datagram pipe.
+    """A byte or datagram pipe. The context manager that opened it closes it.
 
     Attributes:
         seat: the place on a shared port, None on another one. It may change when the link is reopened.
@@ -83,7 +83,7 @@ class Link(Protocol):
         """Wait for input and return 1..256 pieces, with all that is there.
 
         Raises:
-            LinkClosed: the link will never work again (aclose was called).
+            LinkClosed: the link will never work again.
         """
         ...
 
@@ -94,10 +94,6 @@ class Link(Protocol):
         was heard last. Never blocks, and never raises for a full or absent peer: what cannot be kept within
         a bounded backlog is dropped and counted, as a radio would.
         """
-        ...
-
-    async def aclose(self) -> None:
-        """Flush what can be flushed at once and close."""
         ...
 
 

@@ -62,7 +62,6 @@ class SharedLink:
         self._inner: Link | None = None
         self._was_open = False
         self._news: list[Piece] = []
-        self._closed = False
         self._changed = trio.lowlevel.ParkingLot()
 
     # -- opening, again and again
@@ -177,7 +176,7 @@ class SharedLink:
     async def receive(self) -> list[Piece]:
         """See link.base.Link."""
         await trio.lowlevel.checkpoint_if_cancelled()
-        while not self._closed:
+        while True:
             inner = self._inner
             if inner is None:
                 await self._changed.park()
@@ -190,7 +189,6 @@ class SharedLink:
                 except LinkClosed:
                     if self._inner is inner:
                         await self._changed.park()
-        raise LinkClosed(f"{self.description} is closed")
 
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """See link.base.Link."""
@@ -198,12 +196,6 @@ class SharedLink:
             self.stats.dropped_sends += len(frames)
         else:
             self._inner.send(frames, to)
-
-    async def aclose(self) -> None:
-        """No more is sent or received; `run` closes what is open when it is cancelled."""
-        self._closed = True
-        self._changed.unpark_all()
-        await trio.lowlevel.checkpoint()
 
 
 def _may_pass(problem: LinkClosed, waited: float) -> bool:
@@ -258,8 +250,6 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
         except Exception as exc:  # raised again outside, so that it is not wrapped in a group
             failure = exc
         finally:
-            with trio.CancelScope(shield=True):
-                await link.aclose()
             lasting.cancel()
     if failure is not None:
         raise failure

@@ -13,7 +13,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.link.base import MAX_DATAGRAM, Link
+from mavftpfs.link.base import MAX_DATAGRAM, Link, PipeLink
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.opening import open_link
@@ -159,6 +159,7 @@ async def test_closing_wakes_the_receiver(source: str) -> None:
 
         nursery.start_soon(receive)
         await trio.testing.wait_all_tasks_blocked()
+        assert isinstance(link, PipeLink)
         await link.aclose()
         await link.aclose()
         link.send([b"into the void"])

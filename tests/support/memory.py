@@ -13,7 +13,6 @@ import trio
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import LinkStats, Piece, Seat
-from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim.linkmodel import Direction, LinkModel
 from mavftpfs.sim.vehicle import SimVehicle
 
@@ -35,7 +34,6 @@ class MemoryLink:
         self.model = model
         self._inbox: list[Piece] = []
         self._time = float("-inf")
-        self._closed = False
         self._changed = trio.Event()
         vehicle.on_news = self.kick
         vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
@@ -61,8 +59,6 @@ class MemoryLink:
         await trio.lowlevel.checkpoint_if_cancelled()
         waited = False
         while True:
-            if self._closed:
-                raise LinkClosed("memory is closed")
             self._catch_up()
             if self._inbox:
                 if not waited:
@@ -82,12 +78,6 @@ class MemoryLink:
         for frame in frames:
             self.model.push(Direction.TO_VEHICLE, frame, now)
         self._notify()
-
-    async def aclose(self) -> None:
-        """See link.base.Link."""
-        self._closed = True
-        self._notify()
-        await trio.lowlevel.checkpoint()
 
     def kick(self) -> None:
         """Look again at the vehicle, and at what is on its way."""
