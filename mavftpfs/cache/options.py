@@ -1,11 +1,12 @@
-"""The options of a mount that concern the caches. Layer: cache; pure."""
+"""The options as the caches see them. Layer: cache; pure."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.shared.model import ROOT, normalise
+from mavftpfs.shared.model import normalise
+from mavftpfs.shared.options import Options
 
 KIB = 1024
 MIB = 1024 * KIB
@@ -21,43 +22,32 @@ ATTRIBUTES_HOLD, ABSENCE_HOLDS = 1.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class CacheOptions:
-    """Times in seconds, sizes in bytes.
+class CacheOptions(Options):
+    """The options, and the limits of the caches. Times in seconds, sizes in bytes.
 
-    root: the vehicle's directory that is the mount's `/`. read_only: nothing is changed, all names are shown.
-    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s, and
-    longer for an expensive listing.
-    cache_size: budget for file blocks; max_entries: directory entries remembered over all listings.
+    max_entries: directory entries remembered over all listings.
     at_file_limit: largest `@` file that is read; at_cache_size: how much of such snapshots is kept.
     at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
     probe_time: how long listing an `@` directory may spend on finding out which entries open.
-    op_deadline: a read ends when none of its bytes came for so long.
     link_rate: bytes per second that the link carries at most, where that is known before anything is
-    measured.
-    verify_max: largest written file whose CRC32 is asked for without a doubt. write_armed: change things in
-    flight too. inplace: overwrite files where they cannot be replaced. local: files of `localfiles` never
-    reach the vehicle; local_max: bytes they may take.
+    measured. local_max: bytes that files of `localfiles` may take.
 
     Raises:
         UsageError: a value is out of range.
     """
 
-    root: bytes = ROOT
-    read_only: bool = False
-    dir_timeout: float | None = None
-    cache_size: int = 64 * MIB
     max_entries: int = 100_000
     at_file_limit: int = 4 * MIB
     at_cache_size: int = 4 * MIB
     at_stat_limit: int = 128 * KIB
     probe_time: float = 3.0
-    op_deadline: float = 30.0
     link_rate: float | None = None
-    verify_max: int = 4 * MIB
-    write_armed: bool = False
-    inplace: bool = False
-    local: bool = True
     local_max: int = 16 * MIB
+
+    @property
+    def write_armed(self) -> bool:
+        """Whether things are changed in flight, too."""
+        return self.when_armed == "ok"
 
     @property
     def proof_time(self) -> float:

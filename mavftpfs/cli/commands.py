@@ -17,13 +17,14 @@ from mavftpfs.cli import report
 from mavftpfs.cli.drawing import changing_line
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
-from mavftpfs.client.options import TABLE, Options, at_source, split_words
+from mavftpfs.client.options import at_source, split_words
 from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, statuses_at
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon, places
 from mavftpfs.mount.members import Member
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
+from mavftpfs.shared.options import TABLE, Options
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0

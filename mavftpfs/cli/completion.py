@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 
 import shtab
 
-from mavftpfs.client.options import TABLE
 from mavftpfs.mount.options import option_help
+from mavftpfs.shared.options import TABLE
 
 SHELLS = ("bash", "zsh", "fish")
 

@@ -21,7 +21,6 @@ import trio
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.leftovers import rescue, spool_for
-from mavftpfs.client.options import Options
 from mavftpfs.client.status import holder_of, snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.watcher import Watcher
@@ -48,6 +47,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT
+from mavftpfs.shared.options import Options
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -352,26 +352,23 @@ def subscribe(connection: Connection, tree: Tree) -> None:
 
 
 def connect_options(options: Options) -> ConnectOptions:
-    """Return the session's part of the options.
+    """Return the options for the session.
 
     Raises:
         UsageError: the signing key cannot be read.
     """
     key = None if options.signing_key is None else read_key(options.signing_key)
-    return ConnectOptions(**{**_given(ConnectOptions, options), "signing_key": key})
+    return ConnectOptions(**_values(options), key=key)
 
 
 def cache_options(options: Options, spec: LinkSpec) -> CacheOptions:
-    """Return the caches' part of the options, for a link."""
+    """Return the options for the caches, for a link."""
     link_rate = spec.baud / BITS_PER_BYTE if spec.kind is LinkKind.SERIAL else None
-    given = _given(CacheOptions, options)
-    return CacheOptions(**given, link_rate=link_rate, write_armed=options.when_armed == "ok")
+    return CacheOptions(**_values(options), link_rate=link_rate)
 
 
-def _given(part: type[ConnectOptions | CacheOptions], options: Options) -> dict[str, Any]:
-    """Return the values of the options that `part` has by the same name."""
-    names = {field.name for field in fields(options)}
-    return {field.name: getattr(options, field.name) for field in fields(part) if field.name in names}
+def _values(options: Options) -> dict[str, Any]:
+    return {field.name: getattr(options, field.name) for field in fields(Options)}
 
 
 def read_key(path: str) -> bytes:

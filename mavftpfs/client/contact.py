@@ -11,13 +11,13 @@ import trio
 
 from mavftpfs.client.connect import told_version, with_tree
 from mavftpfs.client.files import Session, session_of
-from mavftpfs.client.options import Options
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.peers import vehicles_in
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.vehicle import Standing
 from mavftpfs.shared.errors import LinkClosed
+from mavftpfs.shared.options import Options
 
 
 class Heard(NamedTuple):

@@ -22,7 +22,6 @@ from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answ
 from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
 from mavftpfs.client.mountpoint import OUR_TYPE, canonical, enclosing_mount, mounts
-from mavftpfs.client.options import Options
 from mavftpfs.client.several import Unnamed
 from mavftpfs.client.status import (
     Facts,
@@ -39,6 +38,7 @@ from mavftpfs.session.connection import HEARD_SOON, Connection
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
+from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024

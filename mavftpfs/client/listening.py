@@ -13,7 +13,6 @@ from math import inf
 import trio
 
 from mavftpfs.client.connect import connect_options
-from mavftpfs.client.options import Options
 from mavftpfs.link.base import Link, background
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
@@ -26,6 +25,7 @@ from mavftpfs.link.messages import (
 from mavftpfs.session.connection import HEARTBEAT_PERIOD, nobody, signing_now
 from mavftpfs.session.driver import QUIET
 from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.shared.options import Options
 
 
 class Listener:
@@ -42,7 +42,7 @@ class Listener:
         self._link = link
         self._on_heard = on_heard
         own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
-        key = connect_options(options).signing_key
+        key = connect_options(options).key
         self._framer = Framer(own, stream=link.is_stream, signing_key=key, signing_clock=signing_now)
         self._framer.link_id = 0 if link.seat is None else link.seat.number
 

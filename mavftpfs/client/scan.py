@@ -13,13 +13,13 @@ import trio
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
 from mavftpfs.client.files import Target, heartbeats_in, mount_status, mounts_on
 from mavftpfs.client.listening import listening
-from mavftpfs.client.options import Options
 from mavftpfs.client.status import second_vehicle, with_vehicles
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer, names_of
 from mavftpfs.session.connection import connected, heard_within
 from mavftpfs.shared.errors import FtpNak, LinkClosed, MavftpfsError, VehicleLost
+from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_time
 
 Entry = dict[str, Any]

@@ -9,11 +9,12 @@ from dataclasses import replace
 from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.files import Target, mountpoint_of
 from mavftpfs.client.mounted import STATUS_PATIENCE
-from mavftpfs.client.options import Options, at_source
+from mavftpfs.client.options import at_source
 from mavftpfs.client.status import several_at, told_by
 from mavftpfs.link.uri import parse_source, require_expanded
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import ROOT
+from mavftpfs.shared.options import Options
 
 
 def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[str, list[str]] | None:

@@ -25,11 +25,11 @@ from mavftpfs import __version__
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
 from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts, vehicles_below
-from mavftpfs.client.options import Options
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+from mavftpfs.shared.options import Options
 
 BESIDE = ".put-"
 """Begins the name that a file which `put` sends has in a mount until it is whole."""

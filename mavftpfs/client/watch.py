@@ -23,7 +23,6 @@ from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing,
 from mavftpfs.client.files import Session, Target, reading
 from mavftpfs.client.logs import Wish, path_of, sync
 from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
-from mavftpfs.client.options import Options
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import is_no_log
 from mavftpfs.client.watchpolicy import Log, Policy
@@ -32,6 +31,7 @@ from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected
 from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout, UsageError
+from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_size
 
 TICK = 0.25

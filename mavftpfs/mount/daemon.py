@@ -17,8 +17,8 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
-from mavftpfs.client.options import Options
 from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, exit_code_for
+from mavftpfs.shared.options import Options
 from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 

@@ -16,10 +16,10 @@ import pyfuse3
 import trio
 
 from mavftpfs.client.mountpoint import is_dead, stderr_of, unmount, why_not_mounted
-from mavftpfs.client.options import Options
 from mavftpfs.mount.handles import Presentation
 from mavftpfs.mount.options import permissions
 from mavftpfs.shared.errors import MountFailed
+from mavftpfs.shared.options import Options
 
 log = logging.getLogger("mavftpfs.mount")
 

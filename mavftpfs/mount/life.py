@@ -25,10 +25,10 @@ import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Sinks
 from mavftpfs.client.control import Reply
 from mavftpfs.client.controlserver import Command, ControlServer
-from mavftpfs.client.options import Options
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mount.daemon import Report, ending_signals
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, exit_code_for
+from mavftpfs.shared.options import Options
 
 log = logging.getLogger("mavftpfs.mount")
 

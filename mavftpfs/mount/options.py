@@ -13,8 +13,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from mavftpfs.client.mountpoint import SUBTYPE
-from mavftpfs.client.options import TABLE, Options, split_words, take_gone
+from mavftpfs.client.options import split_words, take_gone
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.options import TABLE, Options
 
 KERNEL_WORDS = frozenset({"dev", "nodev", "suid", "nosuid", "exec", "noexec", "sync", "async", "dirsync"})
 """VFS words that libfuse takes."""

@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import inf
-from typing import Any, Literal
+from typing import Any
 
 import trio
 
@@ -35,11 +35,12 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import Payload
 from mavftpfs.session.driver import Driver, PayloadSink
-from mavftpfs.session.scheduler import ReadMode, Scheduler
+from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.store import Store
 from mavftpfs.session.upload import Upload
 from mavftpfs.session.vehicle import SILENCE_LIMIT, Standing, Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
+from mavftpfs.shared.options import Options
 
 log = logging.getLogger("mavftpfs.session")
 
@@ -76,22 +77,13 @@ _TELLS_NO_ID = (
 
 
 @dataclass(frozen=True, slots=True)
-class ConnectOptions:
-    """How to talk to the vehicle. 0 = find out; seconds for times.
+class ConnectOptions(Options):
+    """The options, and the key that is in the file of `signing_key`.
 
-    bwlimit: bytes per second that we cause on the link, about. With it nothing is read by bursts, whose pace
-    is the server's.
+    With `bwlimit` nothing is read by bursts, whose pace is the server's.
     """
 
-    target_system: int = 0
-    target_component: int = 0
-    source_system: int = 254
-    signing_key: bytes | None = None
-    op_deadline: float = 30.0
-    read_mode: ReadMode = "window"
-    chunk: int | None = None
-    when_armed: Literal["ro", "ok"] = "ro"
-    bwlimit: int | None = None
+    key: bytes | None = None
 
 
 class Connection:
@@ -121,7 +113,7 @@ class Connection:
         framer = Framer(
             own,
             stream=link.is_stream,
-            signing_key=options.signing_key,
+            signing_key=options.key,
             signing_clock=signing_now,
             on_frame=on_frame,
         )

@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.options import Options
 from mavftpfs.client.status import is_wanted
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32
+from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_size
 from tests.mount.conftest import Field
 from tests.support import terminal

@@ -21,10 +21,10 @@ import pyfuse3
 import trio
 
 from mavftpfs.client.connect import Attached
-from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import MountRequest
 from mavftpfs.mount.single import SingleMount
+from mavftpfs.shared.options import Options
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0

@@ -14,7 +14,6 @@ import trio
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.client import connect as compose
-from mavftpfs.client.options import Options
 from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
@@ -28,6 +27,7 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.shared.options import Options
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
@@ -46,7 +46,7 @@ async def test_signing_both_ways() -> None:
     tree.add(b"/f", DATA)
     vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
     link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01, loss=0.05)))
-    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
+    async with connected(link, ConnectOptions(key=KEY), rng=random.Random(3)) as connection:
         await connection.ready(10)
         # A vehicle without a clock is refused until it has heard the time in our frames.
         assert await read_file(connection, b"/f") == DATA
@@ -55,10 +55,10 @@ async def test_signing_both_ways() -> None:
         assert await read_file(connection, b"/f") == DATA
         assert connection.driver.framer.stats.bad_signature == refused
     # Restarted, we must not begin with older timestamps than the vehicle heard from us.
-    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(4)) as connection:
+    async with connected(link, ConnectOptions(key=KEY), rng=random.Random(4)) as connection:
         await connection.ready(10)
         assert await read_file(connection, b"/f") == DATA
-    async with connected(link, ConnectOptions(signing_key=bytes(32)), rng=random.Random(5)) as connection:
+    async with connected(link, ConnectOptions(key=bytes(32)), rng=random.Random(5)) as connection:
         with pytest.raises(VehicleLost, match="bad signature; check signing_key"):
             await connection.ready(5)
 
@@ -203,7 +203,7 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(monkeypatch: pytest
     vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
     monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
     link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
-    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
+    async with connected(link, ConnectOptions(key=KEY), rng=random.Random(3)) as connection:
         with pytest.raises(VehicleLost, match="compare the clocks"):
             await connection.ready(5)
 

@@ -457,7 +457,7 @@ async def test_what_was_cut_off_is_noticed_by_its_size(here: Rig, verify_max: in
 async def test_no_checksum_is_asked_for_in_flight() -> None:
     """Where a file is in doubt it is not delivered then."""
     async with rig(options=ConnectOptions(when_armed="ok")) as here:
-        tree = here.mount(write_armed=True)
+        tree = here.mount(when_armed="ok")
         await here.arm()
         await write_file(tree, b"/new", NEW)
         assert here.data(b"/new") == NEW

@@ -11,7 +11,6 @@ import pytest
 import trio
 
 from mavftpfs.client.connect import _list_root
-from mavftpfs.client.options import Options
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
@@ -29,6 +28,7 @@ from mavftpfs.shared.errors import (
     SessionLost,
     VehicleLost,
 )
+from mavftpfs.shared.options import Options
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import STATION

@@ -18,11 +18,11 @@ from mavftpfs.client.contact import Heard, MountContact
 from mavftpfs.client.files import Session
 from mavftpfs.client.logs import Wish
 from mavftpfs.client.manifest import NAME, Manifest
-from mavftpfs.client.options import Options
 from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.client.watch import Watch
 from mavftpfs.link.messages import Address
 from mavftpfs.link.uri import parse_source
+from mavftpfs.shared.options import Options
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from mavftpfs.client.options import TABLE
+from mavftpfs.shared.options import TABLE
 
 GUIDE = Path(__file__).parents[2] / "docs/guide.md"
 HEAD = "| option | default | meaning |\n|---|---|---|\n"

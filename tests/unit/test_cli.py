@@ -21,7 +21,6 @@ from mavftpfs.cli import commands
 from mavftpfs.cli import main as cli
 from mavftpfs.client import connect as compose
 from mavftpfs.client import control, status
-from mavftpfs.client.options import Options
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import (
     ExitCode,
@@ -33,6 +32,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
     exit_code_for,
 )
+from mavftpfs.shared.options import Options
 from tests.support.vehicles import free_udp_port
 from tests.unit.test_daemon import restored_logging
 

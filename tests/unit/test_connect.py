@@ -1,4 +1,4 @@
-"""client.connect: every option of the table reaches its user; what a hub calls a program."""
+"""client.connect: the options reach kernel, session and caches; what a hub calls a program."""
 
 from __future__ import annotations
 
@@ -11,53 +11,35 @@ from typing import Any
 import pytest
 
 from mavftpfs.client.connect import cache_options, connect_options, process_name
-from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.kernel import presentation
 from mavftpfs.mount.options import fuse_words
+from mavftpfs.shared.options import TABLE, Options
 
-OTHER: dict[str, Any] = {
-    "read_only": True,
-    "allow_other": True,
-    "uid": 12345,
-    "gid": 54321,
-    "umask": 0o777,
-    "fmask": 0o777,
-    "dmask": 0o777,
-    "root": b"/fs",
-    "read_mode": "burst",
-    "when_armed": "ok",
-    "local": (),
-    "inplace": True,
-    "kernel_words": ("noexec",),
-}
-"""Values that are no default; numbers are made below."""
-
-ELSEWHERE = {"baud", "connect_timeout", "tlog", "forward", "gone", "all"}
-"""What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
-in `test_cli`."""
+VALUES: dict[str, Any] = {"read_only": True, "allow_other": True, "kernel_words": ("noexec",)}
+OF_KERNEL = [row.field for row in TABLE.rows if row.of_kernel and row.field != "all"]
 
 
-def told(options: Options) -> tuple[Any, ...]:
-    """Return what kernel, session and caches are told."""
-    return (
-        connect_options(options),
-        cache_options(options, parse_source("udpin:0.0.0.0:14550")),
-        fuse_words(options, "SOURCE"),
-        presentation(options),
-    )
+@pytest.mark.parametrize("name", ["read_only", *OF_KERNEL, "kernel_words"])
+def test_the_kernel_is_told_each_option_that_concerns_it(name: str) -> None:
+    told = [
+        (fuse_words(options, "SOURCE"), presentation(options))
+        for options in (Options(), replace(Options(), **{name: VALUES.get(name, 0o70)}))
+    ]
+    assert told[0] != told[1]
 
 
-@pytest.mark.parametrize("name", sorted({field.name for field in fields(Options)} - ELSEWHERE))
-def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
-    value = OTHER.get(name, 77)
-    if name == "signing_key":
-        value = str(tmp_path / "key")
-        (tmp_path / "key").write_bytes(bytes(32))
-        (tmp_path / "key").chmod(0o600)
-    elif name == "cache_size":
-        value = 77 << 20
-    assert told(replace(Options(), **{name: value})) != told(Options())
+def test_session_and_caches_get_the_options_as_they_are(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    key.chmod(0o600)
+    options = Options(op_deadline=7.0, cache_size=77 << 20, when_armed="ok", signing_key=str(key))
+    connected, cached = connect_options(options), cache_options(options, parse_source("/dev/ttyX,57600"))
+    for field in fields(Options):
+        value = getattr(options, field.name)
+        assert getattr(connected, field.name) == getattr(cached, field.name) == value
+    assert connected.key == bytes(range(32))
+    assert (cached.link_rate, cached.write_armed) == (5760, True)
 
 
 @pytest.mark.parametrize(

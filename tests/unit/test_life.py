@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.shared.errors import ExitCode, LinkClosed
+from mavftpfs.shared.options import Options
 
 SOURCE = "udpin:127.0.0.1:14550"
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.client.options import GONE, TABLE, Options, options_of
+from mavftpfs.client.options import GONE, at_source, options_of
+from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.options import (
     IGNORED_WORDS,
     KERNEL_WORDS,
@@ -19,16 +19,11 @@ from mavftpfs.mount.options import (
     parse_options,
     permissions,
 )
-from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.options import TABLE, Options
 from tests.support.optiontable import option_table, told_table
 
-DEFAULTS, PASSED_ON = (
-    {field.name: field.default for part in parts for field in fields(part)}
-    for parts in ((Options,), (CacheOptions, ConnectOptions))
-)
-
-
+DEFAULTS = {field.name: field.default for field in fields(Options)}
 ELSEWHERE = {"root", "baud", "local", "kernel_words", "gone"}
 """Fields that SOURCE, words of 0.2 or for the kernel, and the library set."""
 
@@ -43,11 +38,6 @@ def test_each_value_option_takes_its_own_default() -> None:
         default = DEFAULTS[name]
         if default:
             assert TABLE.parsed(name, row.default, {}) == default
-
-
-def test_defaults_are_those_of_the_session_and_the_caches() -> None:
-    both = DEFAULTS.keys() & PASSED_ON.keys()
-    assert {name: DEFAULTS[name] for name in both} == {name: PASSED_ON[name] for name in both}
 
 
 @pytest.mark.parametrize(
@@ -252,14 +242,21 @@ def test_words_that_are_gone_are_in_no_help_and_free_for_nothing_else() -> None:
     assert not names & (KERNEL_WORDS | IGNORED_WORDS)
 
 
+def forwarded(options: Options) -> tuple[str, ...]:
+    return at_source(parse_source("udpin:0.0.0.0:14550"), options)[1].forward
+
+
 def test_endpoints_are_collected() -> None:
     wanted = ("udpout:127.0.0.1:14550", "tcpin:127.0.0.1:5760")
-    assert parse_options(["forward=udpout:127.0.0.1:14550,forward=tcpin::5760"]).forward == wanted
-    assert parse_options([f"forward={place}" for place in (*wanted, wanted[0])]).forward == wanted
-    assert options_of({"forward": list(wanted)}).forward == wanted
-    assert options_of({"forward": wanted[0]}).forward == wanted[:1]
-    with pytest.raises(UsageError, match="forward=nowhere"):
-        parse_options(["forward=nowhere"])
+    for words in (
+        ["forward=udpout:127.0.0.1:14550,forward=tcpin::5760"],
+        [f"forward={place}" for place in (*wanted, "tcpin::5760")],
+    ):
+        assert forwarded(parse_options(words)) == wanted
+    assert forwarded(options_of({"forward": list(wanted)})) == wanted
+    assert forwarded(options_of({"forward": wanted[0]})) == wanted[:1]
+    with pytest.raises(UsageError, match="option forward=nowhere: "):
+        forwarded(parse_options(["forward=nowhere"]))
 
 
 def test_words_for_access_times_reach_neither_libfuse_nor_the_user() -> None:

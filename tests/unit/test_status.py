@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.options import Options
 from mavftpfs.client.status import vehicle_below
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+from mavftpfs.shared.options import Options
 
 ONE = {"name": "1", "state": "mounted", "problem": None}
 TWO = {"name": "2", "state": "starting", "problem": None}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.life import MountRequest
 from mavftpfs.mount.members import Member, MemberState
 from mavftpfs.mount.supervisor import Supervisor
+from mavftpfs.shared.options import Options
 
 SOURCE = "udpin:127.0.0.1:14550"
 

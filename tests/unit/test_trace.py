@@ -10,12 +10,12 @@ import pytest
 from pymavlink import mavutil
 
 from mavftpfs.client.connect import open_sinks
-from mavftpfs.client.options import Options
 from mavftpfs.client.trace import REPLY, TlogWriter, text_line
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.options import Options
 from tests.support.replies import request
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
