@@ -25,6 +25,7 @@ from mavftpfs.client.logs import Wish, path_of, sync
 from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import is_no_log
+from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.watchpolicy import Log, Policy
 from mavftpfs.link.base import Link
 from mavftpfs.link.uri import LinkSpec
@@ -98,6 +99,8 @@ class Watch:
                         await self._run_on_link(target)
                     else:
                         self._complaints.over("link")
+                        if mounted.unnamed is not None:
+                            self._complaints.tell("others", mounted.unnamed.note(ON_COMMAND_LINE))
                         contact = MountContact(mounted)
                         while True:
                             await self.serve(contact)
@@ -233,8 +236,8 @@ class Complaints:
         self._told: dict[str, str] = {}
 
     def tell(self, about: str, line: str) -> None:
-        """Say a line, unless it was the last one about the same thing."""
-        if self._told.get(about) != line:
+        """Say a line, unless it is empty or was the last one about the same thing."""
+        if line and self._told.get(about) != line:
             self._told[about] = line
             self._say(line)
 

@@ -25,7 +25,7 @@ from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
 from tests.support.mounts import PATIENCE, Mount, command, mavftpfs, mounted_at, wait_until
 from tests.support.neighbours import Beating
-from tests.support.vehicles import HOST, PROJECT, SimVehicle, free_udp_port
+from tests.support.vehicles import HOST, PROJECT, Program, SimVehicle, free_udp_port
 
 PROFILES = {1: "px4", 2: "ardupilot5", 3: "mavsdk"}
 
@@ -309,6 +309,15 @@ def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
             assert "a second vehicle" in command(*words)[0]
         assert mounts.read_bytes(mounts.path / "1/log/0.bin") == (fleet.cards[1] / "log/0.bin").read_bytes()
     assert "give each a system id of its own" in mounts.alive().text()
+
+
+def test_a_watch_by_the_mount_of_one_names_the_others(fleet: Fleet) -> None:
+    mount_all(fleet, 1, 2)
+    argv = ["mavftpfs.__main__", "sync", fleet.source, str(fleet.field.local("sync")), "--watch"]
+    watch = Program("sync", argv, fleet.field.local("out"))
+    fleet.field.own(watch)
+    wait_until("the other one is named", lambda: "to choose one, use -o target_system=" in watch.text())
+    assert watch.stop() == 0
 
 
 def test_a_busy_one_refuses_the_unmount_of_all_and_a_signal_ends_all(fleet: Fleet) -> None:
