@@ -22,7 +22,7 @@ import trio
 from mavftpfs.link import ports
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import REOPENED, Link, LinkStats, Piece, Seat, background
-from mavftpfs.link.hublink import Facts, Wish, hear, join, tell
+from mavftpfs.link.hublink import PROTOCOL, Facts, Wish, hear, join, tell
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
@@ -39,6 +39,8 @@ START_PATIENCE, COMING = 25.0, 5.0
 """Seconds for the hub to start, and then to call."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
 _NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a port"
+_OTHER_VERSION = "{}: process {} has this port, with another version of mavftpfs; end that first"
+_UPGRADED = "mavftpfs was upgraded since this program began; start it anew"
 _PAUSE, _LONGEST_PAUSE = 0.02, 1.0
 _SHARED = "%s is shared with another program from now on: a hub opens it, and all programs use the hub%s"
 _LINE = {LinkKind.SERIAL: "; DTR of the line falls for a moment"}
@@ -124,7 +126,9 @@ class SharedLink:
                 if "join" not in request:
                     continue
                 problem = f"{self.description} belongs to another user"
-                if ports.may_share(caller, self._spec):
+                if request.get("protocol") != PROTOCOL:
+                    problem = _OTHER_VERSION.format(self.description, os.getpid())
+                elif ports.may_share(caller, self._spec):
                     try:
                         return await self._started_hub(name)
                     except LinkClosed as exc:
@@ -145,6 +149,8 @@ class SharedLink:
                 if _is_hub(caller, request):
                     return caller
                 others.enter_context(caller)
+                if "hub" in request and request.get("protocol") != PROTOCOL:
+                    raise LinkClosed(_UPGRADED)
         raise LinkClosed("the hub ended at once")
 
     @contextmanager
@@ -217,8 +223,10 @@ async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:
 
 
 def _is_hub(caller: socket.socket, request: Facts) -> bool:
-    """Return whether the hub calls: one of this user, since it gets the port."""
-    return "hub" in request and ports.peer_of(caller).uid == os.getuid()
+    """Return whether a hub calls that may have the port: of this version, and of this user."""
+    return (
+        "hub" in request and request.get("protocol") == PROTOCOL and ports.peer_of(caller).uid == os.getuid()
+    )
 
 
 @asynccontextmanager

@@ -212,6 +212,29 @@ async def test_why_a_port_cannot_be_shared_is_told_to_the_program_that_wants_it(
             await port.hears(one, two)
 
 
+async def test_a_program_keeps_its_port_from_those_of_another_version(
+    port: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither joins, nor is it the hub that takes the port."""
+    async with port.shared() as one:
+        await port.hears(one)
+        with monkeypatch.context() as patch:
+            patch.setattr(hublink, "PROTOCOL", hublink.PROTOCOL - 1)
+            with pytest.raises(
+                LinkClosed, match=f"process {os.getpid()} has this port, with another version"
+            ):
+                async with port.shared():
+                    pass
+        with monkeypatch.context() as patch:  # an upgrade replaced the files; the hub is of the new version
+            patch.setattr(sharing, "PROTOCOL", hublink.PROTOCOL + 1)
+            patch.setattr(hublink, "PROTOCOL", hublink.PROTOCOL + 1)
+            with pytest.raises(LinkClosed, match="mavftpfs was upgraded since this program began"):
+                async with port.shared():
+                    pass
+        await port.hears(one)
+        assert one.stats.reopened == 0
+
+
 @contextmanager
 def no_descriptors_left() -> Iterator[None]:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
