@@ -48,7 +48,7 @@ def globbed(place: tuple[DroneFileSystem, str]) -> str:
 
 
 class Fixtures(abstract.AbstractFixtures):  # type: ignore[misc]
-    """What the suite asks for."""
+    """The fixtures that the suite asks for."""
 
     @pytest.fixture
     def fs(self, place: tuple[DroneFileSystem, str]) -> DroneFileSystem:

@@ -1,4 +1,4 @@
-"""What is measured: conditions, and the limit that docs/benchmarks.md gives for them.
+"""The measured cases: conditions, and the limit that docs/benchmarks.md gives for them.
 
 The limit is the link's, and at most the server's ceiling, which for PX4 and MAVSDK is whatever they answer. A
 PX4 whose card pauses (px4-nuttx) answers a read later, and answers that wait in the link meanwhile bridge

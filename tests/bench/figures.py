@@ -56,7 +56,7 @@ LOOPBACK_WINDOW = 64
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What everybody does. size, peers_size: bytes. timeout: seconds."""
+    """The same work for every client. size, peers_size: bytes. timeout: seconds."""
 
     server: str
     link: str
@@ -90,7 +90,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What came of a transfer. seconds: from the first call to the last. cpu: seconds, user and system, of
+    """The result of a transfer. seconds: from the first call to the last. cpu: seconds, user and system, of
     the client's processes while it lasted. memory: their peak in bytes. None if it did not end well.
     """
 
@@ -120,7 +120,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What the runs of one client under the same conditions amount to: medians of those that went well.
+    """The summary of one client's runs under the same conditions: medians of those that went well.
 
     rate: bytes/s; at_most: it was cut off by the time-out, and rate and shares are what it can have reached.
     of_us, of_bare, of_limit: shares. cpu: seconds per 10**6 bytes. memory: peak in bytes.

@@ -26,7 +26,7 @@ PROGRAMS = {
     "new": 'cp "$1" "$2"',
     "pipe": 'cat "$1" > "$2"',
 }
-"""What each does to the file of its name; `new` is not there yet."""
+"""The effect of each on the file of its name; `new` is not there yet."""
 
 
 @pytest.fixture(autouse=True)

@@ -22,7 +22,7 @@ OLD = content("old", 45_000)
 NEW = content("new", 60_000)
 TOO_LARGE = content("too large", 105_000)
 FULL = {"px4": "No space left on device", REAL: "Input/output error"}
-"""What programs are told: MAVSDK has but one word for all failures."""
+"""The errno that programs get: MAVSDK has but one word for all failures."""
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from tests.support.replies import ack, nak
 
 GOOD = b"good"
 GOOD_NAMES = {"good.txt", "no_size", "caf\udce9"}
-"""What of the directory /names may appear, as os.listdir shows it; all hold GOOD."""
+"""The names of the directory /names that may appear, as os.listdir shows them; all hold GOOD."""
 
 NAMES = (
     b"F../../etc/passwd\t4",
@@ -37,7 +37,7 @@ NAMES = (
 
 
 def card() -> MemoryTree:
-    """What the vehicle has."""
+    """Return the vehicle's files."""
     tree = MemoryTree()
     for name in GOOD_NAMES:
         tree.add(b"/names/" + os.fsencode(name), GOOD)

@@ -1,4 +1,4 @@
-"""What the kernel makes of our answers: sizes, pages, absences, inode numbers.
+"""The kernel's use of the mount's answers: sizes, pages, absences, inode numbers.
 
 The tree behind the mount is in memory and says that everything is valid for 1000 s, so the kernel asks again
 only where it is told to.

@@ -81,7 +81,7 @@ def test_memory_is_bounded_while_reading_ten_times_the_cache(field: Field, tmp_p
 
 @pytest.mark.holds("promise 8")
 def test_memory_is_bounded_while_writing(field: Field) -> None:
-    """What the vehicle does not provably have yet waits on the local disk."""
+    """Bytes that the vehicle does not provably have yet wait on the local disk."""
     cache = 2 * MIB
     card, local = field.local("card"), two_files(field.local("local"), 16 * MIB)
     mount = field.mount(field.sim(card).source, f"cache_size={cache}")

@@ -24,7 +24,7 @@ def source(request: pytest.FixtureRequest, module_field: Field, small_tree: Path
 
 
 THROUGH_A_MOUNT = pytest.mark.parametrize("source", ["mount"], scope="module", indirect=True)
-"""What is not a matter of the way to the vehicle."""
+"""Cases that do not depend on the way to the vehicle."""
 
 
 def param(source: str, *words: object, code: int = 0) -> list[str]:

@@ -74,7 +74,7 @@ def restored(texts: Texts) -> Iterator[None]:
 VIM = "vim -es -N -i NONE -n -u NONE"
 BACKUP = f"{VIM} --cmd 'set writebackup backupskip='"
 PAUSE = "-c 'call system(\"sleep 1\")'"
-"""What a vehicle sets by itself moves each second."""
+"""Parameters that a vehicle sets by itself change each second."""
 MOVING = {"ATC_RAT_PIT_P": "STAT_RUNTIME", "MC_PITCHRATE_P": "LND_FLIGHT_T_LO"}
 
 

@@ -1,4 +1,4 @@
-"""What `mavftpfs install` brings, by use: the systemd unit's own commands, as systemd would run them, on a
+"""The files of `mavftpfs install`, in use: the systemd unit's own commands, as systemd would run them, on a
 simulated serial port; and install, remove, install, upgrade and uninstall, as root and in a namespace."""
 
 from __future__ import annotations

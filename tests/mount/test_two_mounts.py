@@ -47,7 +47,7 @@ def start(mount: Mount, folder: str, name: str) -> subprocess.Popen[str]:
 
 
 def check(child: subprocess.Popen[str], card: Path) -> int:
-    """What was confirmed must be on the card; returns how many files that were."""
+    """Check that the card has every confirmed file; return how many these are."""
     out, errors = child.communicate(timeout=240)
     assert child.returncode == 0, errors
     confirmed = {name: bytes.fromhex(data) for name, data in json.loads(out).items() if data}

@@ -14,7 +14,7 @@ from tests.support.mounts import Mount
 
 TRUTH = VirtualTrees()
 FILLED = {name.decode(): data for name, data in TRUTH.sys_files.items() if data}
-"""What is in @SYS and can be opened; the vehicle lists more names than it can open."""
+"""Files in @SYS that can be opened; the vehicle lists more names than it can open."""
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ _TAKING = (Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME)
 
 @dataclass
 class _Meeting:
-    """What happens at the nth of the requests of a kind from now on, and at `times` - 1 more after it.
+    """An event at the nth of the requests of a kind from now on, and at `times` - 1 more after it.
 
     opcode: None for all kinds."""
 

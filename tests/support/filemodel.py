@@ -281,7 +281,7 @@ class Model:
         raise AssertionError(f"neither before nor after: {shown}")
 
     async def on_check(self) -> None:
-        """What the tree shows is the model."""
+        """Check that the tree shows the model."""
         shown = dict(await self.tree.list(b"/d"))
         below = dict(await self.tree.list(b"/d/sub"))
         sizes = {b"/d/" + name: stat.size for name, stat in shown.items() if name != b"sub"}

@@ -1,4 +1,4 @@
-"""What a framer found, message by message."""
+"""The messages that a framer found."""
 
 from __future__ import annotations
 

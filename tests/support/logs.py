@@ -1,4 +1,4 @@
-"""What a log must not hold. A traceback or an unexpected warning in any process's output fails its test."""
+"""Lines that a log must not hold. A traceback or an unexpected warning of any process fails its test."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ FOLDERS = {
 """The folder of each that may be written."""
 
 OPTIONS: dict[str, tuple[str, ...]] = {"littlefs": ("inplace",)}
-"""What mounting needs there."""
+"""Files that mounting needs there."""
 
 NO_RENAME = ("littlefs",)
 """Servers that cannot rename: programs that replace a file by rename cannot work there."""

@@ -16,7 +16,7 @@ DATA = Path(__file__).parent.parent / "data"
 
 @dataclass
 class Step:
-    """What the client tried in one go: requests as (time, wire), and the replies that came."""
+    """One attempt of the client: its requests as (time, wire), and the replies that came."""
 
     name: str
     requests: list[tuple[float, bytes]] = field(default_factory=list)

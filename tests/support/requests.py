@@ -1,4 +1,4 @@
-"""What commands on a real mount cost: FTP requests by opcode, counted by the vehicle that got them.
+"""The cost of commands on a real mount: FTP requests by opcode, counted by the vehicle that got them.
 
 A `Case` is a shell script that runs in a directory of its own on the mount. It is counted from its first
 request to the last one that follows of it (the Terminate of an idle file, a background delivery). Listings
@@ -69,7 +69,7 @@ SHORT = {
 
 @dataclass(slots=True)
 class Cost:
-    """What one run of a case cost. payload: bytes of file data asked for or sent. repeats: how many of the
+    """The cost of one run of a case. payload: bytes of file data asked for or sent. repeats: how many of the
     requests the client says were repetitions. late: names were listed once more, because time had passed."""
 
     counts: Counter[str] = field(default_factory=Counter)

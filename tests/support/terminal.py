@@ -1,4 +1,4 @@
-"""What a program shows on a terminal of a given size."""
+"""The screen of a program on a terminal of a given size."""
 
 from __future__ import annotations
 

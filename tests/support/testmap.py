@@ -1,4 +1,4 @@
-"""What tests hold: promises, faults and rules, and which tests say so: python -m tests.support.testmap.
+"""The promises, faults and rules that tests hold, and which tests hold them: python -m tests.support.testmap.
 
 A test says `@pytest.mark.holds("promise 2", "fault lost", "rule 14.3")`. Promises are those of README, rules
 those of docs/servers.md section 14.

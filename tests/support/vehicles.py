@@ -152,7 +152,7 @@ class Program(Process):
 
 
 class UdpVehicle:
-    """What both kinds of vehicle share: a port of the mount, a process, perhaps a bad link between."""
+    """The common part of both kinds of vehicle: a port, a process, perhaps a bad link between."""
 
     name = "vehicle"
     allowed_log: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""What the bench takes for the limit of a link, and the page that shows what it recorded."""
+"""The limit that the bench assumes for a link, and the page that shows its records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the build does beyond packing. hatchling itself is only there while a package is built."""
+"""The build's work beyond packing. hatchling itself is only there while a package is built."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ BLOCK_LINE = re.compile(r"^    (\S.*)$", re.MULTILINE)
 TABLE_ROW = re.compile(r"^\| `(mavftpfs [^`]*)`", re.MULTILINE)
 URL = re.compile(r"`(mftp://[^`]+)`")
 PLACEHOLDERS = {"SOURCE": "udpin:0.0.0.0:14550", "[PATH...]": "/a", "PATH...": "/a", "LOCAL...": "a"}
-"""What stands for something in the guide's table of commands."""
+"""Placeholders in the guide's table of commands."""
 
 
 def shown() -> Iterator[str]:

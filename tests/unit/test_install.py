@@ -1,4 +1,4 @@
-"""What `mavftpfs install` puts into place, and that the programs it is for can read it."""
+"""The files of `mavftpfs install`, and whether the programs that they are for can read them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
 
 @pytest.fixture
 def pieces() -> dict[str, install.Piece]:
-    """What root would install, by its path without the first /."""
+    """Return the files that root would install, by their paths without the first /."""
     program = Path("/opt/py thon/100%/mavftpfs")
     found = install.for_everybody(cli.whole_parser(), program)
     return {piece.path.relative_to("/").as_posix(): piece for piece in found}

@@ -1,4 +1,4 @@
-"""What is said of the components that are heard: link.peers, and the versions that they tell."""
+"""The words for components that are heard: link.peers, and the versions that they tell."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ UPLOADS = (
 
 
 LIVE = frozenset({b"BARO1_GND_PRESS", b"BARO2_GND_PRESS", b"MIS_TOTAL", b"STAT_RUNTIME", b"COMPASS_DEC"})
-"""What the recorded ArduPilot changed by itself between two downloads."""
+"""Parameters that the recorded ArduPilot changed by itself between two downloads."""
 
 
 def without_live(params: list[Parameter]) -> dict[bytes, bytes]:

@@ -1,4 +1,4 @@
-"""What holds for every simulated server: above all that it never raises."""
+"""Properties of every simulated server: above all, the server never raises."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is learned of the vehicle by listening."""
+"""Facts about the vehicle that listening tells."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_when_boot_times_tell_of_a_reboot(told: list[tuple[float, int]], reboots
 
 @pytest.mark.parametrize(("restarts", "told"), [(True, 8_000), (False, 40_000), (False, 24_000)])
 def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, told: int) -> None:
-    """It was heard all the time, and had counted on; perhaps at half the speed, as a simulator."""
+    """The vehicle was heard all the time, and had counted on; perhaps at half the speed, as a simulator."""
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)
     tell_boot_times(vehicle, (0.0, 5_000))

@@ -258,7 +258,7 @@ async def test_what_is_listed_but_not_found_is_hidden(here: Rig, tree: Tree) -> 
 async def test_what_cannot_be_read_is_an_error_to_open_but_is_shown(
     here: Rig, limit: int, error: type[Exception]
 ) -> None:
-    """It is too long, or refused."""
+    """The file is too long, or the vehicle refuses it."""
     if error is FtpNak:
         here.faults.refuse(OPEN, NakCode.FAIL, times=99)
     tree = here.mount(at_file_limit=limit)

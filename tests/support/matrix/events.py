@@ -206,7 +206,7 @@ UNNOTICED = (nothing, lose_answer, lose_for_good, arrive_twice, answer_the_secon
 """Whatever is lost or doubled once, the call succeeds."""
 
 EARLY = (late_copies,)
-"""What begins before the operation."""
+"""Events that begin before the operation."""
 
 LOCAL = (full_disk, failing_disk)
 

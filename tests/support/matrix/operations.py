@@ -15,13 +15,13 @@ from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.transfers import content
 
 State = dict[bytes, bytes | None]
-"""What is in the directory: contents of files by name, None for a directory."""
+"""The directory: contents of files by name, None for a directory."""
 
 Model = Callable[[State], State | None]
-"""What a call does to the directory on a local disk; None if it fails there."""
+"""The effect of a call on a directory of a local disk; None if the call fails there."""
 
 Call = Callable[[Tree], Awaitable[object]]
-"""What a program does. A call that reads returns what it saw."""
+"""The calls of a program. One that reads returns what it saw."""
 
 D = b"/d"
 FILE, NAME = b"/d/file", b"file"
@@ -263,16 +263,16 @@ VIEWS: dict[Call, Callable[[State], object]] = {
     list_names: frozenset,
     read: lambda state: state.get(NAME),
 }
-"""What a call sees of a directory."""
+"""Return what a call sees of a directory."""
 
 FAILING = (fail_to_create, fail_to_replace)
 RENAMES = (rename, rename_over, rename_over_open)
 IN_PLACE = (create, replace, change, append, append_in_doubt, sync, truncate, fail_to_create)
-"""What is done byte by byte where nothing can be renamed."""
+"""Work byte by byte where the server cannot rename."""
 
 WRITING = (*IN_PLACE, take_back, fail_to_replace)
 KEEPING_NEW = (create, replace, change, append, append_in_doubt, sync)
-"""What writes the first bytes of NEW. The program is told that they arrived, or they are kept here."""
+"""Write the first bytes of NEW. The program is told that they arrived, or they are kept here."""
 
 ON_THE_WAY: dict[Call, tuple[bytes, ...]] = {
     replace: (b"",),
@@ -280,7 +280,7 @@ ON_THE_WAY: dict[Call, tuple[bytes, ...]] = {
     take_back: (b"", LARGE),
     fail_to_replace: (b"", LARGE),
 }
-"""What another program of the same mount may read of the file beside the old and the new content."""
+"""Return what another program of the same mount may read beside the old and the new content."""
 
 
 def after(operation: Call) -> State:

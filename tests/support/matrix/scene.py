@@ -1,4 +1,4 @@
-"""What an event of the matrix may touch, and those who change the directory meanwhile."""
+"""The things that an event of the matrix may touch, and those who change the directory meanwhile."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def visible(here: Rig) -> State:
 
 @dataclass
 class Scene:
-    """What an event may touch.
+    """The things that an event may touch.
 
     Attributes:
         at_end: called when the operation ended.
