@@ -40,8 +40,6 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """
     while True:
         node.require_not_stale()
-        if node.draft is not None:
-            await require_base_there(context, node.draft)
         if node.base_handle is None:
             opened = await open_node(context, node)
             if node.base_handle is None:
@@ -63,21 +61,6 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             ):
                 context.files.on_replaced(node.path)
             raise
-
-
-async def require_base_there(context: Context, draft: Draft) -> None:
-    """Check by listings that the base of a draft still has its name. Costs nothing unless changes of names
-    were not answered.
-
-    Raises:
-        FileChanged: one of them took the name away, so the draft is stale. Else as Directories.ask_entry.
-    """
-    for path in list(draft.taken_if_gone):
-        gone = await context.directories.ask_entry(path) is None
-        if gone and path in draft.taken_if_gone:  # else it was emptied, or the name went otherwise, meanwhile
-            draft.lose_base(though_rewritten=True)
-            raise FileChanged(f"{path!r} is gone: what was changed here is another file by now")
-        draft.taken_if_gone.discard(path)
 
 
 async def fetch(context: Context, node: Node, draft: Draft) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from mavftpfs.cache.attributes import SECOND, Times
 from mavftpfs.cache.directories import Directories, Directory
@@ -13,7 +14,6 @@ from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
 from mavftpfs.shared import readonly
@@ -22,14 +22,20 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 from mavftpfs.shared.sameness import Listed, Sameness, compare
 
 
+class ListLater(Protocol):
+    """See repair.Repair.list_later."""
+
+    def __call__(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None: ...
+
+
 @dataclass(slots=True)
 class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
     clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. times: mtimes that the vehicle
     cannot be told. blocked: nothing may be changed, because the vehicle is armed (only
-    Writeback.armed_changed sets it). retry_later(): to be called when something was not delivered, or a
-    replacement is unfinished; it is tried again.
+    Writeback.armed_changed sets it). retry_later(): to be called when something was not delivered; it is
+    tried again. list_later(directory), look_later(): see repair.Repair.
     """
 
     store: VehicleStore
@@ -43,13 +49,10 @@ class Context:
     paths: PathLocks
     spool: Spool
     retry_later: Callable[[], None]
+    list_later: ListLater
+    look_later: Callable[[], None]
     times: Times = field(default_factory=Times)
     blocked: bool = False
-
-    @property
-    def replacements(self) -> Replacements:
-        """See Nodes."""
-        return self.nodes.replacements
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""

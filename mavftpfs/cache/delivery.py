@@ -15,12 +15,14 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from math import inf
 
 import trio
 
 from mavftpfs.cache import base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, Event, State
+from mavftpfs.cache.looking import look
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
@@ -68,6 +70,10 @@ a mount: finding out costs four requests on every card."""
 
 START_PAUSE = 5.0
 """Seconds after which an upload that could not begin is tried again."""
+
+LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
+"""Seconds after which it is tried again to find out what has a name; the second if only a checksum is
+lacking, which is asked for after the flight."""
 
 PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, NotVerified, Armed)
 """Errors after which the upload goes on where it stopped."""
@@ -148,8 +154,8 @@ class Deliverer:
         due = context.clock() >= node.start_after and not context.blocked and not node.claims
         if not due or draft.base_limit or draft.unacked < START_AT or not may_pass(node):
             return  # of a file that only changes every byte is sent again: that waits for the close
-        if context.replacements.is_unfinished(node.path):
-            return  # the next delivery finds out first
+        if node.unsure is not None:
+            return  # the next delivery looks first
         try:
             with trio.CancelScope() as node.delivery:
                 async with context.paths.steady(node, lasting=True):
@@ -175,11 +181,11 @@ class Deliverer:
                 await attempt.upload.end()
             finally:
                 if node.draft is not None and node.draft.sending is attempt.sending:
-                    node.draft.give_up()
+                    node.draft.end_attempt()
             if not attempt.in_place and attempt.upload.may_exist:
                 await self._names.discard(attempt.path)
         finally:
-            self._context.own.in_use.discard(attempt.path)
+            self._context.own.release(attempt.path)
 
     async def break_off(self, node: Node, error: MavftpfsError) -> None:
         """Break a file, because a program was told that a write failed after others had been taken.
@@ -192,6 +198,7 @@ class Deliverer:
         assert draft is not None
         draft.on(Event.FAILED)
         node.attempt, node.error = None, error
+        self._names.settle(node)
         if attempt is not None and not attempt.in_place and attempt.upload.may_exist:
             self.parts.append(attempt.path)
         if draft.base is None and draft.sent_in_place:
@@ -241,7 +248,7 @@ class Deliverer:
                 log.info("%r stays on the card: %s", part, nak)
             if part in self.parts:  # else another call was faster
                 self.parts.remove(part)
-            self._context.own.in_use.discard(part)
+            self._context.own.release(part)
 
     async def withdraw(self, node: Node) -> bool | None:
         """Take back the undelivered bytes of a file: nothing of it is sent from now on.
@@ -269,10 +276,9 @@ class Deliverer:
             if node.broken:
                 return await self._withdraw_broken(node, draft, there)
             try:
-                if context.replacements.is_unfinished(node.path):
-                    await self._end_unfinished(node, draft)
-                    if not node.undelivered:
-                        return True
+                await self.look(node)
+                if not node.undelivered:
+                    return True
                 await self.abandon(node)
                 if draft.base is not None:
                     there = None if draft.sent_in_place else there
@@ -318,8 +324,7 @@ class Deliverer:
         while True:
             in_place = store.traits.rename_works is False
             try:
-                if self._context.replacements.is_unfinished(node.path):
-                    await self._end_unfinished(node, draft)
+                await self.look(node)
                 if draft.state is not State.CLEAN:
                     await self._send(node, draft)
                 return
@@ -338,32 +343,41 @@ class Deliverer:
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
 
-    async def _end_unfinished(self, node: Node, draft: Draft) -> None:
-        """End the record of a replacement that was interrupted: a listing tells whether the name has a file,
-        and that is compared with the draft.
+    async def look(self, node: Node) -> None:
+        """If the placing of a file was interrupted, find out what has its name, and give a missing name its
+        file. The caller holds the node's lock.
 
         Raises:
-            As Directories.ask_entry, Verifier.check and Verifier.is_same.
+            As looking.look.
         """
-        context, path = self._context, node.path
-        there = await context.directories.ask_entry(path)
-        record = context.replacements.get(path)  # as that listing left it: the cleaner may have ended it
-        if there is None and record is not None and record.aside is not None:
-            with suppress(FtpNak):  # the cleaner was faster, or it is gone: the draft becomes a new file
-                await self._names.rename(record.aside, path, completes=True)
-                record.placed = False
-            there = await context.directories.ask_entry(path)
-        if draft.whole and there is None:
-            draft.base, draft.base_limit = None, 0
-        elif draft.whole and record is not None and record.placed is None:
-            try:
-                crc32 = await self.verifier.check(path, draft, doubted=True)
-            except VerificationFailed:  # a program wrote more since, or others replaced the file
-                if record.sent is not None and await self.verifier.is_same(path, record.sent):
-                    draft.base = record.sent
+        unsure, draft = node.unsure, node.draft
+        if unsure is None or draft is None:
+            return
+        if await look(self._context, self._names, node):
+            if draft.changes == unsure.changes:
+                self._on_delivered(node, draft, unsure.sent.crc32)
             else:
-                self._on_delivered(node, draft, crc32)
-        context.replacements.end(path)
+                draft.base = unsure.sent
+
+    async def look_at_all(self) -> float:
+        """Look at all files whose placing was interrupted, unless a delivery or a change of the name does;
+        return in how many seconds that is to be done again, infinite if it is not."""
+        again = inf
+        for node in self._context.nodes:
+            if node.unsure is None:
+                continue
+            if node.lock.locked():
+                again = min(again, LOOK_AGAIN)
+                continue
+            try:
+                async with node.lock:
+                    await self.look(node)
+            except MavftpfsError as error:
+                log.info("what has the name %r is not known yet: %s", node.path, error)
+                again = min(again, IN_FLIGHT if isinstance(error, Armed) else LOOK_AGAIN)
+            else:
+                self._context.nodes.maybe_forget(node)
+        return again
 
     # --- sending
 
@@ -383,16 +397,15 @@ class Deliverer:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
         await self._context.store.let_rest(attempt.path)
         crc32 = await self._compare_and_look(node, draft, attempt)
-        try:
-            with self._context.store.finishing():
-                node.attempt = None
-                await attempt.upload.end()
-                if not attempt.in_place:
-                    await self._place(node, draft, attempt, crc32)
+        with self._context.store.finishing():
+            node.attempt = None
+            draft.end_attempt()
+            await attempt.upload.end()
             if not attempt.in_place:
-                await self._compare_again(node, draft, attempt, Known(draft.size, crc32=crc32))
-        finally:
-            self._context.own.in_use.discard(attempt.path)  # the next listing cleans up what is left there
+                await self._place(node, draft, attempt, crc32)
+        if not attempt.in_place:
+            await self._compare_again(node, draft, attempt, crc32)
+            self._names.settle(node)
         self._on_delivered(node, draft, crc32)
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
@@ -415,18 +428,17 @@ class Deliverer:
             await self._require_untouched(node, draft)
             await context.store.let_rest(path)
         else:
-            path = context.own.beside(node.path, Kind.NEW)
+            path = context.own.need(node.path, Kind.NEW)
         try:
             sending = draft.begin(in_place=in_place, progress=partial(self._throttle.on_acked, draft))
             upload = context.store.open_upload(path, sending)
         except MavftpfsError:
-            draft.give_up()
+            draft.end_attempt()
+            context.own.on_gone(path)
             raise
         attempt = node.attempt = Attempt(path, in_place, sending, upload, begun_at)
         if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
-        else:
-            context.own.in_use.add(path)
         return attempt
 
     async def _compare_and_look(self, node: Node, draft: Draft, attempt: Attempt) -> int | None:
@@ -455,10 +467,9 @@ class Deliverer:
         still the same.
 
         Raises:
-            AlreadyExists. FileChanged: the draft is stale from now on. Else as base.require_base_there,
-            Names.is_free and Verifier.is_same.
+            AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free and
+            Verifier.is_same.
         """
-        await base.require_base_there(self._context, draft)
         path = node.path
         if draft.base is not None and draft.base_limit and not draft.sent_in_place:
             if not await self.verifier.is_same(path, draft.base):
@@ -478,53 +489,38 @@ class Deliverer:
         """Rename what was sent and verified into place. crc32: as the vehicle told it, if it did.
 
         Raises:
-            As Names.rename and replace.
+            As Names.place.
         """
-        replacements, path = self._context.replacements, node.path
-        sent = Known(draft.size, crc32=crc32)
         self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
-        draft.on(Event.COMMITS)
         try:
-            if draft.base is None:
-                await self._names.remove_aside(path)
-                await self._names.rename(attempt.path, path)
-            else:
-                await self._names.replace(attempt.path, path)
-        except MavftpfsError as error:
-            draft.on(Event.NOT_PLACED)
-            if isinstance(error, OutcomeUnknown) or replacements.is_unfinished(path):
-                replacements.on_interrupted(path).sent = sent
-            else:
-                await self._names.discard(attempt.path)
+            await self._names.place(node, attempt.path, Known(draft.size, crc32=crc32))
+        except OutcomeUnknown:
+            raise
+        except MavftpfsError:
+            await self._names.discard(attempt.path)
             raise
 
-    async def _compare_again(self, node: Node, draft: Draft, attempt: Attempt, sent: Known) -> None:
+    async def _compare_again(self, node: Node, draft: Draft, attempt: Attempt, crc32: int | None) -> None:
         """Compare a file once more, under its own name, where the ACK of its rename is not proof enough.
 
-        A late copy of its CreateFile may have emptied it after it was compared. A late copy of an earlier
-        rename may have taken it away. A server may ACK a rename and do something else: it is believed once it
-        was seen to rename.
+        A late duplicate of its CreateFile may have emptied it after it was compared. A late duplicate of an
+        earlier rename may have taken it away. A server may ACK a rename and do something else: it is believed
+        once it was seen to rename. If this is interrupted, the file stays unsure.
 
         Raises:
-            VerificationFailed: it is not there. Else as Verifier.check. The replacement is unfinished then.
+            VerificationFailed: it is not there, so it is sent again, whatever has the name. Else as
+            Verifier.check.
         """
         store, path = self._context.store, node.path
         doubted, unproven = store.in_doubt(attempt.begun_at), store.traits.rename_works is None
         try:
-            if doubted or (unproven and sent.crc32 is not None):
+            if doubted or (unproven and crc32 is not None):
                 await self.verifier.check(path, draft, doubted=doubted)
             elif (unproven or attempt.upload.made_twice) and await self._names.size(path) != draft.size:
                 raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
-        except BaseException as error:
-            record = self._context.replacements.on_interrupted(path)
-            # From now on the cleaner may give the old file its name back.
-            self._context.own.in_use.discard(record.aside or b"")
-            if isinstance(error, VerificationFailed):
-                draft.not_confirmed()
-            else:  # others may have put a file there before the vehicle is heard again
-                record.sent = sent
-                draft.on(Event.NOT_PLACED)
-            if unproven and isinstance(error, VerificationFailed):
+        except VerificationFailed:
+            draft.not_confirmed()
+            if unproven:
                 await self._names.learn_rename_works(path)
             raise
         store.traits.rename_works = True

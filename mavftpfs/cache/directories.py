@@ -84,7 +84,7 @@ class Directory:
     entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
     after that it proves nothing. complete: the vehicle listed it to its end. end: see ListDirectory.
     sizes: what replies to opens told since; they beat the listing. growing: when a file was last seen to be
-    larger than before, though we did not write it.
+    larger than before, though we did not write it. seen: of temporary names, how each looks, and since when.
     """
 
     entries: dict[bytes, DirEntry]
@@ -95,6 +95,7 @@ class Directory:
     end: int | None = None
     sizes: dict[bytes, int] = field(default_factory=dict)
     growing: dict[bytes, float] = field(default_factory=dict)
+    seen: dict[bytes, tuple[tuple[int, bool], float]] = field(default_factory=dict)
 
     def size_of(self, name: bytes) -> int:
         """Return the best known size of a listed name in bytes."""
@@ -463,6 +464,7 @@ class Directories:
             life = 0.0
         new = Directory(entries, sweep.began, now, now + life, listing.complete, listing.end)
         if old is not None:
+            new.seen = old.seen
             _see_growth(old, new, sweep)
         if not sweep.void:
             self._known[sweep.path] = new

@@ -29,16 +29,15 @@ STEP = 64 * 1024
 class State(Enum):
     """How far the vehicle has a draft.
 
-    CLEAN: it has all of it. DIRTY: it lacks some, or may lack it after interrupted renames (`replacements`
-    tells), and nothing is under way. SENDING: a new file is written under a reserved name, or under its own
-    if the card cannot rename. COMMITTING: that file is verified and being renamed into place. STALE: the base
-    is another file now. BROKEN: a program was told that a write failed, so the vehicle never gets the draft.
+    CLEAN: it has all of it. DIRTY: it lacks some, and nothing is sent; or all is sent, and gets its name
+    (`Node.unsure`). SENDING: a new file is written under a temporary name, or under its own if the card
+    cannot rename. STALE: the base is another file now. BROKEN: a program was told that a write failed, so the
+    vehicle never gets the draft.
     """
 
     CLEAN = "clean"
     DIRTY = "dirty"
     SENDING = "sending"
-    COMMITTING = "committing"
     STALE = "stale"
     BROKEN = "broken"
 
@@ -47,19 +46,16 @@ class Event(Enum):
     """What happens to a draft.
 
     CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
-    BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
-    is verified, and the first rename is about to be asked for. PLACED: it has its name. NOT_PLACED: it does
-    not have its name, or that is not known. REPLACED: others replaced the base. FAILED: a write was answered
-    with an error after others had been taken.
+    BEGUN: an attempt to send it began. ENDED: the attempt ended. PLACED: the vehicle has it, verified, under
+    its name. REPLACED: others replaced the base. FAILED: a write was answered with an error after others had
+    been taken.
     """
 
     CHANGED = "changed"
     EMPTIED = "emptied"
     BEGUN = "begun"
-    GIVEN_UP = "given up"
-    COMMITS = "commits"
+    ENDED = "no longer sent"
     PLACED = "placed"
-    NOT_PLACED = "not placed"
     REPLACED = "replaced"
     FAILED = "failed"
 
@@ -81,13 +77,8 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.SENDING: {
         Event.CHANGED: State.SENDING,
         Event.EMPTIED: State.DIRTY,
-        Event.GIVEN_UP: State.DIRTY,
-        Event.COMMITS: State.COMMITTING,
+        Event.ENDED: State.DIRTY,
         Event.FAILED: State.BROKEN,
-    },
-    State.COMMITTING: {
-        Event.PLACED: State.CLEAN,
-        Event.NOT_PLACED: State.DIRTY,
     },
     State.STALE: {
         Event.EMPTIED: State.DIRTY,
@@ -128,8 +119,7 @@ class Draft:
         base: what is known of the file on the vehicle, None if there is none.
         base_limit: below this, bytes that are not held are the base's. 0: nothing of the base stays, so the
             file is replaced whatever it has become.
-        taken_if_gone: if one of these paths is gone, a change of names that was not answered took the base's
-            name away.
+        changes: counts the changes of the content.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
     """
@@ -139,7 +129,7 @@ class Draft:
         self.size = 0 if base is None else base.size
         self.base = base
         self.base_limit = self.size
-        self.taken_if_gone: set[bytes] = set()
+        self.changes = 0
         self.state = State.DIRTY if base is None else State.CLEAN
         self.sending: SendBuffer | None = None
         self._in_place = False  # the present attempt, or the last one
@@ -276,38 +266,33 @@ class Draft:
         self.sending = SendBuffer(self.local_bytes, self.size, progress)
         return self.sending
 
-    def give_up(self) -> None:
-        """Note that the attempt ended without success."""
+    def end_attempt(self) -> None:
+        """Note that the attempt ended, if there is one."""
         if self.state is State.SENDING:
-            self.on(Event.GIVEN_UP)
+            self.on(Event.ENDED)
 
     def not_confirmed(self) -> None:
-        """Note that a comparison right after the rename showed other bytes, or no file: what we placed there
+        """Note that a comparison right after the rename showed other bytes, or no file: what was placed there
         is spoilt, and the next delivery may replace it, whatever it has become. All of the draft is here.
-
-        If the comparison was only interrupted, others may have put a file there: see Replacement.sent.
         """
-        self.on(Event.NOT_PLACED)
         self.base, self.base_limit = Known(self.size), 0
 
     def delivered(self, crc32: int | None = None) -> None:
         """Note that the vehicle has it, verified: from now on that is the base. crc32: of the content, if
         known."""
-        if self.state is State.SENDING:  # a card that cannot rename
-            self.on(Event.COMMITS)
         self.on(Event.PLACED)
         self.base, self.base_limit = Known(self.size, crc32=crc32), self.size
-        self.taken_if_gone.clear()
         self._sent_in_place = False
         self.content.mark_unneeded()
 
     def lose_base(self, *, though_rewritten: bool = False) -> None:
         """Note that others replaced the base. That changes nothing if no byte of the base was to stay, unless
-        `though_rewritten`: another file that got the name by a change of ours may be its only copy.
+        `though_rewritten`: a change of names that was not answered may have given the name to another file,
+        and this may be its only copy.
         """
         stays = self.base_limit or self.state is State.CLEAN  # CLEAN: also an empty base
         if (stays or though_rewritten) and self.state is not State.STALE:
-            self.give_up()
+            self.end_attempt()
             self.on(Event.REPLACED)
 
     def on(self, event: Event) -> None:
@@ -319,8 +304,7 @@ class Draft:
         after = TRANSITIONS[self.state].get(event)
         if after is None:
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
-        if self.state is State.STALE:  # it was emptied, so whatever has the name is to be replaced
-            self.taken_if_gone.clear()
+        self.changes += event in (Event.CHANGED, Event.EMPTIED)
         self.state = after
         if after is not State.SENDING:
             self._sent_in_place, self.sending = self.sent_in_place, None
@@ -331,7 +315,7 @@ class Draft:
         assert self.base_limit <= self.size
         assert (self.sending is not None) == (self.state is State.SENDING)
         assert self.base is not None or self.base_limit == 0
-        if self.state in (State.SENDING, State.COMMITTING):
+        if self.state is State.SENDING:
             assert self.whole
 
     # --- inside

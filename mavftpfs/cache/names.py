@@ -6,24 +6,27 @@ remove(3). On NuttX a rename moves into a directory. A rename may replace a file
 
 The session finds out whether a change happened. Here the remembered listings are updated.
 
-A new file is renamed to a free name, never over another file. An existing file is replaced by one rename
-where the server does that in one step. Else (FAT refuses it, NuttX removes the target first) it takes three
-requests: the old file is moved aside, the new one gets the name, the old one is removed. After the first
-request the name has no file. So the second one is sent even if the vehicle was armed meanwhile. If it cannot
-be sent because the link is lost, the replacement is unfinished (`replacements`): programs still see the name,
-and when the link is back a listing is made and the name gets a file again (`repair`).
+**How does a file get its name?** (`Names.place`) A new file is renamed to a free name, never over another
+file. An existing file is replaced by one rename where the server does that in one step. Otherwise (FAT
+refuses it, NuttX removes the target first) that takes three requests: the old file is moved aside, the new
+one gets the name, the old one is removed. After the first request the name has no file, so the second one is
+sent even if the vehicle was armed meanwhile. Once begun, all of that is finished, even if the caller is
+cancelled. If the vehicle stops answering, the file stays `unsure`, and `looking` finds out what has its name;
+of a `mv`, `repair` gives the name its file again.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from math import inf
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.replacements import Replacement
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
+from mavftpfs.cache.unsure import Placeable, Unsure
 from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -37,11 +40,13 @@ from mavftpfs.shared.errors import (
     PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, is_on_nuttx, join, split
+from mavftpfs.shared.sameness import Known
 
 log = logging.getLogger("mavftpfs.cache")
 
 LIES_ASIDE = 10.0
-"""Seconds for which the old file stays aside when it was replaced in doubt."""
+"""Seconds for which the old file stays aside if it was replaced while replies were suspect. After these
+seconds a directory is listed if they were."""
 
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
 """Refusals that mean what they say. Others may mean that the server never renames over a file."""
@@ -145,10 +150,10 @@ class Names:
     # --- changing
 
     async def remove(self, path: bytes) -> None:
-        """Remove a file. Raises as VehicleStore. A reserved name is used once, so it does not rest before."""
+        """Remove a file; no temporary name rests before, because it is used once. Raises as VehicleStore."""
         async with self._changing(path):
             await self._context.store.remove(path, at_once=is_reserved(split(path)[1]))
-        self._context.directories.put(path, None)
+        self._on_gone(path)
 
     async def remove_if_there(self, path: bytes) -> None:
         """Remove a file that may be gone. Raises as VehicleStore."""
@@ -157,7 +162,11 @@ class Names:
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
-            self._context.directories.put(path, None)
+            self._on_gone(path)
+
+    def _on_gone(self, path: bytes) -> None:
+        self._context.own.on_gone(path)
+        self._context.directories.put(path, None)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove an empty directory. Raises as VehicleStore."""
@@ -172,13 +181,13 @@ class Names:
         self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY))
 
     async def discard(self, path: bytes) -> None:
-        """Remove a reserved name that is not needed any more. If that fails, it is removed after the next
-        listing of its directory, or by `purge`."""
+        """Remove a temporary name that is not needed any more. If that fails, `repair` removes it."""
+        self._context.own.release(path)
         try:
             await self.remove_if_there(path)
         except MavftpfsError as error:
             log.info("%r stays until its directory is listed again: %s", path, error)
-            self._context.directories.expire(split(path)[0])
+            self._context.list_later(split(path)[0])
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
         """Rename; both paths fit a request.
@@ -204,6 +213,7 @@ class Names:
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
+        self._context.own.on_gone(old)
         self._context.directories.rename(old, new)
 
     async def learn_rename_works(self, near: bytes) -> None:
@@ -226,11 +236,10 @@ class Names:
         """Make an empty file, rename and remove it; return False if it was lost on the way."""
         context, store, own = self._context, self._context.store, self._context.own
         try:
-            first = place = own.beside(near, Kind.NEW)
-            second = own.beside(first, Kind.NEW)
+            first = place = own.need(near, Kind.NEW)
+            second = own.need(first, Kind.NEW)
         except PathTooLong:
             return True
-        own.in_use |= {first, second}
         try:
             await store.create_empty(first)
             try:
@@ -245,55 +254,73 @@ class Names:
             log.debug("an empty file beside %r was refused: %s", near, nak)
             return place != second or await context.directories.ask_entry(second) is not None
         finally:
-            own.in_use -= {first, second}
+            own.release(first)
+            own.release(second)
             context.directories.expire(split(near)[0])  # the next listing cleans up what is left
         return True
 
     async def purge(self, path: bytes) -> None:
-        """Before a name goes, remove what earlier replacements left: it would bring the name back.
+        """Before a name goes, remove old files of it, also those of other mounts: repair would bring the name
+        back.
 
         Raises:
             As VehicleStore: then the name has to stay.
         """
-        await self.remove_aside(path)
-        own, (parent, name) = self._context.own, split(path)
-        directory = self._context.directories.known(parent)
-        ended = self._context.replacements.end(path)
-        needed = own.in_use | self._context.replacements.needed_asides()
+        context, (parent, _) = self._context, split(path)
+        directory = context.directories.known(parent)
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
-            if reserved is None or reserved.owner != own.owner or left in needed:
-                continue
-            if reserved.target in (name, None):
-                try:
-                    await self.remove_if_there(left)
-                except MavftpfsError:
-                    if ended is not None:
-                        self._context.replacements.put(path, ended)
-                    raise
-
-    async def remove_aside(self, path: bytes) -> None:
-        """Remove the old file that still lies aside, if one does: the name is about to change again."""
-        own, replacements = self._context.own, self._context.replacements
-        record = replacements.get(path)
-        if record is None or not record.placed:
-            return
-        replacements.end(path)
-        if record.aside in own.in_use:
-            own.in_use.discard(record.aside)
-            await self.remove_if_there(record.aside)
+            old = reserved is not None and reserved.kind is Kind.OLD
+            if reserved is not None and old and context.own.target_of(left, reserved) == path:
+                await self.remove_if_there(left)
 
     # --- giving a verified file its name
 
-    async def replace(self, source: bytes, target: bytes) -> None:
-        """Rename over a file that exists.
+    async def place(self, file: Placeable, temporary: bytes, sent: Known) -> None:
+        """Give a file its name: rename its verified temporary file, over the file that has the name if it
+        has a base. The caller holds the file's lock, and has looked at the name just before.
+
+        From the first request on the file is `unsure`. It still is when this returns, so the caller can
+        compare the file under its name first; then it calls `settle`. sent: what is placed.
+
+        Raises:
+            OutcomeUnknown: the file stays unsure. Else as rename and replace: the file was not placed.
+        """
+        context, path = self._context, file.path
+        with context.store.finishing():
+            await self._remove_asides(path)
+            file.unsure = Unsure(temporary, None, sent, file.changes)
+            context.look_later()
+            try:
+                if file.base is None:
+                    await self.rename(temporary, path)
+                else:
+                    await self.replace(temporary, path, file)
+            except OutcomeUnknown:
+                raise
+            except MavftpfsError:
+                file.unsure = None
+                raise
+
+    def settle(self, file: Placeable) -> None:
+        """Note that it is known what has the name of a file. What is left of its placing is repaired."""
+        unsure, file.unsure = file.unsure, None
+        if unsure is not None:
+            own, now = self._context.own, self._context.clock()
+            for left in filter(None, (unsure.temporary, unsure.aside)):
+                if own.needed.get(left, now) == inf:
+                    own.release(left)
+                    self._context.list_later(split(left)[0])
+
+    async def replace(self, source: bytes, target: bytes, file: Placeable | None = None) -> None:
+        """Rename over a file that exists. file: the unsure file that is placed.
 
         One rename is enough where the server never leaves the name without a file. NuttX removes the old file
         first (servers.md 9).
 
         Raises:
             NotSupported: the server does not rename. Else as VehicleStore.rename. After an error the old file
-            has its name again, unless the replacement is unfinished.
+            has its name again. After OutcomeUnknown that is not known, and `repair` looks.
         """
         traits = self._context.store.traits
         if traits.rename_replaces is not False and not is_on_nuttx(target):
@@ -307,18 +334,27 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        await self.remove_aside(target)
-        own = self._context.own
-        aside = own.beside(target, Kind.OLD)
-        own.in_use.add(aside)
-        stays = False
+        own, shown = self._context.own, self._context.directories.entry(target)
+        aside = own.need(target, Kind.OLD)
+        if file is not None and file.unsure is not None:
+            file.unsure = dataclasses.replace(file.unsure, aside=aside)
         with self._context.store.finishing():
             try:
-                if await self._swap(source, target, aside):
-                    stays = await self._discard_old(target, aside)
-            finally:
-                if not stays:
-                    own.in_use.discard(aside)
+                moved = await self._swap(source, target, aside)
+            except OutcomeUnknown:
+                if file is None:
+                    if shown is not None:
+                        self._context.directories.put(target, shown)  # programs go on seeing it
+                    own.release(aside)
+                    self._context.list_later(split(target)[0])
+                raise
+            except MavftpfsError:
+                own.on_gone(aside)
+                raise
+            if moved:
+                await self._leave_or_remove(aside)
+            else:
+                own.on_gone(aside)
 
     def on_unknown(self, *paths: bytes) -> None:
         """Note that it is not known what these names are after an interrupted change: the listings and files
@@ -330,56 +366,71 @@ class Names:
 
     # --- inside
 
+    async def _remove_asides(self, path: bytes) -> None:
+        """Remove old files of a name that this mount left aside for some seconds: the name changes again.
+
+        Raises:
+            As VehicleStore.
+        """
+        own = self._context.own
+        for aside in [aside for aside, target in own.targets.items() if target == path]:
+            if own.is_needed(aside, self._context.clock()) and own.needed[aside] < inf:
+                await self.remove_if_there(aside)
+
     async def _swap(self, source: bytes, target: bytes, aside: bytes) -> bool:
         """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
 
         Raises:
-            As replace.
+            OutcomeUnknown: the target may have no file. Else as replace.
         """
-        moved: bool | None = None  # not known
+        moved = await self._move_aside(target, aside)
         try:
-            try:
-                await self.rename(target, aside)
-                moved = True
-            except FtpNak as nak:
-                gone = errno_for(nak) == errno.ENOENT
-                if not gone or await self._context.directories.ask_entry(target) is not None:
-                    raise
-                moved = False
             await self.rename(source, target, completes=moved)
-        except OutcomeUnknown:
-            if moved is not False:
-                self._note_unfinished(target, aside, placed=None if moved else False)
-            raise
-        except MavftpfsError:
-            if moved:
+        except MavftpfsError as error:
+            if moved and not isinstance(error, OutcomeUnknown):
                 await self._undo(aside, target)
             raise
         return moved
 
-    async def _discard_old(self, target: bytes, aside: bytes) -> bool:
-        """Remove the file that a new one replaced; return whether it stays for now. In doubt it stays until a
-        listing shows the new one: a late copy of the first rename may have moved that over the old one.
-        `Cleaner.finish` sees to that. Removed or not, the record stays for some seconds: a late copy may
-        bring the old file back."""
-        context, stays = self._context, self._context.store.in_doubt()
-        if not stays:
-            await self.discard(aside)
-        context.replacements.put(target, Replacement(aside, placed=True, until=context.clock() + LIES_ASIDE))
-        context.retry_later()
-        return stays
+    async def _move_aside(self, target: bytes, aside: bytes, *, again: bool = True) -> bool:
+        """Move the old file aside; return False if there is none.
 
-    def _note_unfinished(self, path: bytes, aside: bytes, *, placed: bool | None) -> None:
-        """Note that the file of a name may lie aside: go on showing the name, and have its directory
-        listed."""
-        context = self._context
-        entry = context.directories.entry(path) or context.directories.entry(aside)
-        if entry is not None:
-            context.directories.put(path, entry)
-        context.replacements.put(path, Replacement(aside, placed=placed))
-        context.retry_later()
-        context.directories.expire(split(path)[0])
-        log.warning("%r may lie under %r until the vehicle is heard again", path, aside)
+        again: if a late duplicate had moved it, the look after the refusal gives it its name back, and it is
+        moved then.
+        """
+        try:
+            await self.rename(target, aside)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            if await self._context.directories.ask_entry(target) is None:
+                return False
+            if not again:
+                raise
+            return await self._move_aside(target, aside, again=False)
+        return True
+
+    async def _undo(self, aside: bytes, path: bytes) -> None:
+        """Give an old file its name back.
+
+        Raises:
+            OutcomeUnknown: that failed.
+        """
+        try:
+            await self.rename(aside, path, completes=True)
+        except MavftpfsError as error:
+            raise OutcomeUnknown(f"{path!r} may be {aside!r} for a while: {error}") from error
+
+    async def _leave_or_remove(self, aside: bytes) -> None:
+        """Remove the old file of a name that has a new one. In doubt it stays aside for some seconds: a late
+        duplicate of the first rename may move the new file over it. That is looked at then, also if the doubt
+        arises in these seconds."""
+        context, parent = self._context, split(aside)[0]
+        if context.store.in_doubt():
+            context.own.needed[aside] = context.clock() + LIES_ASIDE
+        else:
+            await self.discard(aside)
+        context.list_later(parent, LIES_ASIDE, only_in_doubt=True)
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
@@ -390,13 +441,6 @@ class Names:
         except OutcomeUnknown:
             self.on_unknown(*paths)
             raise
-
-    async def _undo(self, place: bytes, path: bytes) -> None:
-        try:
-            await self.rename(place, path, completes=True)
-        except MavftpfsError as error:
-            self._note_unfinished(path, place, placed=False)
-            log.debug("%r did not get its file back: %s", path, error)
 
 
 def _plain(name: bytes) -> bytes:

@@ -109,19 +109,19 @@ class Namespace:
                 nodes.maybe_forget(node)
 
     @asynccontextmanager
-    async def _looks_later(self, *paths: bytes) -> AsyncIterator[None]:
-        """For a body that moves or removes the first path. If its outcome is unknown, forget what these names
-        were. If it happened, the first path is gone. So drafts of these paths look for it before they go on.
-        """
+    async def _moving(self, *paths: bytes) -> AsyncIterator[None]:
+        """For a body that moves the first path to the second. If its outcome is unknown, forget what these
+        names were; files of these names that are not delivered are STALE, because their names may have other
+        files."""
         context = self._context
         try:
             yield
-            context.nodes.on_gone(paths[0])
-        except OutcomeUnknown:  # perhaps it was done, and what follows it was not
+        except OutcomeUnknown:
             self._names.on_unknown(*paths)
             for node in [n for path in paths for n in context.nodes.below(path)]:
                 if node.undelivered and node.draft is not None:
-                    node.draft.taken_if_gone.add(paths[0])
+                    self._names.settle(node)
+                    node.draft.lose_base(though_rewritten=True)
                 else:
                     context.files.on_replaced(node.path)
             raise
@@ -132,11 +132,12 @@ class Namespace:
         context, node = self._context, self._context.nodes.get(path)
         draft = None if node is None else node.draft
         if node is not None:
+            await self._deliverer.look(node)
             await self._deliverer.abandon(node)
         entry = await context.directories.ask_entry(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
         if draft is not None:  # a file of others under its name is not to be removed, if it holds something
-            ours = draft.base is not None or draft.sent_in_place or context.replacements.is_unfinished(path)
+            ours = draft.base is not None or draft.sent_in_place
             there &= ours or (entry is not None and not entry.size)
         elif entry is None:
             context.nodes.forget_broken(path)
@@ -148,9 +149,8 @@ class Namespace:
         await self._names.purge(path)
         context.nodes.forget_broken(path)
         if there:
-            async with self._looks_later(path):
-                await self._names.remove_if_there(path)
-                context.files.on_changed(path)
+            await self._names.remove_if_there(path)
+            context.files.on_changed(path)
         if node is not None:
             context.nodes.unnamed(node)
 
@@ -197,8 +197,8 @@ class Namespace:
         context.nodes.rename(old, new)
         for path in (old, new):
             context.nodes.forget_broken(path)
-        context.own.follow_rename(old, new)
-        context.replacements.follow_rename(old, new)
+        for directory in context.own.follow_rename(old, new):
+            context.list_later(directory)
         self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
@@ -209,10 +209,11 @@ class Namespace:
             if node.draft is not None and node.draft.base is None:
                 raise FileBusy(f"{node.path!r} is being written, and not on the vehicle yet")
         if displaced is not None:
+            await self._deliverer.look(displaced)
             await self._deliverer.abandon(displaced)
         await self._names.purge(old)
         try:
-            async with self._looks_later(old, new):
+            async with self._moving(old, new):
                 if listed is not None and listed.kind is EntryKind.FILE:
                     context.files.close_readers(new)
                     await self._names.replace(old, new)

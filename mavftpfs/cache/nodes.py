@@ -17,8 +17,8 @@ import trio
 from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.remote import Upload
-from mavftpfs.cache.replacements import Replacements
 from mavftpfs.cache.spool import Spool, SpoolContent
+from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import FileBusy, FileChanged, MavftpfsError, WriteFailed
 from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sameness import Known
@@ -53,7 +53,8 @@ class Node:
     path: its name, or its last one. draft: its content here, if it was written. handles: how many are open;
     writers: how many of them are for writing. generation: counts how often it was delivered;
     delivered_since_open: since its first writer opened it. removed: it has no name any more. error: why the
-    last delivery failed, or the write that broke the file. attempt: the present attempt to deliver it.
+    last delivery failed, or the write that broke the file. unsure: what was being placed when that was
+    interrupted. attempt: the present attempt to deliver it.
     base_handle: on the vehicle's file below the draft. start_after: no upload begins by itself before that
     time (infinite: only a close sends the file). proven_at: when the vehicle was last proven to have what the
     draft says it has. lock: a program writes the file, a delivery is under way, or a call takes its name
@@ -69,6 +70,7 @@ class Node:
     delivered_since_open: bool = False
     removed: bool = False
     error: MavftpfsError | None = None
+    unsure: Unsure | None = None
     attempt: Attempt | None = None
     base_handle: OpenFile | None = None
     start_after: float = float("-inf")
@@ -96,9 +98,32 @@ class Node:
     def changing(self) -> bool:
         """Whether we are changing the file that has its name on the vehicle (see Nodes.is_changing)."""
         draft, attempt = self.draft, self.attempt
-        if attempt is not None and attempt.in_place:
+        if self.unsure is not None or (attempt is not None and attempt.in_place):
             return True
-        return draft is not None and (draft.sent_in_place or draft.state is State.COMMITTING)
+        return draft is not None and draft.sent_in_place
+
+    # --- as cache.unsure.Placeable
+
+    @property
+    def base(self) -> Known | None:
+        """The vehicle's file that it changes, None if it is a new one."""
+        return None if self.draft is None else self.draft.base
+
+    @base.setter
+    def base(self, known: Known | None) -> None:
+        if self.draft is not None:
+            self.draft.base = known
+            if known is None:
+                self.draft.base_limit = 0
+
+    @property
+    def changes(self) -> int:
+        """How often its content changed."""
+        return 0 if self.draft is None else self.draft.changes
+
+    def crc32(self) -> int:
+        """Return the CRC32 of its content, all of which is here. Raises SpoolFailed."""
+        return 0 if self.draft is None else self.draft.crc32()
 
     @asynccontextmanager
     async def claim(self, patience: float) -> AsyncIterator[None]:
@@ -175,12 +200,11 @@ class Nodes:
     """All nodes that have a name.
 
     Attributes:
-        replacements: the records of files that we replace. broken: the last broken file of each path, until
+        broken: the last broken file of each path, until
             the path gets a good file, or loses the one that it has.
     """
 
     def __init__(self) -> None:
-        self.replacements = Replacements()
         self._by_path: dict[bytes, Node] = {}
         self.broken: dict[bytes, Node] = {}
         self._stale: list[Node] = []
@@ -203,13 +227,6 @@ class Nodes:
     def below(self, path: bytes) -> list[Node]:
         """Return the nodes at a path and below it."""
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
-
-    def on_gone(self, path: bytes) -> None:
-        """A change of ours took this name away, and was answered. So the name was still there, and no earlier
-        change without an answer had taken it (`Draft.taken_if_gone`)."""
-        for node in self._by_path.values():
-            if node.draft is not None:
-                node.draft.taken_if_gone.discard(path)
 
     def maybe_forget(self, node: Node) -> None:
         """Forget a node if no program has it open and nothing of it is undelivered."""
@@ -249,13 +266,13 @@ class Nodes:
         """Return whether we are changing what the vehicle has under a path, or a change may have happened in
         part."""
         node = self._by_path.get(path)
-        return self.replacements.is_unfinished(path) or (node is not None and node.changing)
+        return node is not None and node.changing
 
     def on_replaced(self, path: bytes) -> bool:
         """Note that another file has the path now, or may have. Handles that are open never read that one. A
         draft that needs no byte of the old file goes on. Returns whether this took the node away."""
         node = self._by_path.get(path)
-        if node is None or node.delivery is not None:
+        if node is None or node.delivery is not None or node.unsure is not None:
             return False  # a delivery compares the base itself
         draft, lacks = node.draft, node.undelivered
         if draft is not None:

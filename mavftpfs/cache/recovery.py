@@ -23,10 +23,8 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from random import Random
 
 from mavftpfs.cache.draft import Draft, State
-from mavftpfs.cache.reserved import new_owner
 from mavftpfs.cache.spool import remove
 from mavftpfs.shared.private import make_private_directory
 from mavftpfs.shared.readable import readable
@@ -36,21 +34,14 @@ log = logging.getLogger("mavftpfs.cache")
 SLOTS = 64
 """Mounts of one vehicle by one user at the same time."""
 
-TOKENS = 256
-"""So many past mounts are remembered, so that their leftovers on the vehicle are known to be ours."""
-
 LONGEST_NAME = 200
 """Bytes of the names in a recovery directory, so that every local disk takes what is added to them."""
 
 
 class SpoolDirectory:
-    """A directory on disk that one mount at a time uses; `owner` is the token in the mount's reserved names.
+    """A directory on disk that one mount at a time uses."""
 
-    Attributes:
-        dead_owners: tokens of mounts that ended here; no mount needs what they left on the vehicle.
-    """
-
-    def __init__(self, base: Path, rng: Random) -> None:
+    def __init__(self, base: Path) -> None:
         """Claim a slot below `base` that no mount uses, and that has no files of an earlier one.
 
         Raises:
@@ -60,14 +51,12 @@ class SpoolDirectory:
         slots = [base / f"slot{number}" for number in range(SLOTS)]
         self._locks: dict[Path, int] = {}
         free = [slot for slot in slots if slot.exists() and self._lock(slot)]
-        self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
         usable = [slot for slot in free if not data_in(slot)]
         new = (slot for slot in slots if slot not in free and self._lock(slot))
         path = usable[0] if usable else next(new, None)
         if path is None:
             raise OSError(f"all {SLOTS} slots of {base} are in use")
         self.path = path
-        self.owner = self._new_token(path, rng)
         self._abandoned = [slot for slot in free if slot != path]
 
     def rescue(self, recovery: Path) -> list[Path]:
@@ -113,20 +102,6 @@ class SpoolDirectory:
 
     def _unlock(self, slot: Path) -> None:
         os.close(self._locks.pop(slot))
-
-    def _tokens(self, slot: Path) -> list[bytes]:
-        """Return the tokens of the slot's mounts, the latest first."""
-        return os.pread(self._locks[slot], 8 * TOKENS, 0).split()
-
-    def _new_token(self, slot: Path, rng: Random) -> bytes:
-        """Make the token of this mount. It is a new one, because other mounts take the older ones for
-        dead."""
-        token = new_owner(rng)
-        while token in self.dead_owners:
-            token = new_owner(rng)
-        kept = [token, *self._tokens(slot)][:TOKENS]
-        os.pwrite(self._locks[slot], b"\n".join(kept) + b"\n", 0)
-        return token
 
 
 def data_in(slot: Path) -> list[Path]:

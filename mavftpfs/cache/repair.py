@@ -1,172 +1,222 @@
-"""What becomes of reserved names that an interruption left on the card. Layer: cache.
+"""What becomes of temporary names that an interruption left on the card. Layer: cache.
 
-`leftovers` finds them in a listing, `Cleaner` acts on each:
-  what was sent                  is removed: no close() reported it to be on the card
-  an old file, its name there    is removed: the new one has the name
-  an old file, its name missing  gets its name again
-  an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy
-Nothing is touched while the mount that owns it may be alive: see DEAD_AFTER.
+Each listing of a directory shows them, and `due_in` says in how many seconds which one is repaired:
+
+| whose, and what | then | when |
+|---|---|---|
+| this mount's old file, its name missing | gets its name back | at once, in flight, too |
+| this mount's, anything else | is removed | at once |
+| another mount's old file, its name missing | gets its name back | after 60 s |
+| another mount's, anything else | is removed | when it stayed the same for 600 s |
+
+What this mount still needs is left alone. An old file that tells no name becomes `recovered-oSSS`. Another
+computer's upload to a FAT card shows a size of 0 until its file is closed, which each upload does at least
+once a minute where the server keeps the content: so 600 s without a change say that nobody uploads.
+
+The mount lists these directories by itself (`Repair.later`), so that no program has to.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable
+from math import inf
+
+import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.reserved import Kind, Reserved, is_reserved, parse
+from mavftpfs.cache.reserved import Kind, Reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
-from mavftpfs.shared.model import DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
-MAX_LEFTOVERS = 128
-"""Leftovers that are dealt with after one listing."""
+MOST_AT_ONCE = 128
+"""Temporary names that are repaired after one listing."""
 
-DEAD_AFTER = 600.0
-"""Another mount's reserved name counts as left behind after it stayed the same for so many seconds."""
+NAMELESS_FOR = 60.0
+"""Seconds after which another mount that moved an old file aside is taken to have ended."""
 
-MAX_SEEN = 1024
-"""How many such names are remembered, each with the time since which it stayed the same."""
+SAME_FOR = 600.0
+"""Seconds for which another mount's temporary name stayed the same, after which its mount is taken to have
+ended."""
+
+AGAIN_AFTER = 2.0
+"""Seconds before a directory is listed again if that failed."""
+
+LOST_FOR = 0.5
+"""Seconds between two looks whether a lost vehicle is heard again."""
+
+IN_FLIGHT = 60.0
+"""Seconds before a directory is listed again in which something waits for the end of a flight."""
 
 
-def leftovers(
-    directory: bytes, entries: Iterable[DirEntry], is_dead: Callable[[bytes, bytes, DirEntry], bool]
-) -> list[tuple[bytes, Reserved]]:
-    """Return the paths in a listing that an interruption left, old files first: their names may have no file.
+def due_in(name: Reserved, owner: bytes, *, target_there: bool, age: float) -> float:
+    """Return in how many seconds a temporary name is to be repaired; 0 or less: now.
 
-    is_dead(path, owner, entry): whether no mount works with that name any more. Directories are never ours.
+    owner: this mount's token. target_there: whether the name that it belongs to has a file. age: seconds
+    since it was first seen as it is.
     """
-    found = []
-    for entry in entries:
-        name, path = parse(entry.name), join(directory, entry.name)
-        if name is not None and entry.kind is not EntryKind.DIRECTORY and is_dead(path, name.owner, entry):
-            found.append((path, name))
-    return sorted(found, key=lambda left: left[1].kind is not Kind.OLD)
+    if name.owner == owner:
+        return 0.0
+    waits = name.kind is Kind.OLD and not target_there
+    return (NAMELESS_FOR if waits else SAME_FOR) - age
 
 
-class Cleaner:
-    """Looks at every listing, removes leftovers, and ends unfinished replacements."""
+class Repair:
+    """Looks at every listing, and repairs what is due. Lists by itself what is to be looked at, and has files
+    that are `unsure` looked at, as soon as the vehicle is heard.
+    """
 
-    def __init__(self, context: Context, names: Names, dead_owners: frozenset[bytes]) -> None:
-        """`dead_owners`: mounts that are known to have ended."""
+    def __init__(
+        self, context: Context, names: Names, nursery: trio.Nursery, look: Callable[[], Awaitable[float]]
+    ) -> None:
+        """look(): looks at all unsure files once; returns in how many seconds again, infinite if none is
+        left."""
         self._context = context
         self._names = names
-        self._dead_owners = dead_owners | {context.own.owner}
-        self._seen: dict[bytes, tuple[int, float]] = {}
+        self._nursery = nursery
+        self._look = look
+        self._look_at = inf
+        self._due: dict[tuple[bytes, bool], float] = {}
         self._busy: set[bytes] = set()
+        self._running = False
+        self._news = trio.Event()
+
+    def list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None:
+        """List a directory in so many seconds, or before. only_in_doubt: only if replies are suspect by
+        then."""
+        key, at = (directory, only_in_doubt), self._context.clock() + seconds
+        if only_in_doubt:
+            self._due[key] = max(at, self._due.get(key, at))
+        else:
+            self._due[key] = min(at, self._due.get(key, at))
+        self._start()
+
+    def look_later(self) -> None:
+        """Have unsure files looked at as soon as the vehicle is heard."""
+        self._look_at = self._context.clock()
+        self._start()
+
+    def retry(self) -> None:
+        """Do at once what waits for the vehicle or for the end of a flight: there are news of the vehicle."""
+        now = self._context.clock()
+        self._due = {key: at if key[1] else now for key, at in self._due.items()}
+        if self._look_at < inf:
+            self._look_at = now
+        self._news.set()
+
+    async def finish(self) -> None:
+        """Repair everything of this mount: it ends. A directory that cannot be listed is left alone."""
+        context, doubt = self._context, self._context.store.in_doubt()
+        ours = context.own.needed.keys() | context.own.targets.keys()
+        directories = {split(path)[0] for path in ours}
+        directories |= {directory for directory, only_in_doubt in self._due if doubt or not only_in_doubt}
+        context.own.needed.clear()
+        self._due.clear()
+        for directory in directories:
+            await self._list(directory)
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
-        """Clean up after a directory was listed. Raises no MavftpfsError: the listing is right in any
-        case."""
-        replacements = self._context.replacements
-        targets = {record.aside: target for target, record in replacements if record.aside is not None}
-        reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
-        if directory is self._context.directories.known(path):
-            here = {join(path, name) for name in directory.entries}
-            for target, record in replacements:
-                if split(target)[0] == path and record.lacks_file:
-                    lost = directory.complete and record.aside not in here
-                    if target in here or lost:
-                        self._on_nothing_to_mend(target)
-        if path in self._busy or not reserved:
+        """Repair what a listing shows. Raises no MavftpfsError: the listing is valid even if this fails."""
+        if directory is not self._context.directories.known(path):
+            return  # it began before a change of ours that was interrupted, and proves nothing
+        found = self._see(path, directory)
+        waits = [seconds for _, _, seconds in found if seconds > 0.0]
+        if waits:
+            self.list_later(path, min(waits))
+        if path in self._busy:
             return
         self._busy.add(path)
         try:
-            for left, ours in leftovers(path, reserved, self._is_dead)[:MAX_LEFTOVERS]:
-                if not self._context.blocked or left in replacements.needed_asides():
-                    await self._mend(left, ours, targets.get(left))
+            for left, name, seconds in found[:MOST_AT_ONCE]:
+                if seconds > 0.0 or self._context.own.is_needed(left, self._context.clock()):
+                    continue
+                if not await self._repair(left, name, directory):
+                    self.list_later(path, IN_FLIGHT)
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
+            self.list_later(path, AGAIN_AFTER)
         finally:
             self._busy.discard(path)
 
-    async def finish(self, *, at_once: bool = False) -> None:
-        """End unfinished replacements. Names that may lack a file get theirs, and old files that lay aside
-        long enough are removed; all of them `at_once`. A listing of their directories does both.
-
-        An old file that was removed at once can be there again only by a late copy of a request. So its
-        directory is listed only in doubt.
-        """
-        context, now = self._context, self._context.clock()
-        directories = set()
-        for path, record in context.replacements:
-            if record.lacks_file and record.aside not in context.own.in_use:
-                directories.add(split(path)[0])
-            elif record.aside is None and not self._waits_for_delivery(path):
-                context.replacements.end(path)
-            elif record.placed and (at_once or record.until <= now):
-                context.own.in_use.discard(record.aside or b"")
-                if not context.store.in_doubt():
-                    context.replacements.end(path)
-                    continue
-                directories.add(split(path)[0])
-                record.until = now
-        for directory in directories:
-            try:
-                await context.directories.ask(directory)
-            except MavftpfsError as error:
-                log.info("%r is mended at a later listing: %s", directory, error)
-                continue
-            for path, record in context.replacements:
-                if split(path)[0] == directory and record.placed and record.until <= now:
-                    context.replacements.end(path)
-
     # --- inside
 
-    def _on_nothing_to_mend(self, path: bytes) -> None:
-        """Note that a name has a file, or that the old file is gone, too. If a draft waits to be delivered
-        there, its delivery looks at that; else nothing is unfinished any more."""
-        record = self._context.replacements.get(path)
-        if record is not None and self._waits_for_delivery(path):
-            record.aside = None
-        else:
-            self._context.replacements.end(path)
+    def _see(self, path: bytes, directory: Directory) -> list[tuple[bytes, Reserved, float]]:
+        """Return the temporary names in a listing, those of old files first, each with the seconds until it
+        is to be repaired."""
+        own, now, seen, found = self._context.own, self._context.clock(), directory.seen, []
+        for entry in directory.entries.values():
+            name, left = parse(entry.name), join(path, entry.name)
+            if name is None or entry.kind is EntryKind.DIRECTORY:
+                continue  # directories are never ours
+            there = split(self._target(left, name))[1] in directory.entries
+            looks = (entry.size, there)
+            if seen.get(entry.name, (None, 0.0))[0] != looks:
+                seen[entry.name] = looks, now
+            seconds = due_in(name, own.owner, target_there=there, age=now - seen[entry.name][1])
+            seconds = max(seconds, own.needed.get(left, now) - now)
+            if seconds < inf and (there or directory.complete or name.kind is Kind.NEW):
+                found.append((left, name, seconds))
+        for gone in seen.keys() - directory.entries.keys():
+            del seen[gone]
+        return sorted(found, key=lambda one: one[1].kind is not Kind.OLD)
 
-    def _waits_for_delivery(self, path: bytes) -> bool:
-        """Return whether a draft of this path waits to be delivered."""
-        node = self._context.nodes.get(path)
-        return node is not None and node.undelivered
+    def _target(self, left: bytes, name: Reserved) -> bytes:
+        """Return the path that an old file is to get."""
+        told = self._context.own.target_of(left, name)
+        return told or join(split(left)[0], b"recovered-o" + name.serial)
 
-    def _is_dead(self, path: bytes, owner: bytes, entry: DirEntry) -> bool:
-        if path in self._context.own.in_use:
+    async def _repair(self, left: bytes, name: Reserved, directory: Directory) -> bool:
+        """Remove what is left, or give it its name; return False if that waits for the end of a flight."""
+        target, ours = self._target(left, name), name.owner == self._context.own.owner
+        waits = name.kind is Kind.OLD and split(target)[1] not in directory.entries
+        if self._context.blocked and not (ours and waits):
             return False
-        if owner in self._dead_owners:
-            return True
-        seen, now = self._seen.get(path), self._context.clock()
-        if seen is None or seen[0] != entry.size:  # it is new, or it grows
-            seen = self._seen[path] = (entry.size, now)
-            if len(self._seen) > MAX_SEEN:
-                del self._seen[next(iter(self._seen))]
-        return now - seen[1] >= DEAD_AFTER
-
-    async def _mend(self, left: bytes, name: Reserved, known_target: bytes | None) -> None:
-        """Remove what is left, or give it its name. known_target: the path whose replacement left it, if this
-        mount made it."""
-        context, parent = self._context, split(left)[0]
-        target = known_target or join(parent, name.target or b"recovered-o" + name.serial)
-        if name.kind is not Kind.OLD or await self._exists(target):
-            await self._names.remove(left)
-        else:
-            node = context.nodes.get(target)
-            if node is not None and node.delivery is not None:
-                return  # its delivery is under way: a later listing shows the outcome
+        if waits:
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
-            await self._names.rename(left, target, completes=known_target is not None)
-            if known_target is not None:
-                self._on_nothing_to_mend(known_target)
+            await self._names.rename(left, target, completes=ours)
+        else:
+            await self._names.remove_if_there(left)
+        return True
 
-    async def _exists(self, path: bytes) -> bool:
-        """Return whether the vehicle has a file of this name.
+    def _start(self) -> None:
+        self._news.set()
+        if not self._running:
+            self._running = True
+            self._nursery.start_soon(self._run)
 
-        Raises:
-            VehicleLost: only an old listing was to be had, in which we may have put the name ourselves.
-        """
-        with suppress(NotFound, NotADirectory):
-            await self._context.directories.find(path)
-            self._context.directories.require_heard()
-            return True
-        return False
+    async def _run(self) -> None:
+        """Look and list, as long as there is something to."""
+        context = self._context
+        try:
+            while self._due or self._look_at < inf:
+                self._news, lost = trio.Event(), context.store.why_lost() is not None
+                at = min(self._look_at, *self._due.values(), inf)
+                with trio.move_on_after(LOST_FOR if lost else max(0.0, at - context.clock())):
+                    await self._news.wait()
+                if context.store.why_lost() is None:
+                    await self._do_due(context.clock())
+        finally:
+            self._running = False
+
+    async def _do_due(self, now: float) -> None:
+        if self._look_at <= now:
+            self._look_at = inf
+            again = await self._look()
+            self._look_at = min(self._look_at, self._context.clock() + again)
+        for key in [key for key, at in self._due.items() if at <= now]:
+            directory, only_in_doubt = key
+            if self._due.pop(key, None) is not None and (not only_in_doubt or self._context.store.in_doubt()):
+                await self._list(directory)
+
+    async def _list(self, directory: bytes) -> None:
+        try:
+            await self._context.directories.ask(directory)
+        except (NotFound, NotADirectory):
+            pass
+        except MavftpfsError as error:
+            log.info("%r is mended at a later listing: %s", directory, error)
+            self.list_later(directory, AGAIN_AFTER)

@@ -1,11 +1,12 @@
 """Our own names on the card. Layer: cache; pure.
 
-A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is the token of the mount that made
-it, SSS counts, and the kind k is
+A temporary name is `.mavftpfs-OOOOOOOkSSS` or `.mavftpfs-OOOOOOOkSSS-NAME`: OOOOOOO is the token of the mount
+that made it (35 random bits; mounts before version 0.3 have four characters), SSS counts, and the kind k is
   n  what is sent of a file, perhaps incomplete;
   o  the old file of NAME, moved aside until the new one has its name.
 It lies beside the file that it belongs to. Only o tells its NAME, if that fits: a rename carries both paths
-in one request of 238 bytes.
+in one request of 238 bytes. No temporary name is used twice, so a duplicate of a request that arrives late
+harms none.
 
 `repair` says what becomes of those that an interruption left.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from random import Random
 
 from mavftpfs.shared.errors import NotSupported, PathTooLong
@@ -32,9 +34,9 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([no])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{7}|[a-z2-7]{4})([no])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
-_OWNER_LENGTH = 4
+_OWNER_LENGTH = 7
 
 
 class Kind(Enum):
@@ -74,7 +76,7 @@ def require_not_ours(path: bytes) -> None:
 def require_writable(path: bytes) -> None:
     """Raise NotSupported for a reserved name, PathTooLong where none fits beside the path."""
     require_not_ours(path)
-    shortest = Reserved(b"oooo", Kind.NEW, b"sss").name
+    shortest = Reserved(b"o" * _OWNER_LENGTH, Kind.NEW, b"sss").name
     if not fits_rename(join(split(path)[0], shortest), path):
         raise PathTooLong(f"{path!r} is too long for a temporary name beside it")
 
@@ -99,17 +101,46 @@ def fits_rename(old: bytes, new: bytes) -> bool:
 
 
 class OwnNames:
-    """The reserved names of this mount. None repeats before it made 32,768 of them.
+    """The temporary names of this mount. None repeats before it made 32,768 of them.
 
     Attributes:
         owner: the mount's token.
-        in_use: names in use, which no repair touches.
+        needed: names that repair leaves alone, each with the time until which it does; infinite as long as
+            somebody needs it. targets: of old files, the path of which each one is.
     """
 
     def __init__(self, owner: bytes, rng: Random) -> None:
         self.owner = owner
-        self.in_use: set[bytes] = set()
+        self.needed: dict[bytes, float] = {}
+        self.targets: dict[bytes, bytes] = {}
         self._serial = rng.randrange(_SERIALS)
+
+    def need(self, target: bytes, kind: Kind) -> bytes:
+        """Return a new path in the target's directory, needed until `release`. Raises PathTooLong."""
+        path = self.beside(target, kind)
+        self.needed[path] = inf
+        if kind is Kind.OLD:
+            self.targets[path] = target
+        return path
+
+    def release(self, path: bytes) -> None:
+        """Leave a name to repair from now on; what has it may be gone already."""
+        self.needed.pop(path, None)
+
+    def is_needed(self, path: bytes, now: float) -> bool:
+        """Return whether repair is to leave a name alone."""
+        return self.needed.get(path, -inf) > now
+
+    def target_of(self, path: bytes, name: Reserved) -> bytes | None:
+        """Return the path of which an old file is, None if that is not known."""
+        if path in self.targets:
+            return self.targets[path]
+        return None if name.target is None else join(split(path)[0], name.target)
+
+    def on_gone(self, path: bytes) -> None:
+        """Note that nothing has the name any more."""
+        self.needed.pop(path, None)
+        self.targets.pop(path, None)
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
         """Return a path in the target's directory. Raises PathTooLong."""
@@ -123,8 +154,11 @@ class OwnNames:
                 return path
         raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
 
-    def follow_rename(self, old: bytes, new: bytes) -> None:
-        """A directory has another name."""
-        for path in list(self.in_use):
-            self.in_use.remove(path)
-            self.in_use.add(renamed(path, old, new))
+    def follow_rename(self, old: bytes, new: bytes) -> set[bytes]:
+        """Note that a directory has another name; return the directories at and below it that have old files
+        of ours."""
+        self.needed = {renamed(path, old, new): until for path, until in self.needed.items()}
+        self.targets = {
+            renamed(path, old, new): renamed(target, old, new) for path, target in self.targets.items()
+        }
+        return {split(path)[0] for path in self.targets if path.startswith(new + b"/")}

@@ -496,7 +496,7 @@ class Tree:
     async def _on_swept(self, remote: bytes, directory: Directory) -> None:
         """A listing is to be given out: leftovers in it are mended first."""
         if not self._options.read_only:
-            await self._writing.cleaner.on_swept(remote, directory)
+            await self._writing.repair.on_swept(remote, directory)
 
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):

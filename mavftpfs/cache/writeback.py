@@ -27,7 +27,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory, describe, move
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.repair import Cleaner
+from mavftpfs.cache.repair import Repair
 from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle, WriteLimit
@@ -60,7 +60,7 @@ class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
     Attributes:
-        context: what its parts share. namespace: mkdir, rmdir, unlink and rename. cleaner: looks at listings.
+        context: what its parts share. namespace: mkdir, rmdir, unlink and rename. repair: see there.
     """
 
     def __init__(
@@ -80,8 +80,6 @@ class Writeback:
 
         Without a spool directory, bytes that wait lie in one that does not outlive the process.
         """
-        owner = new_owner(rng) if spool_directory is None else spool_directory.owner
-        dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
         self._limit = limit = WriteLimit()
         self.context = self._context = context = Context(
             store=store,
@@ -91,18 +89,20 @@ class Writeback:
             options=options,
             clock=directories.clock,
             wall=wall,
-            own=OwnNames(owner, rng),
+            own=OwnNames(new_owner(rng), rng),
             paths=files.paths,
             spool=Spool(
                 None if spool_directory is None else spool_directory.path,
                 vehicle=lambda: {"system": store.address()[0], "uid": store.board()},
             ),
             retry_later=self._retry_later,
+            list_later=self._list_later,
+            look_later=lambda: self.repair.look_later(),
         )
         self._throttle = throttle = Throttle(context, limit)
         self._names = names = Names(context)
-        self.cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, throttle)
+        self.repair = Repair(context, names, nursery, deliverer.look_at_all)
         self._nursery = nursery
         self._retrying, self._news = False, trio.Event()
         self.namespace = Namespace(context, names, deliverer)
@@ -266,8 +266,7 @@ class Writeback:
             return
         with suppress(MavftpfsError):
             await self._deliverer.remove_parts()
-        if self._context.replacements:
-            await self.cleaner.finish(at_once=True)
+        await self.repair.finish()
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
@@ -306,7 +305,8 @@ class Writeback:
         for node in self._context.nodes:
             if isinstance(node.error, PASSING):
                 node.error = None
-        if self._context.replacements or self._deliverer.parts or self.undelivered():
+        self.repair.retry()
+        if self._deliverer.parts or self.undelivered():
             self._news.set()
             self._retry_later()
 
@@ -342,26 +342,23 @@ class Writeback:
             else:
                 self._context.nodes.maybe_forget(node)
 
+    def _list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None:
+        self.repair.list_later(directory, seconds, only_in_doubt=only_in_doubt)
+
     def _retry_later(self) -> None:
-        """Try again later: something was not delivered, a replacement is unfinished, or a broken file left a
-        part on the card."""
+        """Try again later: something was not delivered, or a broken file left a part on the card."""
         if not self._retrying:
             self._retrying = True
             self._nursery.start_soon(self._retry)
 
     async def _retry(self) -> None:
-        """End unfinished replacements, and deliver what no program writes: with growing pauses as long as
+        """Deliver what no program writes: with growing pauses as long as
         that may help, because a link may fail and return between two heartbeats. When there are news of the
         vehicle, everything is tried at once, also what was refused."""
-        nodes, replacements, (pause, longest) = self._context.nodes, self._context.replacements, PAUSES
+        nodes, (pause, longest) = self._context.nodes, PAUSES
         parts = self._deliverer.parts
         try:
-            while (
-                self._news.is_set()
-                or replacements
-                or parts
-                or any(n.undelivered and may_pass(n) for n in nodes)
-            ):
+            while self._news.is_set() or parts or any(n.undelivered and may_pass(n) for n in nodes):
                 with trio.move_on_after(pause):
                     await self._news.wait()
                 is_new, pause = self._news.is_set(), min(2 * pause, longest)
@@ -371,7 +368,6 @@ class Writeback:
                         node.start_after = float("-inf")
                 with suppress(MavftpfsError):
                     await self._deliverer.remove_parts()
-                await self.cleaner.finish()
                 await self._deliver_each(partial(self._is_left_to_us, is_new))
         finally:
             self._retrying = False

@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from random import SystemRandom
 
 from mavftpfs.cache.recovery import SpoolDirectory, left_in
 from mavftpfs.client.recovered import recovered_in
@@ -68,7 +67,7 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
     """Claim a spool directory for the length of the body; None if this user can have none."""
     base = spool_base(vehicle)
     try:
-        spool = SpoolDirectory(base, SystemRandom())
+        spool = SpoolDirectory(base)
     except OSError as exc:
         log.warning("what waits for the vehicle will not survive this process: %s: %s", base, exc)
         yield None

@@ -9,9 +9,8 @@ requests came late, names rest between two changes (LateCopies). Only `let_rest`
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
-from enum import Enum
 from functools import partial
 from math import inf
 
@@ -24,6 +23,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.protocol.writing import Pieces, WriteTransfer
 from mavftpfs.session.doubt import MOST_REST
+from mavftpfs.session.happened import After, Names, Outcome, together
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler, SessionUser
 from mavftpfs.session.serversession import OpenSession
@@ -42,7 +42,6 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.model import (
     RENAME_ROOM,
     DirEntry,
-    EntryKind,
     Listing,
     Traits,
     is_on_nuttx,
@@ -95,22 +94,6 @@ _SECOND = {
     Opcode.CREATE_DIRECTORY: _THERE,
 }
 """What servers may say to a request that was done already, by opcode."""
-
-
-class Outcome(Enum):
-    """What listings tell about a change that was asked for."""
-
-    HAPPENED = "happened"
-    """It was carried out."""
-    DID_NOT = "did not"
-    """It was not."""
-    CONFLICT = "conflict"
-    """They fit neither. Something else has the new name, or both names of a rename are gone."""
-    UNKNOWN = "unknown"
-    """They failed, or are incomplete."""
-
-
-Verdict = Callable[[], Awaitable[Outcome]]
 
 
 class Store:
@@ -338,20 +321,20 @@ class Store:
         """Remove what is known to be a file."""
         request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
         async with self._changing(path, at_once=at_once):
-            await self._perform(path, request, partial(self._is_absent, path))
+            await self._perform(path, request, {path: After.ABSENT})
             self._scheduler.on_removed(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
         request = partial(Simple, Opcode.REMOVE_DIRECTORY, wire_path(path))
         async with self._changing(path, below=True):
-            await self._perform(path, request, partial(self._is_absent, path))
+            await self._perform(path, request, {path: After.ABSENT})
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
         request = partial(Simple, Opcode.CREATE_DIRECTORY, wire_path(path))
         async with self._changing(path):
-            await self._perform(path, request, partial(self._is_new_directory, path))
+            await self._perform(path, request, {path: After.DIRECTORY})
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; readers of the old path go on under the new one. completes: in flight, too."""
@@ -362,7 +345,7 @@ class Store:
             # NuttX before October 2022 removes the file under the new name also when there is none under the
             # old one: done twice, nothing is left (servers.md 9).
             request = partial(Simple, Opcode.RENAME, data, exclusive=is_on_nuttx(new))
-            await self._perform(old, request, partial(self._is_renamed, old, new))
+            await self._perform(old, request, {old: After.ABSENT, new: After.PRESENT})
             self._scheduler.on_renamed(old, new)
         if old.lower() != new.lower():
             self._late_copies.on_placed(new)
@@ -417,9 +400,9 @@ class Store:
 
     # --- did that change happen?
 
-    async def _perform(self, path: bytes, make: Callable[[], Simple], verify: Verdict) -> None:
+    async def _perform(self, path: bytes, make: Callable[[], Simple], after: Mapping[bytes, After]) -> None:
         """Run a request; look what became of it if its answer may not be that to its first execution. path:
-        the name that a late copy of it would harm."""
+        the name that a late duplicate of it would harm. after: what each name has then."""
         error: FtpNak | RequestTimeout
         for last in (False, True):
             self._under_way += 1
@@ -437,7 +420,7 @@ class Store:
                 if may_come_late:
                     self._late_copies.on_maybe_under_way(path, self._clock() - began, self._clock())
             if isinstance(error, RequestTimeout):
-                outcome = await self._after_silence(verify)
+                outcome = await self._after_silence(after)
                 if outcome is Outcome.HAPPENED:
                     return
                 if outcome is Outcome.DID_NOT:
@@ -447,7 +430,7 @@ class Store:
             # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
             if not twice and error.code != NakCode.FILE_EXISTS:
                 raise error
-            outcome = await self._after_refusal(error, verify)
+            outcome = await self._after_refusal(error, after)
             if outcome is Outcome.HAPPENED and twice:
                 return
             if outcome is not Outcome.DID_NOT or last:
@@ -465,9 +448,9 @@ class Store:
         looked_at = self._server.in_doubt() or opcode == Opcode.RENAME
         return looked_at and nak.code in _SECOND.get(opcode, ())
 
-    async def _after_refusal(self, nak: FtpNak, verify: Verdict) -> Outcome:
+    async def _after_refusal(self, nak: FtpNak, after: Mapping[bytes, After]) -> Outcome:
         try:
-            outcome = await verify()
+            outcome = await self._look(after)
         except FtpNak:
             raise nak from None  # there is not even a parent to list
         except MavftpfsError as error:
@@ -476,13 +459,26 @@ class Store:
             raise OutcomeUnknown(f"{nak}; whether it was done is not known") from nak
         return outcome
 
-    async def _after_silence(self, verify: Verdict) -> Outcome:
+    async def _after_silence(self, after: Mapping[bytes, After]) -> Outcome:
         with trio.move_on_after(VERIFY_LIMIT), suppress(MavftpfsError):
-            return await verify()
+            return await self._look(after)
         return Outcome.UNKNOWN
 
-    async def _names(self, directory: bytes) -> tuple[dict[bytes, DirEntry], bool]:
-        """Return what a fresh listing shows, by name, and whether it is complete.
+    async def _look(self, after: Mapping[bytes, After]) -> Outcome:
+        """List the directories of these names; return whether they have what they have after the change."""
+        listed = {}
+        for parent in {split(path)[0]: None for path in after}:
+            listed[parent] = await self._names(parent)
+        evidence = [listed[split(path)[0]].judge(split(path)[1], then) for path, then in after.items()]
+        verdict = together(evidence)
+        for path, then in after.items():  # with entries it is somebody else's
+            made = then is After.DIRECTORY and verdict is Outcome.HAPPENED
+            if made and (await self.list_directory(path)).entries:
+                return Outcome.CONFLICT
+        return verdict
+
+    async def _names(self, directory: bytes) -> Names:
+        """Return what a fresh listing shows.
 
         It is listed again if changes of ours went on meanwhile. Servers count names: those behind one that is
         taken away move up, past the place where a sweep goes on. If they never stood still: what any saw.
@@ -495,38 +491,9 @@ class Store:
             complete = listing.complete
             fresh = {entry.name: entry for entry in listing.entries}
             if self._sent == before and not self._under_way:
-                seen = fresh
-                break
+                return Names(fresh, complete)
             seen |= fresh
-        return seen, complete
-
-    async def _is_absent(self, path: bytes) -> Outcome:
-        parent, name = split(path)
-        names, complete = await self._names(parent)
-        if name in names:
-            return Outcome.DID_NOT
-        return Outcome.HAPPENED if complete else Outcome.UNKNOWN
-
-    async def _is_new_directory(self, path: bytes) -> Outcome:
-        """A directory that is there and empty may be the one we made; with entries it is somebody else's."""
-        parent, name = split(path)
-        names, complete = await self._names(parent)
-        if name not in names:
-            return Outcome.DID_NOT if complete else Outcome.UNKNOWN
-        if names[name].kind is not EntryKind.DIRECTORY:
-            return Outcome.CONFLICT
-        listing = await self.list_directory(path)
-        return Outcome.CONFLICT if listing.entries else Outcome.HAPPENED
-
-    async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
-        (parent, old_name), (target, new_name) = split(old), split(new)
-        names, complete = await self._names(parent)
-        others, new_complete = (names, complete) if target == parent else await self._names(target)
-        if old_name in names:
-            return Outcome.CONFLICT if new_name in others else Outcome.DID_NOT
-        if new_name in others and complete:
-            return Outcome.HAPPENED
-        return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
+        return Names(seen, complete)
 
 
 def _asking_times(

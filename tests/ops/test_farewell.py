@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import stat
 from collections.abc import Sequence
 from pathlib import Path
@@ -80,11 +79,11 @@ def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
 
 
 def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
-    dead = SpoolDirectory(state / "base", random.Random(1))
+    dead = SpoolDirectory(state / "base")
     (dead.path / "000001.data").write_bytes(b"held")
     (dead.path / "000001.json").write_text('{"path": "/f"}')
     dead.close()
-    spool = SpoolDirectory(state / "base", random.Random(2))
+    spool = SpoolDirectory(state / "base")
     assert leftovers.rescue(spool, "tcp:x:1").startswith(
         "1 file of an earlier mount did not reach the vehicle; it is in "
     )
@@ -100,11 +99,11 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     ],
 )
 def test_a_part_is_listed_because_recover_does_not_put_it_back(state: Path, facts: str, told: str) -> None:
-    dead = SpoolDirectory(state / "base", random.Random(1))
+    dead = SpoolDirectory(state / "base")
     (dead.path / "000001.data").write_bytes(b"held")
     (dead.path / "000001.json").write_text(facts)
     dead.close()
-    spool = SpoolDirectory(state / "base", random.Random(2))
+    spool = SpoolDirectory(state / "base")
     assert f"; {told}" in leftovers.rescue(spool, "tcp:x:1")
     spool.close()
 
@@ -113,7 +112,7 @@ def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPat
     def fail(self: SpoolDirectory, recovery: Path) -> list[Path]:
         raise OSError("the disk is full")
 
-    spool = SpoolDirectory(state / "base", random.Random(1))
+    spool = SpoolDirectory(state / "base")
     monkeypatch.setattr(SpoolDirectory, "rescue", fail)
     assert "the disk is full" in leftovers.rescue(spool, "x")
     spool.close()

@@ -78,7 +78,7 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
     async with here.connected() as connection, trio.open_nursery() as nursery:
 
         async def sweep() -> None:
-            shown.update((await connection.store._names(directory))[0])
+            shown.update((await connection.store._names(directory)).entries)
 
         await connection.store.list_directory(directory)
         nursery.start_soon(sweep)

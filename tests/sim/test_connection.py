@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from itertools import pairwise
 from pathlib import Path
-from random import Random
 
 import pytest
 import trio
@@ -173,7 +172,7 @@ def join(monkeypatch: pytest.MonkeyPatch, here: Rig, folder: Path) -> None:
         yield here.link
 
     monkeypatch.setattr(compose, "open_shared", open_link)
-    monkeypatch.setattr(compose, "spool_for", lambda _: closing(SpoolDirectory(folder / "spool", Random(1))))
+    monkeypatch.setattr(compose, "spool_for", lambda _: closing(SpoolDirectory(folder / "spool")))
 
 
 async def test_a_restart_while_leaving_has_nothing_delivered(

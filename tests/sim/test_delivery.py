@@ -9,7 +9,6 @@ import errno
 import json
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from random import Random
 
 import pytest
 import trio
@@ -700,7 +699,7 @@ async def test_what_may_wait_is_what_ten_seconds_bring() -> None:
 
 async def test_what_is_still_open_when_the_mount_ends_is_not_kept(here: Rig, tmp_path: Path) -> None:
     """A kernel that lost its mount closes nothing: the next mount must not offer what was delivered."""
-    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    spool = SpoolDirectory(tmp_path / "spool")
     tree = here.mount(spool=spool)
     file = await tree.create(FRESH, exclusive=True)
     await file.write(0, bytes(300_000))

@@ -7,7 +7,6 @@ import json
 import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from random import Random
 
 import pytest
 import trio
@@ -336,7 +335,7 @@ async def test_what_is_taken_back_leaves_nothing_here_either(each: Rig, path: by
 
 @pytest.fixture
 def spool(tmp_path: Path) -> SpoolDirectory:
-    return SpoolDirectory(tmp_path / "spool", Random(1))
+    return SpoolDirectory(tmp_path / "spool")
 
 
 def told(copies: list[Path]) -> dict[str, tuple[bytes, str]]:
@@ -398,7 +397,7 @@ async def test_a_part_is_kept_until_the_name_has_a_good_file_or_none(
         with pytest.raises(WriteFailed):
             await file.release()
     spool.close()
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    again = SpoolDirectory(tmp_path / "spool")
     assert again.rescue(tmp_path / "kept") == [], "nor does the next mount find it after a kill"
     again.close()
 
@@ -421,7 +420,7 @@ async def test_after_a_kill_the_next_mount_offers_the_part_and_puts_nothing_back
         await write_on(file)
     await here.find()
     spool.close()
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    again = SpoolDirectory(tmp_path / "spool")
     ((path, (data, _)),) = told(again.rescue(tmp_path / "kept")).items()
     assert path == FILE.decode()
     assert data[: len(PART)] == PART

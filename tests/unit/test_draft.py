@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import Draft, Event, State, Where
+from mavftpfs.cache.draft import Draft, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.sameness import Known
@@ -50,7 +50,7 @@ def test_after_a_comparison_that_failed_no_base_counts_any_more() -> None:
     draft.fill(0, b"old")
     draft.write(0, b"X")
     draft.begin(in_place=False)
-    draft.on(Event.COMMITS)
+    draft.end_attempt()
     draft.not_confirmed()
     assert draft.state is State.DIRTY
     draft.lose_base()
@@ -189,14 +189,12 @@ class DraftMachine(RuleBasedStateMachine):
             assert self.flight
             self.answer(0, 12)
         assert self.remote == self.model
-        self.draft.on(Event.COMMITS)
+        self.draft.end_attempt()
         if end.startswith("not confirmed"):
             self.draft.not_confirmed()
         if end in ("placed", "not confirmed, and placed"):
             self.draft.delivered()
             self.base = bytes(self.model)
-        elif end == "not placed":
-            self.draft.on(Event.NOT_PLACED)
         assert (self.draft.state is State.CLEAN) == (end in ("placed", "not confirmed, and placed"))
 
     def give_up_if_overtaken(self) -> None:
@@ -206,7 +204,7 @@ class DraftMachine(RuleBasedStateMachine):
     @rule()
     def give_up(self) -> None:
         self.flight.clear()
-        self.draft.give_up()
+        self.draft.end_attempt()
 
     @invariant()
     def content_is_the_models(self) -> None:

@@ -6,7 +6,6 @@ import logging
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import pytest
 
@@ -55,13 +54,13 @@ def test_records_and_logs_are_private_and_follow_no_link(
 
 def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     state = tmp_path / "state"
-    killed = SpoolDirectory(state / "spool" / "1-1", Random(1))
+    killed = SpoolDirectory(state / "spool" / "1-1")
     content = SpoolContent(Spool(killed.path))
     content.put(0, b"precious")
     content.persist({"path": "/card/a", "size": 8})
     assert exposed(state) == []
     killed.close()
-    again = SpoolDirectory(state / "spool" / "1-1", Random(2))
+    again = SpoolDirectory(state / "spool" / "1-1")
     assert again.rescue(state / "recovered" / "now")
     assert exposed(state) == []
     again.close()

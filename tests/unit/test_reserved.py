@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.repair import leftovers
+from mavftpfs.cache.repair import NAMELESS_FOR, SAME_FOR, due_in
 from mavftpfs.cache.reserved import (
     Kind,
     OwnNames,
@@ -19,7 +19,7 @@ from mavftpfs.cache.reserved import (
     parse,
 )
 from mavftpfs.shared.errors import PathTooLong
-from mavftpfs.shared.model import DirEntry, EntryKind, split, usable_name
+from mavftpfs.shared.model import split, usable_name
 
 names = st.binary(min_size=1, max_size=60).filter(usable_name)
 
@@ -70,28 +70,22 @@ def test_names_do_not_repeat() -> None:
     assert len({namer.beside(b"/a/b", Kind.NEW) for _ in range(5000)}) == 5000
 
 
-def named(kind: Kind, target: bytes | None = b"file", owner: bytes = b"abcd") -> DirEntry:
-    return DirEntry(Reserved(owner, kind, b"sss", target).name, EntryKind.FILE, 5)
-
-
-def test_a_name_that_may_lack_its_file_comes_first() -> None:
-    entries = [named(Kind.NEW, None), named(Kind.OLD)]
-    found = leftovers(b"/d", entries, lambda *_: True)
-    assert found[0] == (b"/d/" + entries[1].name, Reserved(b"abcd", Kind.OLD, b"sss", b"file"))
-    assert len(found) == 2
-
-
-def test_what_is_not_ours_is_not_touched() -> None:
-    entries = [
-        DirEntry(b"file", EntryKind.FILE),
-        DirEntry(b".mavftpfs-strange", EntryKind.FILE),
-        DirEntry(named(Kind.NEW).name, EntryKind.DIRECTORY),
-    ]
-    assert leftovers(b"/d", entries, lambda *_: True) == []
-
-
-def test_what_is_alive_is_left_alone() -> None:
-    entries = [named(Kind.NEW, None), named(Kind.OLD)]
-    alive = b"/d/" + entries[1].name
-    ((path, _),) = leftovers(b"/d", entries, lambda path, owner, entry: path != alive)
-    assert path == b"/d/" + entries[0].name
+@pytest.mark.parametrize(
+    ("owner", "kind", "target_there", "age", "due"),
+    [
+        (b"ourselv", Kind.OLD, False, 0.0, True),
+        (b"ourselv", Kind.NEW, False, 0.0, True),
+        (b"another", Kind.OLD, False, NAMELESS_FOR - 1.0, False),
+        (b"another", Kind.OLD, False, NAMELESS_FOR, True),
+        (b"another", Kind.OLD, True, NAMELESS_FOR, False),
+        (b"another", Kind.OLD, True, SAME_FOR, True),
+        (b"another", Kind.NEW, True, SAME_FOR - 1.0, False),
+        (b"four", Kind.NEW, False, SAME_FOR, True),
+    ],
+)
+def test_when_a_temporary_name_is_repaired(
+    owner: bytes, kind: Kind, target_there: bool, age: float, due: bool
+) -> None:
+    name = parse(Reserved(owner, kind, b"abc", b"file").name)
+    assert name is not None
+    assert (due_in(name, b"ourselv", target_there=target_there, age=age) <= 0.0) == due

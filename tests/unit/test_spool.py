@@ -8,7 +8,6 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import pytest
 
@@ -41,7 +40,7 @@ def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) 
     slot = tmp_path / "slot0"
     slot.mkdir()
     (slot / "000001.data").write_bytes(b"of a dead mount")
-    directory = SpoolDirectory(tmp_path, Random(1))
+    directory = SpoolDirectory(tmp_path)
     content = SpoolContent(Spool(directory.path))
     content.put(0, b"mine")
     content.persist({"size": 4})
@@ -89,40 +88,22 @@ def test_a_disk_that_fills_up_on_the_way_takes_nothing(
 
 
 def test_names_in_recovery_do_not_collide_and_unknown_ones_are_kept(tmp_path: Path) -> None:
-    slot = SpoolDirectory(tmp_path / "spool", Random(1))
+    slot = SpoolDirectory(tmp_path / "spool")
     facts = [json.dumps({"path": f"/{name}"}) for name in ("x.json", "x", "x.json")]
     for number, text in enumerate([*facts, "not JSON"]):
         (slot.path / f"{number}.data").write_bytes(b"%d" % number)
         (slot.path / f"{number}.json").write_text(text)
     slot.close()
-    saved = SpoolDirectory(tmp_path / "spool", Random(1)).rescue(tmp_path / "r")
+    saved = SpoolDirectory(tmp_path / "spool").rescue(tmp_path / "r")
     assert [path.read_bytes() for path in saved] == [b"0", b"1", b"2", b"3"]
     assert [path.name for path in saved] == ["x.json", "x.1", "x.json.1", "3.data"]
     assert len(list((tmp_path / "r").iterdir())) == 2 * len(saved), "each has its description"
 
 
-def test_who_takes_a_slot_that_another_mount_knows_for_dead_is_alive(tmp_path: Path) -> None:
-    early = [SpoolDirectory(tmp_path, Random(n)) for n in (1, 2)]
-    for each in early:
-        each.close()
-    first = SpoolDirectory(tmp_path, Random(3))
-    assert {each.owner for each in early} <= first.dead_owners
-    first.rescue(tmp_path / "r")
-    second = SpoolDirectory(tmp_path, Random(2))
-    assert second.path == early[1].path
-    assert second.owner not in first.dead_owners
-    assert first.owner not in second.dead_owners
-    for each in (first, second):
-        each.close()
-    third = SpoolDirectory(tmp_path, Random(4))
-    assert {each.owner for each in (*early, first, second)} <= third.dead_owners
-    third.close()
-
-
 def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
-    claimed = [SpoolDirectory(tmp_path, Random(n)) for n in range(SLOTS)]
+    claimed = [SpoolDirectory(tmp_path) for n in range(SLOTS)]
     with pytest.raises(OSError, match="in use"):
-        SpoolDirectory(tmp_path, Random(0))
+        SpoolDirectory(tmp_path)
     for each in claimed:
         each.close()
 
@@ -132,7 +113,7 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
 
 def written(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
     """A file that was written, and not closed."""
-    directory = SpoolDirectory(tmp_path / "spool", Random(1))
+    directory = SpoolDirectory(tmp_path / "spool")
     content = SpoolContent(Spool(directory.path), name)
     content.put(0, b"so far")
     return directory, content
@@ -141,7 +122,7 @@ def written(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[Spoo
 def rescued(directory: SpoolDirectory, tmp_path: Path) -> dict[str, bytes]:
     """What the next mount offers, without the descriptions."""
     directory.close()  # as the kernel does for a killed process
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    again = SpoolDirectory(tmp_path / "spool")
     found = again.rescue(tmp_path / "recovered")
     assert [path.name for path in again.path.iterdir()] == ["owner"]
     again.close()
@@ -212,7 +193,7 @@ def test_more_than_was_written_down_says_so(tmp_path: Path) -> None:
     ],
 )
 def test_no_text_that_is_left_behind_breaks_the_next_mount(tmp_path: Path, text: bytes) -> None:
-    slot = SpoolDirectory(tmp_path / "spool", Random(1))
+    slot = SpoolDirectory(tmp_path / "spool")
     (slot.path / "000001.data").write_bytes(b"bytes")
     (slot.path / "000001.json").write_bytes(text)
     (slot.path / "000001.new").write_bytes(b'{"pa')
@@ -224,7 +205,7 @@ def test_no_text_that_is_left_behind_breaks_the_next_mount(tmp_path: Path, text:
 def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slot = SpoolDirectory(tmp_path / "spool", Random(1))
+    slot = SpoolDirectory(tmp_path / "spool")
     for number in (1, 2, 3):
         (slot.path / f"00000{number}.data").write_bytes(b"%d" % number)
         (slot.path / f"00000{number}.json").write_text("{}")
@@ -238,14 +219,14 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
         return really(source, target)
 
     monkeypatch.setattr(shutil, "move", move)
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    again = SpoolDirectory(tmp_path / "spool")
     assert [path.read_bytes() for path in again.rescue(tmp_path / "r")] == [b"1", b"3"]
     assert sorted(path.name for path in (tmp_path / "r").glob("*.data")) == ["000001.data", "000003.data"]
     content = SpoolContent(Spool(again.path))
     content.put(0, b"new")
     again.discard()
     again.close()
-    third = SpoolDirectory(tmp_path / "spool", Random(3))
+    third = SpoolDirectory(tmp_path / "spool")
     with pytest.raises(OSError, match="full"):
         third.rescue(tmp_path / "r")
     assert (slot.path / "000002.data").read_bytes() == b"2"

@@ -40,7 +40,7 @@ from tests.support.matrix.operations import (
     take_back,
     unlink,
 )
-from tests.support.matrix.scene import IN_TIME, Scene, on_card
+from tests.support.matrix.scene import IN_TIME, Scene, on_card, visible
 from tests.support.rigs import Rig
 
 NAMELESS = 11.5
@@ -54,6 +54,10 @@ doubt the file is compared after it got its name, and sent again if it is not th
 SATISFIED = (unlink, rename_over, rename_over_open)
 """A refusal because the file is gone may be that of a copy of the request. So if others removed the file
 between our look and our request, the call succeeds, as one does whose first answer was lost."""
+
+NEXT_MOUNT, NOBODY_UPLOADS = 70.0, 700.0
+"""Seconds after the first listing of the next mount: until each name has its file; until nothing of the last
+mount is left."""
 
 _OPCODE, _SIZE, _OFFSET = 3, 4, slice(8, 12)
 _LISTINGS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
@@ -217,6 +221,15 @@ async def settle(tree: Tree, here: Rig, ends: Sequence[State], held: Sequence[by
     there = {name: data for name, data in card.items() if name not in ours}
     assert set(shown) == set(there)
     assert all(shown[name] == len(data) for name, data in there.items() if data is not None)
+
+
+async def judge_next_mount(tree: Tree, here: Rig, ends: Sequence[State]) -> None:
+    """List once, and wait until that mount put right what the last one left."""
+    await tree.list(D)
+    await trio.sleep(NEXT_MOUNT)
+    require(visible(here), ends)
+    await trio.sleep(NOBODY_UPLOADS - NEXT_MOUNT)
+    await settle(tree, here, ends)
 
 
 async def wait_for_others(scene: Scene) -> None:

@@ -1,0 +1,63 @@
+"""Did a change of names happen? Layer: session; pure.
+
+A change says what each of its names has afterwards. A listing of the directory tells what each has, and the
+evidence for all names together is the verdict. An incomplete listing shows what is there, and proves no
+absence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+from mavftpfs.shared.model import DirEntry, EntryKind
+
+
+class Outcome(Enum):
+    """What listings tell about a change that was asked for."""
+
+    HAPPENED = "happened"
+    """It was carried out."""
+    DID_NOT = "did not"
+    """It was not."""
+    CONFLICT = "conflict"
+    """They fit neither. Something else has a name, or both names of a rename are there or gone."""
+    UNKNOWN = "unknown"
+    """They failed, or are incomplete."""
+
+
+class After(Enum):
+    """What a name has after a change."""
+
+    PRESENT = "present"
+    ABSENT = "absent"
+    DIRECTORY = "an empty directory"
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """What a listing shows. complete: it came to its end, so all other names are absent."""
+
+    entries: dict[bytes, DirEntry]
+    complete: bool
+
+    def judge(self, name: bytes, after: After) -> Outcome:
+        """Return what this listing tells about one name of a change."""
+        entry = self.entries.get(name)
+        if entry is None and not self.complete:
+            return Outcome.UNKNOWN
+        if (entry is None) != (after is After.ABSENT):
+            return Outcome.DID_NOT
+        wrong = after is After.DIRECTORY and entry is not None and entry.kind is not EntryKind.DIRECTORY
+        return Outcome.CONFLICT if wrong else Outcome.HAPPENED
+
+
+def together(evidence: Iterable[Outcome]) -> Outcome:
+    """Return the verdict on a change from the evidence for each of its names."""
+    found = set(evidence)
+    if found == {Outcome.HAPPENED}:
+        return Outcome.HAPPENED
+    if Outcome.CONFLICT in found or found >= {Outcome.HAPPENED, Outcome.DID_NOT}:
+        return Outcome.CONFLICT
+    return Outcome.DID_NOT if Outcome.DID_NOT in found else Outcome.UNKNOWN
