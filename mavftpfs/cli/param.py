@@ -238,7 +238,8 @@ def _change(args: Args, read: Callable[[], Sequence[Line]], name: str, *, meant:
         for change in () if announced else done:
             print(change)
         if announced or not done:
-            print(f"{len(done)} set" if done else "nothing to set: all of it holds", file=sys.stderr)
+            nothing = "nothing to set: the vehicle already has these values"
+            print(f"{len(done)} set" if done else nothing, file=sys.stderr)
     if error is not None:
         raise error
     return ExitCode.OK
@@ -247,7 +248,7 @@ def _change(args: Args, read: Callable[[], Sequence[Line]], name: str, *, meant:
 @dataclass(slots=True)
 class _Setting:
     """One run that sets parameters. name: the file of the lines. meant: see make_plan. done: the parameters
-    that were set and read back.
+    that were set and read back; announced: the changes were printed before.
     """
 
     args: Args
@@ -288,10 +289,10 @@ class _Setting:
         return client.wish(lines, current, self.name, meant=self.meant)
 
     def _require_known(self, wish: Wish) -> None:
-        """Say which names the vehicle does not have.
+        """Name the parameters that the vehicle does not have.
 
         Raises:
-            InvalidText: there are such names, and they may not be left out.
+            InvalidText: there are some, and the user did not allow to leave them out.
         """
         names = ", ".join(line.name for line in wish.unknown)
         if wish.unknown and not self.args.skip_unknown:
@@ -301,7 +302,7 @@ class _Setting:
             say(f"left out, because the vehicle does not have them: {names}")
 
     async def _ask(self, wish: Wish) -> None:
-        """Before more than one parameter is set, say what will change, and ask on a terminal.
+        """Print the changes before more than one parameter is set, and ask on a terminal.
 
         Raises:
             UsageError: the user said no.

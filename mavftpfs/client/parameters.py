@@ -1,7 +1,7 @@
 """A vehicle's parameters for commands: read, compared, set. Layer: client.
 
-They go through the texts in `@PARAM`, of a mount that is up or of a connection. So only one place sets them
-and reads them back (`cache.parameters`).
+The commands use the texts in `@PARAM`, of a mount that is up or of a connection, so that one place alone sets
+parameters and reads them back (`cache.parameters`).
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ DIRECTORY = b"/@PARAM/"
 PACKED, ALL, CHANGED, QGC = b"param.pck", b"params.parm", b"changed.parm", b"params.params"
 LAST_ERROR = b"last_error.txt"
 MOST = 4 << 20
-"""Bytes of a file that is loaded."""
+"""The most bytes of a file for --load."""
 
 _DEFAULT = re.compile(r"^([^,#\n]+),\S+ # default (\S+)$", re.MULTILINE)
 
 
 def at_root(target: Target) -> Target:
-    """Return a target whose `/` is the vehicle's, where `@PARAM` lies; or the mount's, if that shows less."""
+    """Return a target whose `/` is the vehicle's, where `@PARAM` lies; or that of a mount that shows less."""
     mount = None if target.mount is None else (target.mount[0], ROOT)
     return replace(target, options=replace(target.options, root=ROOT), mount=mount)
 
@@ -136,7 +136,7 @@ def _matches(one: Parameter, pattern: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A value that is to be set; before: what the vehicle has."""
+    """A value that is to be set; before: the vehicle's present value."""
 
     before: Parameter
     after: Parameter
@@ -147,7 +147,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What is to be set. unknown: lines of names that the vehicle does not have (yet). notes: for people."""
+    """The changes to make. unknown: lines of names that the vehicle lacks (yet). notes: for people."""
 
     changes: list[Change] = field(default_factory=list)
     unknown: list[Line] = field(default_factory=list)
@@ -160,7 +160,7 @@ def value_text(one: Parameter) -> str:
 
 
 def assignments(words: Sequence[str]) -> list[Line]:
-    """Return what NAME=VALUE words ask for.
+    """Parse NAME=VALUE words.
 
     Raises:
         UsageError: a word has no name, a value is no number, or a name has two.
@@ -218,10 +218,10 @@ def invalid(name: str, problems: Sequence[Problem]) -> InvalidText:
 
 
 def wish(lines: Sequence[Line], current: Sequence[Parameter], name: str, *, meant: bool) -> Wish:
-    """Compare lines with what the vehicle has. meant: each line was written by itself (see make_plan).
+    """Compare lines with the vehicle's parameters. meant: the user wrote each line by itself (see make_plan).
 
     Raises:
-        InvalidText: values do not fit; `name` is of the file.
+        InvalidText: values do not fit; `name` is that of the file.
     """
     values = {one.name: one for one in current}
     known = [line for line in lines if line.name in values]
@@ -239,7 +239,7 @@ def enabling(changes: Sequence[Change]) -> list[Change]:
 
 
 async def set_values(session: Session, changes: Sequence[Change], progress: Progress) -> None:
-    """Set values; all of them were read back. Progress counts what the vehicle acknowledged of the upload.
+    """Set values, and read all of them back. Progress counts the bytes that the vehicle acknowledged.
 
     Raises:
         ReadOnly, Armed: nothing is set in flight. NotTaken: the vehicle did not take some; `last_error` tells
@@ -304,7 +304,7 @@ class Row:
 
 
 def compare_vehicles(vehicles: Sequence[Sequence[Parameter]]) -> list[Row]:
-    """Return what differs between vehicles, except in parameters that a vehicle sets by itself."""
+    """Return the parameters that differ between vehicles, except those that a vehicle sets by itself."""
     texts = [{one.name: value_text(one) for one in found} for found in vehicles]
     names = dict.fromkeys(name for known in texts for name in known if not is_own(name))
     rows = (Row(name, tuple(known.get(name) for known in texts)) for name in names)

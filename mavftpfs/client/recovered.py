@@ -129,6 +129,6 @@ def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
             found += recovered_in(path)
             continue
         if not path.is_file():
-            raise UsageError(f"{name} is nothing that was kept; `mavftpfs recover` lists what is")
+            raise UsageError(f"{name} is not a recovered file; list them with: mavftpfs recover")
         found += [copy for copy in recovered_in(path.parent) if copy.file.name == path.name]
     return found

@@ -1,7 +1,7 @@
 """Records of what went over the link: FTP payloads as text, frames as .tlog. Layer: client.
 
-`text_line` is called for each of the 251-byte payloads only where `-d` prints them. If the disk is full, the
-log says so once, and the .tlog ends there: a record must never break what it watches.
+Only `-d` calls `text_line`, for each of the 251-byte payloads. If the disk is full, the log reports it once,
+and the .tlog ends there: a record must never break the transfer that it records.
 
 The .tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then the frame.
 """

@@ -1,4 +1,4 @@
-"""The log of what happens to a vehicle, and the traffic on its link. Layer: client."""
+"""Logs the events of a vehicle, and measures the traffic on its link. Layer: client."""
 
 from __future__ import annotations
 

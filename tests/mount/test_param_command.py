@@ -57,7 +57,7 @@ def test_versions_with_parameters_are_named_where_a_vehicle_has_none(field: Fiel
 def test_setting(source: str) -> None:
     assert param(source, "rtl_alt=3000") == ["RTL_ALT 1500 -> 3000"]
     assert param(source, "RTL_ALT") == ["RTL_ALT,3000"]
-    assert "all of it holds" in said(source, "RTL_ALT=3000.0")
+    assert "already has these values" in said(source, "RTL_ALT=3000.0")
     lines = said(source, "RTL_ALT=1500", "WPNAV_SPEED=750.5").splitlines()
     assert lines == ["RTL_ALT 3000 -> 1500", "WPNAV_SPEED 1000 -> 750.5", "2 set"]
     assert param(source, "WPNAV_SPEED=1000", "--yes") == ["WPNAV_SPEED 750.5 -> 1000"]
