@@ -40,9 +40,7 @@ class Splitter(FrameBuffer[Frame]):
             verdict, stop, message_id = frame_at(data, position, stream=stream, highest_id=_ANY_ID)
             if verdict is Verdict.PARTIAL:
                 break
-            if verdict is Verdict.GARBAGE:
-                self.garbage += stop - position
-            else:
+            if verdict is not Verdict.GARBAGE:
                 crc_fits = verdict is Verdict.WHOLE and is_known(message_id)
                 out.append(_frame(data[position:stop], message_id, crc_fits=crc_fits))
             position = stop

@@ -147,12 +147,10 @@ class FrameBuffer(Generic[FoundT]):
 
     Attributes:
         stream: whether `feed` gets pieces of a stream instead of datagrams.
-        garbage: bytes that were in no frame.
     """
 
     def __init__(self, *, stream: bool) -> None:
         self.stream = stream
-        self.garbage = 0
         self._tail = b""
 
     @property
@@ -172,7 +170,6 @@ class FrameBuffer(Generic[FoundT]):
 
     def reset(self) -> None:
         """Forget a half-received frame: the stream was reopened."""
-        self.garbage += len(self._tail)
         self._tail = b""
 
     def on_silence(self) -> list[FoundT]:
@@ -180,9 +177,7 @@ class FrameBuffer(Generic[FoundT]):
         it. Return what is found in the rest."""
         out: list[FoundT] = []
         while self._tail:  # as at the end of a datagram: nothing more decides
-            rest = self._tail[self._take(self._tail, out, stream=False) :]
-            self.garbage += bool(rest)
-            self._tail = rest[1:]
+            self._tail = self._tail[self._take(self._tail, out, stream=False) :][1:]
         return out
 
     def _take(self, data: bytes, out: list[FoundT], *, stream: bool) -> int:
@@ -279,15 +274,12 @@ class Framer(FrameBuffer[Message]):
     def _step(self, data: bytes, position: int, out: list[Message], *, stream: bool) -> int:
         """Deal with what begins at `position`; return where to go on, the same if more is needed."""
         verdict, stop, message_id = frame_at(data, position, stream=stream)
-        match verdict:
-            case Verdict.GARBAGE:
-                self.garbage += stop - position
-            case Verdict.DAMAGED:
-                self.stats.bad_crc += 1
-            case Verdict.WHOLE:
-                frame = data[position:stop]
-                signed = frame[0] == _V2 and frame[2] == _SIGNED
-                self._accept(frame, message_id, signed, out)
+        if verdict is Verdict.DAMAGED:
+            self.stats.bad_crc += 1
+        elif verdict is Verdict.WHOLE:
+            frame = data[position:stop]
+            signed = frame[0] == _V2 and frame[2] == _SIGNED
+            self._accept(frame, message_id, signed, out)
         return stop
 
     def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
