@@ -180,8 +180,12 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     @property
-    def epoch(self) -> int:
-        """How often what was read lately came into doubt. Proofs of before the last time are void."""
+    def epoch(self) -> float:
+        """When what was read lately last came into doubt, by the caches' clock; -inf if never.
+
+        Proofs of before then are void. Each time is later than the one before, and is set before
+        `ReadSink.on_suspect` is called.
+        """
         ...
 
     def in_doubt(self, since: float = inf) -> bool:

@@ -144,6 +144,7 @@ class Connection:
         self.scheduler = Scheduler(
             self.driver,
             clock=clock,
+            rng=rng,
             op_deadline=options.op_deadline,
             read_mode=options.read_mode if options.bwlimit is None else "window",
             chunk=options.chunk,

@@ -4,18 +4,24 @@ Servers with one session give it to the client that opens last, or refuse the se
 2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and ArduPilot that
 of a client that paused for 3 s. So nothing is opened while another client may have a file open: from its
 first request that uses a session, until its Terminate or Reset, or 10 s after its last request was heard.
-An open of a file that is not there leaves nothing open, and is often a question: is this name free?
+An open that is refused leaves things as they were: it is often a question (is this name free?), or came just
+before another client closed its file. When a client closed its file, each one that waits does so for a moment
+longer, by chance: then the first one's open is heard by the others.
 """
 
 from __future__ import annotations
 
+import random
 from math import inf
 
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import Opcode
 
 LEFT_OPEN = 10.0
 """Seconds after another client's last request for which its file counts as open. PX4 closes it then; PX4 of
 September 2026 after 30."""
+
+MOST_PAUSE = 0.3
+"""Seconds after another client closed its file for which nothing is opened, at most."""
 
 STAYS_ITS_OWN = 2.5
 """Seconds after an answer for which no ArduPilot with one session gives that away; it does after 3."""
@@ -23,7 +29,7 @@ STAYS_ITS_OWN = 2.5
 OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _USING = OPENING | {Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE}
 _CLOSING = frozenset((Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS))
-_SESSION, _OPCODE, _REQ_OPCODE, _REASON = 2, 3, 5, 12  # where they are in a payload
+_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
 
 
 class OtherClients:
@@ -31,12 +37,17 @@ class OtherClients:
 
     Attributes:
         session: the id that was used last, or closed; None while none was.
+        closed_at: when one of them was last heard to close a file.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rng: random.Random) -> None:
+        """rng: draws for how long we wait after a file was closed."""
+        self._rng = rng
+        self._paused_until = -inf
         self.session: int | None = None
+        self.closed_at = -inf
         self._has_file = False
-        self._had_file = False  # before an open that is not answered yet
+        self._asks = False  # an open of theirs is not answered yet
         self._heard_at = self._answered_at = -inf
         self._answered_since = inf  # without a gap in which its session may have gone
 
@@ -47,28 +58,42 @@ class OtherClients:
         directories makes nobody's bytes doubtful.
         """
         opcode, answered = _opcode_of(payload)
-        had_file = now < self.file_open_until
+        if now >= self.file_open_until:
+            self._has_file = self._asks = False
         self._heard_at = now
         if opcode not in _USING | _CLOSING:
             return None
         self.session = payload[_SESSION]
-        if _found_nothing(payload):
-            self._has_file = self._had_file
+        if opcode in _CLOSING:
+            self._on_closed(now)
+        elif opcode not in OPENING:
+            self._has_file = True
+        elif asks_to_open(payload):
+            self._asks = True
         else:
-            self._has_file = opcode in _USING
-            self._had_file = had_file if payload[_OPCODE] in OPENING else self._has_file
-        if answered and self._has_file:
+            self._asks, self._has_file = False, self._has_file or answered
+        if not self._has_file:
+            self._answered_at = -inf
+        elif answered:
             if now - self._answered_at >= STAYS_ITS_OWN:
                 self._answered_since = now
             self._answered_at = now
-        elif not self._has_file:
-            self._answered_at = -inf
         return self.session
+
+    def _on_closed(self, now: float) -> None:
+        """Note that one of them closes its file. The request and its answer are one event."""
+        if self._has_file:
+            self._paused_until = now + MOST_PAUSE * self._rng.random()
+        self._has_file, self.closed_at = False, now
+
+    def on_ours_opened(self) -> None:
+        """Note that a file of ours was opened: in the only session there is, or beside theirs."""
+        self._has_file = self._asks = False
 
     @property
     def file_open_until(self) -> float:
         """Until when another client may have a file open."""
-        return self._heard_at + LEFT_OPEN if self._has_file else -inf
+        return self._heard_at + LEFT_OPEN if self._has_file or self._asks else self._paused_until
 
     def has_session(self, since: float, now: float) -> bool:
         """Return whether a session was another client's all that time, as its answers show."""
@@ -84,13 +109,6 @@ def took_session(payload: bytes) -> bool:
 def asks_to_open(payload: bytes) -> bool:
     """Return whether this is a request that opens a file, of which only the answer tells what it did."""
     return payload[_OPCODE] in OPENING
-
-
-def _found_nothing(payload: bytes) -> bool:
-    """Return whether this refuses an open because the file is not there. Another refusal may be because a
-    session is taken, whatever it says (docs/servers.md 12)."""
-    refused = payload[_OPCODE] == Opcode.NAK and payload[_REQ_OPCODE] in OPENING
-    return refused and payload[_REASON] == NakCode.FILE_NOT_FOUND
 
 
 def _opcode_of(payload: bytes) -> tuple[int, bool]:

@@ -68,7 +68,6 @@ class FileStream(SessionUser):
             self._wants.add(self._sink.missing(start, stop), demand=demand)
         if self.waiting_since is None and not self._wants.demand.todo.empty:
             self.waiting_since = self._scheduler.clock()
-            self._scheduler.limit_wait(self)
         self._wanted.set()
         self._server.wake()
 
@@ -157,7 +156,7 @@ class FileStream(SessionUser):
         """
         server, session, first = self._server, self._server.session, not self.opened.ended
         if session is None or not self.goes_on(session):
-            session = await turn.open(self.path)
+            session = await turn.open()
         if session.size is None:
             await server.close_quietly()
             raise RemoteProtocolError("the vehicle's open reply holds no size")
@@ -180,7 +179,7 @@ class FileStream(SessionUser):
             return  # it was abandoned meanwhile, or nothing is wanted
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
-        began, driver, engine = server.clock(), server.driver, server.engine
+        driver, engine = server.driver, server.engine
         server.transfer = self._transfer = transfer
         self._received = 0
         if isinstance(transfer, BurstTransfer):
@@ -188,10 +187,7 @@ class FileStream(SessionUser):
         try:
             await driver.start(transfer, server.wake, self._on_batch)
             while not (transfer.done or transfer.idle or self.closed or server.session is None):
-                use = turn.rival_use
-                if use is not None and self.gives_way(use, began, server.clock(), engine.rtt):
-                    break
-                if self._scheduler.is_excluded(self.path) or (use is not None and not transfer.demanded):
+                if turn.is_over() or (turn.contended and not transfer.demanded):
                     break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
@@ -206,7 +202,6 @@ class FileStream(SessionUser):
             server.transfer = self._transfer = None
             transfer.finish()
             driver.cancel(transfer)
-            self.on_turn(began, server.clock())
         if transfer.error is not None:
             raise transfer.error
 

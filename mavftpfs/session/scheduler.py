@@ -1,18 +1,21 @@
 """Gives the one server session to one user after another. Layer: session.
 
     async with scheduler.turn(user) as turn:
-        session = await turn.open(path)
+        session = await turn.open()
 
-One task (`serve`) grants the turns. Between them it closes what nobody needs open. Readers and uploads have a
-task each, single requests are made in the caller's own.
+A task that waits for a turn looks itself whether it is next: whenever something changed
+(`ServerSession.changed`), and when its own timer ends. Readers and uploads have a task each, single requests
+are made in the caller's own. Between turns the janitor closes what nobody needs open, so that no caller is
+cancelled in a Terminate.
 
-A user that used little of the session lately (an editor, `head`) goes before one that used much (a copy), at
-once. Those that used much take turns of a second or more, since changing files costs round trips. A user that
-waited for long goes first all the same: one small file after another slows a copy down, and does not stop it.
+The user with the least score is next: seconds of use in the recent past, which count up to 0.3, less a tenth
+of the seconds that it waited. So an editor or `head` goes before a copy at once, and one small file after
+another keeps a copy waiting for three seconds at most.
 """
 
 from __future__ import annotations
 
+import random
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -26,28 +29,29 @@ from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.serversession import OpenSession, ServerSession
-from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, RequestTimeout, SessionBusy
+from mavftpfs.shared.errors import (
+    LocalProtocolError,
+    MavftpfsError,
+    RequestTimeout,
+    SessionBusy,
+    SessionTaken,
+)
 from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
 
-LIGHT_USE = 0.3
-"""Seconds of use in the recent past below which a user counts as a light one."""
+MOST_USE = 0.3
+"""Seconds of use in the recent past that count at most."""
 
 USE_MEMORY = 10.0
 """Seconds after which use no longer counts."""
 
-MIN_TURN, MAX_TURN = 1.0, 4.0
+WAITED = 0.1
+"""How much a second of waiting counts, in seconds of use."""
+
+LEAST_TURN, LONGEST_TURN = 0.5, 2.5
 TURN_TRIPS = 10.0
-"""Seconds, and round trips, for which a heavy user keeps the session while another one waits."""
-
-LONG_WAIT = 3.0
-LONG_WAIT_TRIPS = 20.0
-"""Seconds, and round trips, of waiting after which a heavy user is not passed over any more. Opening the file
-of an upload again takes up to four round trips, and five the first time after the vehicle's start."""
-
-RELIEF = 0.5
-"""Seconds for which a user that had waited so long keeps its turn."""
+"""Seconds, and round trips, that a turn lasts among equals: changing files costs up to five round trips."""
 
 RECENT = 10.0
 """Seconds for which what was read stays provisional, also of files that were closed since: another client is
@@ -94,9 +98,8 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        waiting_since: since when it wants more than readahead; None if it does not. A caller waits for that
-            (`awaited`), or none does: uploads in the background. The user sets it; `Scheduler.turn` clears
-            it, however it ends.
+        waiting_since: when it began to want more than readahead; None if it does not. The user sets it;
+            `Scheduler.turn` clears it, however it ends.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -108,9 +111,10 @@ class SessionUser:
         self._until = 0.0
 
     @property
-    def awaited(self) -> bool:
-        """Whether a caller waits for it, and gets an error if it has no turn in time."""
-        return self.waiting_since is not None
+    def awaited_since(self) -> float | None:
+        """When a caller began to wait for this user: it gets a turn in time, or an error. None if none waits,
+        as for an upload in the background."""
+        return self.waiting_since
 
     @property
     def idle(self) -> bool:
@@ -122,19 +126,19 @@ class SessionUser:
         return False
 
     def on_queued(self) -> None:
-        """It goes on waiting, because others have the session: the vehicle is not silent."""
+        """Note that it goes on waiting for others, and that its time is not up."""
 
     def on_removed(self) -> None:
-        """The file of its path was removed or replaced."""
+        """Note that the file of its path was removed or replaced."""
 
     def on_suspect(self, reason: str) -> None:
-        """What was read lately may be another file's."""
+        """Note that what was read lately may be another file's."""
 
     def on_armed_changed(self) -> None:
-        """The vehicle was armed or disarmed."""
+        """Note that the vehicle was armed or disarmed."""
 
     def on_turn(self, began: float, now: float) -> None:
-        """It had the session until now."""
+        """Note that it had the session since then."""
         self._used = self.used(began) + now - began
         self._until = now
 
@@ -143,51 +147,73 @@ class SessionUser:
         until = now if self.waiting_since is None else min(now, self.waiting_since)
         return self._used * min(1.0, max(0.0, 1.0 - (until - self._until) / USE_MEMORY))
 
-    def waited_long(self, now: float, rtt: float | None) -> bool:
-        """Return whether it is not to be passed over any more."""
-        limit = max(LONG_WAIT, LONG_WAIT_TRIPS * (rtt or 0.0))
-        return self.waiting_since is not None and now - self.waiting_since >= limit
-
-    def rank(self, now: float, rtt: float | None) -> tuple[bool, float]:
-        """Return its place among the users that wait: the least goes first."""
-        heavy = self.used(now) >= LIGHT_USE and not self.waited_long(now, rtt)
-        return heavy, now if self.waiting_since is None else self.waiting_since
-
-    def gives_way(self, rival_use: float, began: float, now: float, rtt: float | None) -> bool:
-        """Return whether its turn, which began then, ends for a user that waits. rival_use: see Turn."""
-        slice_, had_waited_long = now - began, self.waited_long(began, rtt)
-        if slice_ < RELIEF and had_waited_long:
-            return False
-        if rival_use < LIGHT_USE and max(self.used(now), slice_) >= LIGHT_USE:
-            return True
-        return slice_ >= min(MAX_TURN, max(MIN_TURN, TURN_TRIPS * (rtt or 0.0)))
+    def score(self, now: float) -> float:
+        """Return its place among the users that wait: the least is next."""
+        waited = 0.0 if self.waiting_since is None else now - self.waiting_since
+        return min(self.used(now), MOST_USE) - WAITED * waited
 
 
 class Turn:
-    """The session, as long as it is one user's; before that, the user's place in the queue.
+    """The session, while one user has it.
 
     Attributes:
-        user, task: whose it is. granted: ends when it is granted, or when the user cannot have it.
-        given_back: it is over. limit: bounds the wait.
+        user, task: whose it is. granted_at: since when. began: when its file was opened, or went on.
     """
 
     def __init__(self, scheduler: Scheduler, user: SessionUser) -> None:
         self.user = user
         self.task = trio.lowlevel.current_task()
-        self.granted, self.given_back = Future(), trio.Event()
-        self.limit = trio.CancelScope()
+        self.granted_at = self.began = scheduler.clock()
         self._scheduler = scheduler
+        since = self.began if user.waiting_since is None else user.waiting_since
+        self._waited = self.began - since
 
-    async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
-        """Close what is open and open another file; raises what ServerSession.open does."""
-        assert self._scheduler.holder is self
-        return await self._scheduler.server.open(path, opcode)
+    async def open(self, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
+        """Close what is open and open the user's file. While another client has a file open, others may have
+        the turn. Raises what ServerSession.open and Scheduler.turn do."""
+        scheduler = self._scheduler
+        while True:
+            assert scheduler.holder is self
+            try:
+                session = await scheduler.server.open(self.user.path, opcode)
+                break
+            except SessionTaken:
+                await scheduler.wait_again(self)
+        self.began = session.opened_at
+        return session
 
     @property
-    def rival_use(self) -> float | None:
-        """How much the lightest user that waits used lately, in seconds; None if nobody waits."""
+    def contended(self) -> bool:
+        """Whether another user waits that could use the session now."""
+        return bool(self._scheduler.waiting(self._scheduler.clock()))
+
+    @property
+    def light_waits(self) -> bool:
+        """Whether another user waits that used little, so that this turn is short."""
         now = self._scheduler.clock()
-        return min((user.used(now) for user in self._scheduler.waiting(now)), default=None)
+        return any(rival.used(now) < MOST_USE for rival in self._scheduler.waiting(now))
+
+    def is_over(self) -> bool:
+        """Return whether another user is to go first now, or the path is about to change.
+
+        A turn that lasted a while ends for any user with a lower score; before that only for one that used
+        little. Half a second is left in any case to a user that waited for longer than its use counts: else
+        the next small file would send it away at once.
+        """
+        scheduler, user = self._scheduler, self.user
+        now, rtt = scheduler.clock(), scheduler.server.engine.rtt
+        if scheduler.is_excluded(user.path):
+            return True
+        lasted = now - self.began
+        used, rivals = user.used(self.began) + lasted, scheduler.waiting(now)
+        score = min(used, MOST_USE)
+        if lasted < LEAST_TURN:
+            score -= WAITED * self._waited
+        if lasted < min(LONGEST_TURN, max(LEAST_TURN, TURN_TRIPS * (rtt or 0.0))):
+            if score <= 0.0 or used < MOST_USE:
+                return False
+            rivals = [rival for rival in rivals if rival.used(now) < MOST_USE]
+        return any(rival.score(now) < score for rival in rivals)
 
 
 @dataclass(eq=False)
@@ -218,13 +244,14 @@ class Scheduler:
         driver: Driver,
         *,
         clock: Callable[[], float],
+        rng: random.Random,
         op_deadline: float = 30.0,
         read_mode: ReadMode = "window",
         chunk: int | None = None,
     ) -> None:
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
-        self.server = ServerSession(driver, clock, op_deadline)
+        self.server = ServerSession(driver, clock, rng, op_deadline)
         self.server.on_reads_distrusted = self._on_reads_distrusted
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
@@ -234,10 +261,12 @@ class Scheduler:
         self._driver = driver
         self._op_deadline = op_deadline
         self._longest_wait = 1.02 * op_deadline  # the time-out of a request comes first, and says more
-        self._queue: dict[SessionUser, Turn] = {}
+        self._queue: dict[SessionUser, MavftpfsError | None] = {}  # with what refuses it a turn
         self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
+        self._tidying = False
         self._used_at = clock()  # end of the last turn, or the janitor's last try
+        self._moved_at = -inf  # see `_moved`
 
     # --- turns
 
@@ -248,7 +277,7 @@ class Scheduler:
         self._nursery.start_soon(run)
 
     def remove(self, user: SessionUser) -> None:
-        """It wants no turn any more; harmless if that is known."""
+        """Unregister a reader or an upload. Calling this twice is harmless."""
         if user in self.users:
             del self.users[user]
             now = self.clock()
@@ -258,54 +287,82 @@ class Scheduler:
         self.refuse(user, LocalProtocolError("it was closed"))
 
     def refuse(self, user: SessionUser, error: MavftpfsError) -> None:
-        """If it waits for a turn, raise an error there."""
-        turn = self._queue.pop(user, None)
-        if turn is not None:
-            turn.granted.end(error)
-        self.server.wake()
-
-    def limit_wait(self, user: SessionUser) -> None:
-        """A caller begins to wait for this user: if it is queued, its turn comes within `op_deadline` from
-        now, or it gets an error. Its place in the queue stays."""
+        """If a user waits for a turn, raise an error there."""
         if user in self._queue:
-            self._limit(self._queue[user])
-
-    def _limit(self, turn: Turn) -> None:
-        """Let it wait for `_longest_wait` from now on; without limit if no caller waits for its user."""
-        turn.limit.deadline = trio.current_time() + self._longest_wait if turn.user.awaited else inf
+            self._queue[user] = error
+        self.server.wake()
 
     @asynccontextmanager
     async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
         """Wait for the session, and have it for the length of the body.
 
         The body must not wait for a path, a node or memory for reads: a task that has one of these may be
-        waiting for the session. If the body is cancelled while it opens or closes a file, `serve` closes what
-        may be open.
+        waiting for the session. If the body is cancelled while it opens or closes a file, the janitor closes
+        what may be open.
 
         Raises:
             VehicleLost, Armed: it cannot be used now. RequestTimeout, SessionBusy: others keep it.
         """
-        turn = self._queue[user] = Turn(self, user)
-        self.server.wake()
+        turn: Turn | None = None
         try:
-            self._limit(turn)
-            with turn.limit:
-                await turn.granted.wait()
-            if self.holder is not turn:
-                raise SessionBusy(_OTHERS) if self.clock() < self.others_until else RequestTimeout(_KEPT)
+            await trio.lowlevel.checkpoint()
+            await self._wait(user)
+            turn = Turn(self, user)
+            self._set_holder(turn)
             self.server.vehicle.require(self.clock(), writing=user.writing)
             yield turn
         finally:
-            user.waiting_since = None
-            if self._queue.get(user) is turn:
-                del self._queue[user]
-            if self.holder is turn:
+            if turn is not None and self.holder is turn:
+                now = self.clock()
+                user.on_turn(turn.began, now)
+                self._moved_at, self._used_at = self._moved, now
                 self._set_holder(None)
-            turn.given_back.set()
+            user.waiting_since = None
+
+    async def wait_again(self, turn: Turn) -> None:
+        """Give a turn back, and wait until it is next again; raises what `turn` does."""
+        self._set_holder(None)
+        await self._wait(turn.user)
+        self._set_holder(turn)
+        self.server.vehicle.require(self.clock(), writing=turn.user.writing)
+
+    async def _wait(self, user: SessionUser) -> None:
+        """Wait in the queue until a user is next."""
+        self._queue[user] = None
+        self.server.wake()
+        try:
+            while not self._is_next(user):
+                if (refusal := self._queue[user]) is not None:
+                    raise refusal
+                now, others_until = self.clock(), self.others_until
+                if now >= self._deadline(user):
+                    raise SessionBusy(_OTHERS) if now < others_until else RequestTimeout(_KEPT)
+                user.on_queued()
+                until = min(self._deadline(user), now + self._op_deadline / 4)  # it is told that it goes on
+                await self.server.sleep((min(until, others_until) if others_until > now else until) - now)
+        finally:
+            del self._queue[user]
+            self.server.wake()
+
+    def _deadline(self, user: SessionUser) -> float:
+        """Return until when a user waits. Its time begins when the vehicle last answered in somebody's turn,
+        or when another client last closed a file."""
+        since = user.awaited_since
+        if since is None:
+            return inf
+        if self.clock() < self.others_until:
+            return self.server.busy_at(max(since, self._moved))
+        return max(since, self._moved) + self._longest_wait
+
+    @property
+    def _moved(self) -> float:
+        """When the vehicle last answered in somebody's turn. Listings are also answered outside of turns."""
+        answered_at, holder = self._driver.last_reply_at, self.holder
+        return answered_at if holder is not None and answered_at >= holder.granted_at else self._moved_at
 
     def _set_holder(self, turn: Turn | None) -> None:
         self.holder = turn
-        self.server.changed.unpark_all()
+        self.server.wake()
 
     def assert_no_turn(self) -> None:
         """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
@@ -315,12 +372,18 @@ class Scheduler:
         """Return the users that want more than readahead, and could use the session now."""
         return [user for user in self._queue if user.waiting_since is not None and self._may_use(user, now)]
 
+    def _is_next(self, user: SessionUser) -> bool:
+        """Return whether a user has its turn now: it is first, and no other file is open."""
+        session = self.server.session
+        closed = session is None or session.path == user.path
+        return closed and self.holder is None and not self._tidying and self.next_user() is user
+
     def next_user(self) -> SessionUser | None:
         """Return the user that is to have the session now. Readahead comes only if nothing waits, and that of
         the open file first."""
-        now, rtt = self.clock(), self._driver.engine.rtt
+        now = self.clock()
         if waiting := self.waiting(now):
-            return min(waiting, key=lambda user: user.rank(now, rtt))
+            return min(waiting, key=lambda user: user.score(now))
         session = self.server.session
         first = None
         for user in self._queue:
@@ -332,14 +395,14 @@ class Scheduler:
 
     def _may_use(self, user: SessionUser, now: float) -> bool:
         """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
-        if self.is_excluded(user.path):
+        if self._queue.get(user) is not None or self.is_excluded(user.path):
             return False
         session = self.server.session
         return now >= self.others_until or (session is not None and user.goes_on(session))
 
     @property
     def others_until(self) -> float:
-        """Before this nothing is opened: that might end another client's session."""
+        """Until then nothing is opened: that might end another client's session."""
         several = self._driver.engine.traits.several_sessions
         return -inf if several else self.server.others.file_open_until
 
@@ -373,23 +436,12 @@ class Scheduler:
 
     def _used_paths(self) -> list[bytes]:
         """Return where something is open, may be open, or may be opened at any time."""
-        used = list(self.server.maybe_open.values())
+        used = [path for _, path in self.server.maybe_open]
         if self.server.session is not None:
             used.append(self.server.session.path)
         if self.holder is not None:
             used.append(self.holder.user.path)
         return used
-
-    async def _close_excluded(self) -> None:
-        """Close what is open, or may be open, where a path is about to change. The task that waits for that
-        is told of a failure by its time-out."""
-        if not self._excluded:
-            return
-        server = self.server
-        if server.session is not None and self.is_excluded(server.session.path):
-            await server.close_quietly()
-        if any(map(self.is_excluded, server.maybe_open.values())):
-            await server.close_maybe_open()
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed. Users of it, and of what lies in it, go on under the new path. A
@@ -419,60 +471,58 @@ class Scheduler:
             user.on_armed_changed()
         self.server.wake()
 
-    # --- the one task
+    # --- the janitor
 
     async def serve(self) -> None:
-        """Grant turns until cancelled, and run the tasks of readers and uploads."""
-        server = self.server
+        """Run the janitor, and the tasks of readers and uploads, until cancelled."""
         async with trio.open_nursery() as self._nursery:
             self.serving.set()
             while True:
                 await trio.lowlevel.checkpoint()
-                await self._close_excluded()
-                user, session = self.next_user(), server.session
-                if user is None:
-                    await self._idle(self.clock())
-                elif session is not None and session.path != user.path:
-                    await server.close_quietly()  # a user may have come meanwhile that goes first
+                if self._queue and self.clock() < self.others_until:
+                    await self.server.learn_several_sessions()
+                wait = self._closes_in(self.clock())
+                if wait > 0.0:
+                    await self.server.sleep(wait)
                 else:
-                    await self._grant(user)
+                    await self.tidy()
 
-    async def _grant(self, user: SessionUser) -> None:
-        """Give a user the session, and wait until it is given back. If the vehicle answered meanwhile, the
-        users in the queue may wait longer: it is not silent."""
-        turn, began = self._queue.pop(user), self.clock()
-        self._set_holder(turn)
-        turn.granted.end()
-        await turn.given_back.wait()
-        self._used_at = self.clock()
-        if self._driver.last_reply_at >= began:
-            for user, other in self._queue.items():
-                self._limit(other)
-                user.on_queued()
-
-    async def _idle(self, now: float) -> None:
-        """Nobody can use the session now: close it in time, and wait for news."""
-        server, news_in = self.server, inf
-        if self._queue and now < self.others_until:
-            await server.learn_several_sessions()
-            for user in self._queue:
-                user.on_queued()
-            news_in = max(0.0, self.others_until - now)
-        if await server.sleep(min(self._closes_in(now), news_in)) or self.next_user() is not None:
-            return
-        self._used_at = self.clock()
-        if server.session is not None:
-            await server.close_quietly()
-        elif not server.vehicle.lost(self._used_at):
-            await server.close_maybe_open()
+    async def tidy(self) -> None:
+        """Close what is open, or may be. A task that waits for that is told of a failure by its time-out."""
+        server = self.server
+        self._tidying = True
+        try:
+            if server.session is not None:
+                await server.close_quietly()
+            else:
+                await server.close_maybe_open()
+        finally:
+            self._tidying, self._used_at = False, self.clock()
+            server.wake()
 
     def _closes_in(self, now: float) -> float:
-        """Return in how many seconds what is open, or may be, is closed. That is counted from the last use,
-        not from the last news: there may always be news, and an orphan of ours keeps other clients out."""
-        session = self.server.session
+        """Return in how many seconds the janitor closes what is open, or may be.
+
+        At once if another user is next, or the path is about to change. Else that is counted from the last
+        use, not from the last news: there may always be news, and an orphan of ours keeps other clients out.
+        """
+        server, session = self.server, self.server.session
+        if self.holder is not None:
+            return inf
         if session is not None:
-            return max(0.0, self._used_at + IDLE_CLOSE - now) if self._is_kept(session.path) else 0.0
-        return max(0.0, self._used_at + MAYBE_OPEN_CLOSE - now) if self.server.maybe_open else inf
+            user = self.next_user()
+            if self.is_excluded(session.path) or (user is not None and user.path != session.path):
+                return 0.0
+            if not self._is_kept(session.path):
+                return 0.0
+            return max(0.0, self._used_at + IDLE_CLOSE - now)
+        if any(self.is_excluded(path) for _, path in server.maybe_open):
+            return 0.0
+        if not server.maybe_open or self.next_user() is not None:  # which closes that before its open
+            return inf
+        if server.vehicle.lost(now):
+            return MAYBE_OPEN_CLOSE
+        return max(0.0, self._used_at + MAYBE_OPEN_CLOSE - now)
 
     def _is_kept(self, path: bytes) -> bool:
         """Return whether a file stays open a moment longer: not in flight, if nobody has it open here."""

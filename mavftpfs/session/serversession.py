@@ -1,24 +1,20 @@
 """The server's one session: what is open there, and what to do when it is taken. Layer: session.
 
-Two facts say what is open by our doing: `session` is the file that is open, `maybe_open` are files of which
-that is not known. There is never both. The task that has the turn opens, uses and closes a file. Between
-turns the scheduler's task (`serve`) closes it. The task that reads the link may abandon it.
-
-Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
-(ArduPilot, the same id). ArduPilot refuses all other requests with 4, too (docs/servers.md 1). Asking again
-soon keeps a stale session alive. So there is one list of remedies: close what may be ours, be silent, reset
-if nobody else was heard. After those it is busy.
+Two facts say what this connection opened: `session` is the file that is open, and `maybe_open` holds the
+files of which that is not known. One of them is always empty. The task that has the turn opens, uses and
+closes a file. Between turns the scheduler's janitor closes it. `distrust` may leave it at any time.
 
 Requests that carry a path and need no session (`ask`) run beside it, and carry its id (docs/servers.md 1).
 """
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from math import inf
+from math import inf, nextafter
 from typing import TypeVar
 
 import trio
@@ -36,7 +32,14 @@ from mavftpfs.session.others import (
     asks_to_open,
     took_session,
 )
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
+from mavftpfs.shared.errors import (
+    FtpNak,
+    MavftpfsError,
+    RequestTimeout,
+    SessionBusy,
+    SessionLost,
+    SessionTaken,
+)
 from mavftpfs.shared.model import wire_path
 
 SILENCE_ARDUPILOT = 3.5
@@ -53,9 +56,6 @@ STALL = 2.0
 
 REOPENS = 5
 """How often a reader or an upload may lose the session without progress before it fails."""
-
-_LOST_ACKS = 4
-"""How often an open is tried again whose ACKs are lost one after the other."""
 
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
@@ -90,36 +90,46 @@ class OpenSession:
 
 
 @dataclass
-class _Remedies:
-    """What is left to be tried against refusals because the session is taken; silences in seconds."""
+class _Tried:
+    """What was tried so far, since `began`, against refusals of one request because the session is taken.
 
-    closings: int = _LOST_ACKS
+    opens: the request opens a file. resent: some try of it was sent more than once. closed: what an open of
+    ours may have left was closed. silences: in seconds, those that are left.
+    """
+
+    began: float
+    opens: bool
+    resent: bool = False
+    listed: bool = False
+    closed: bool = False
     silences: Iterator[float] = field(default_factory=partial(iter, (SILENCE_ARDUPILOT, SILENCE_PX4)))
-    resets: int = 1
+    reset: bool = False
 
 
 class ServerSession:
-    """Opens and closes files, and knows what is open. Its user sleeps here until there is news.
+    """Opens and closes files, and knows what is open.
 
     op_deadline: seconds to wait for a Terminate of whose failure a caller is told.
 
     Attributes:
         session: what is open; None if nothing is, or if it is not believed any more. transfer: what reads or
         writes it now.
-        maybe_open: files that may be open over there by our doing, by session id: a request was not answered
-        yet, or never, or the session is not believed any more.
+        maybe_open: (session id, path) of each file that this connection may have open: a request was not
+        answered yet, or never, or the session is not believed any more.
         file_since: when the last open went out, and once its ACK came, when that was. What went out before
         concerns an earlier file.
-        epoch: how often what was read lately came into doubt. late_copies: which names rest.
+        epoch: when what was read lately last came into doubt; each time is later than the one before.
+        late_copies: which names rest.
         others: other clients of this server.
         on_reads_distrusted: called with the reason whenever the epoch is raised.
-        changed: where tasks park until something more is closed.
+        changed: where tasks park until something changed: turns, what is open, what is wanted.
     """
 
     def __init__(
         self,
         driver: Driver,
         clock: Callable[[], float],
+        rng: random.Random,
         op_deadline: float = 30.0,
     ) -> None:
         self.driver = driver
@@ -129,15 +139,13 @@ class ServerSession:
         self.op_deadline = op_deadline
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
-        self.maybe_open: dict[int, bytes] = {}
+        self.maybe_open: set[tuple[int, bytes]] = set()
         self.file_since = -inf
-        self.epoch = 0
-        self._epoch_at = self._distrusted_at = -inf
+        self.epoch = self._distrusted_at = -inf
         self.late_copies = LateCopies()
-        self.others = OtherClients()
+        self.others = OtherClients(rng)
         self.on_reads_distrusted: Callable[[str], None] = lambda why: None
         self._asked_sessions_at = -inf
-        self._news = trio.Event()
         self.changed = trio.lowlevel.ParkingLot()
 
     # --- trust
@@ -151,7 +159,7 @@ class ServerSession:
         """
         self._distrusted_at = self.clock()
         if reads:
-            self.epoch, self._epoch_at = self.epoch + 1, self._distrusted_at
+            self.epoch = max(self._distrusted_at, nextafter(self.epoch, inf))
             self.leave()
             self.on_reads_distrusted(why)
 
@@ -169,7 +177,7 @@ class ServerSession:
         took = shared and took_session(payload)
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
         # If no file was opened since the last such news, nothing more is in doubt.
-        opened = session is not None or self.file_since >= self._epoch_at
+        opened = session is not None or self.file_since >= self.epoch
         self.distrust("another FTP client is active", reads=(took or missed) and opened)
         self.wake()
 
@@ -221,27 +229,24 @@ class ServerSession:
     def _leave(self) -> None:
         """Count what is open as perhaps open."""
         if self.session is not None:
-            self.maybe_open[self.session.id] = self.session.path
+            self.maybe_open.add((self.session.id, self.session.path))
             self.session, self.engine.session = None, self.engine.home_session
 
     def _forget(self, session: int) -> None:
-        """Note that no file is open by our doing under this id."""
-        self.maybe_open.pop(session, None)
+        """Note that this connection has no file open under this id."""
+        self.maybe_open = {(other, path) for other, path in self.maybe_open if other != session}
         self.changed.unpark_all()
 
     # --- waiting
 
     def wake(self) -> None:
-        """There is news for the user of the session."""
-        self._news.set()
+        """Have everyone look again that sleeps here: something changed."""
+        self.changed.unpark_all()
 
-    async def sleep(self, seconds: float) -> bool:
-        """Wait for news; return False if there was none."""
+    async def sleep(self, seconds: float) -> None:
+        """Wait until something changed, for so long at most."""
         with trio.move_on_after(seconds):
-            await self._news.wait()
-            self._news = trio.Event()
-            return True
-        return False
+            await self.changed.park()
 
     # --- opening
 
@@ -249,82 +254,50 @@ class ServerSession:
         """Close what is open and open another file, by OpenFileRO, OpenFileWO or CreateFile.
 
         Raises:
-            FtpNak: the server refused. SessionBusy: its session stayed taken. SessionLost: it was open, and
-                is not believed any more. RequestTimeout: it was not answered; or a file that may
-                be open from before could not be closed.
+            FtpNak: the server refused. SessionTaken: another client has a file open. SessionBusy: the session
+                stayed taken. SessionLost: the file was opened, and is not believed to be any more.
+                RequestTimeout: no answer, to this open or to the close of an earlier file.
         """
         await self.close_quietly()
         await self._close_maybe_open()
-        began = self.clock()
+        tried = _Tried(self.clock(), opens=True)
         try:
-            await self._open_with_remedies(path, opcode)
+            while not await self._opens(path, opcode, tried):
+                pass
         finally:
             if opcode == Opcode.CREATE_FILE:
                 late, now = self.late_copies, self.clock()
                 late.on_changed(path, now)
                 # Where nothing can be renamed a file is not compared once more under its final name.
                 if self.engine.traits.rename_works is False and (self.session is None or self.session.resent):
-                    late.on_maybe_under_way(path, now - began, now)
+                    late.on_maybe_under_way(path, now - tried.began, now)
         if self.session is None:
             raise _lost()
         return self.session
 
-    async def _open_with_remedies(self, path: bytes, opcode: Opcode) -> None:
-        """Open. While that is refused because the session is taken, try one remedy after the other.
+    async def _opens(self, path: bytes, opcode: Opcode, tried: _Tried) -> bool:
+        """Ask to open a file once; return False if that is to be tried again."""
+        asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
+        operation = OpenRequest(opcode, wire_path(path), session=asked)
+        operation.on_opened = partial(self._on_opened, path, tried)
+        # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
+        if echoes is not False:
+            self.maybe_open.add((asked, path))
+        if not echoes:
+            self.maybe_open.add((0, path))
+        self.file_since = self.clock()
+        try:
+            await self.driver.run(operation)
+        except FtpNak as nak:
+            await self._remedy(nak, tried)
+            return False
+        return True
 
-        | the refusal | may an open of ours have been carried out? | `maybe_open` | then |
-        |---|---|---|---|
-        | one of _OPEN_TAKEN | yes | stays: a remedy may close it | a remedy |
-        | one of _OPEN_TAKEN | no | is cleared | another client's file is waited for, or a remedy |
-        | FAIL, perhaps of an ArduPilot | yes | stays: a remedy may close it | a remedy |
-        | any other | - | is cleared | it is raised |
-        """
-        remedies, resent, began = _Remedies(), False, self.clock()
-        while True:
-            asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
-            operation = OpenRequest(opcode, wire_path(path), session=asked)
-            operation.on_opened = partial(self._on_opened, path, resent)
-            # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
-            if echoes is not False:
-                self.maybe_open[asked] = path
-            if not echoes:
-                self.maybe_open[0] = path
-            self.file_since = self.clock()
-            try:
-                await self.driver.run(operation)
-            except FtpNak as nak:
-                resent |= nak.retransmitted
-                ours = self._may_have_opened(nak)
-                # ArduPilot says FAIL, too, if the session is open under our id.
-                taken = nak.code in _OPEN_TAKEN or (nak.code == NakCode.FAIL and ours and echoes is not False)
-                if not ours or not taken:
-                    self.maybe_open.clear()
-                if not taken:
-                    raise
-                if ours or not await self._another_closes(nak, began + self.op_deadline):
-                    await self._remedy(nak, remedies)
-            else:
-                return
-
-    async def _another_closes(self, nak: FtpNak, deadline: float) -> bool:
-        """Wait until another client, which opened a file just before us, has closed it. Return False if no
-        client is heard to have one open.
-
-        Raises:
-            SessionBusy: it is still open at the deadline.
-        """
-        heard = False
-        while (now := self.clock()) < self.others.file_open_until:
-            if now >= deadline:
-                raise SessionBusy(_IN_USE) from nak
-            await self.sleep(min(self.others.file_open_until, deadline) - now)
-            heard = True
-        return heard
-
-    def _on_opened(self, path: bytes, resent: bool, operation: OpenRequest) -> None:
-        """The ACK of an open came. Noted at once: what shows that another file is open there may come right
-        behind it, before the task that opened the file goes on. resent: an earlier try was."""
+    def _on_opened(self, path: bytes, tried: _Tried, operation: OpenRequest) -> None:
+        """Note the ACK of an open, at once: what shows that another file is open there may come right behind
+        it, before the task that opened the file goes on."""
         self.maybe_open.clear()
+        self.others.on_ours_opened()
         self.session = OpenSession(
             path,
             operation.session,
@@ -332,14 +305,75 @@ class ServerSession:
             self.clock(),
             writing=operation.opcode != Opcode.OPEN_FILE_RO,
             seq=operation.reply.seq,
-            resent=resent or operation.retransmitted,
+            resent=tried.resent or operation.retransmitted,
         )
         self.engine.session, self.file_since = self.session.id, self.session.opened_at
 
-    def _may_have_opened(self, nak: FtpNak) -> bool:
-        """Return whether an open of ours may have been carried out before this refusal: its ACK was lost, or
-        a late copy of an older open came."""
-        return nak.retransmitted or (self.in_doubt() and not self._another_client_heard())
+    # --- when the session is taken
+
+    async def _remedy(self, nak: FtpNak, tried: _Tried) -> None:
+        """Do the next thing about a refusal, so that the request may be sent again.
+
+        | who has the session | NAK | what is done |
+        |---|---|---|
+        | a copy of our own open, whose ACK was lost | 4, 5, 8; of an ArduPilot 1 | close it |
+        | nobody: PX4's sticky errno hides another code | 8 | list a directory to its end, once |
+        | another client that was heard | 4, 5 | the caller waits for that client |
+        | a client that is gone | 4, 5 | be silent for 3.5 s, then for 10.5 s; then reset, if we are alone |
+
+        Asking sooner keeps a stale session alive (docs/servers.md 1).
+
+        Raises:
+            FtpNak: the refusal has another reason. SessionTaken: another client has a file open.
+            SessionBusy: nothing is left that could help. RequestTimeout: a remedy was not answered.
+        """
+        tried.resent |= nak.retransmitted
+        alone = not self.vehicle.another_client_heard(self.clock())
+        doubled = self.in_doubt() and alone and not tried.closed  # a late copy of an older open may have come
+        ours = tried.opens and (nak.retransmitted or doubled)
+        taken = nak.code in (_OPEN_TAKEN if tried.opens else _TAKEN)
+        if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under our id
+            taken = ours and self.engine.traits.ack_carries_own_session is not False
+        if tried.opens and not (taken and ours):
+            self.maybe_open.clear()
+        if not taken:
+            raise nak
+        if self.clock() >= self.busy_at(tried.began):
+            raise SessionBusy(_IN_USE) from nak
+        if nak.code == NakCode.FILE_EXISTS and not tried.listed:
+            tried.listed = True
+            await self._try(ListDirectory(b"/", False))
+            return
+        if ours and await self._close_maybe_open():
+            tried.closed = True
+            return
+        if nak.code == NakCode.FAIL:
+            raise nak
+        if self.clock() < self.others.file_open_until:
+            raise SessionTaken(_IN_USE) from nak
+        for seconds in tried.silences:
+            if await self.driver.be_silent(seconds):
+                return
+        if not tried.opens or tried.reset or not alone:
+            raise SessionBusy(_IN_USE) from nak
+        tried.reset = True
+        await self._try(Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session))
+
+    def busy_at(self, since: float) -> float:
+        """Return when a caller that waits for other clients since then is told that the session is busy: they
+        closed no file for `op_deadline`."""
+        return max(since, self.others.closed_at) + self.op_deadline
+
+    async def wait_for_others(self, since: float) -> None:
+        """Wait until no other client has a file open.
+
+        Raises:
+            SessionBusy: see `busy_at`.
+        """
+        while (now := self.clock()) < self.others.file_open_until:
+            if now >= self.busy_at(since):
+                raise SessionBusy(_IN_USE)
+            await self.sleep(min(self.others.file_open_until, self.busy_at(since)) - now)
 
     # --- closing
 
@@ -391,7 +425,7 @@ class ServerSession:
             RequestTimeout: no answer; it may be open as before.
         """
         closed = False
-        for session in list(self.maybe_open):
+        for session in {session for session, _ in self.maybe_open}:
             # MAVSDK ends the session of another client, whatever id is asked for.
             if self.engine.traits.ack_carries_own_session or self.clock() >= self.others.file_open_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
@@ -410,13 +444,13 @@ class ServerSession:
         heard_at = max(self.driver.last_reply_at, transfer.progress_at)
         return not transfer.idle and self.clock() - heard_at > max(STALL, 4.0 * (self.engine.rtt or 0.0))
 
-    # --- requests beside the session, and what to do when it is taken
+    # --- requests beside the session
 
     async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
         """Carry out a request that needs no session of its own, and carries a path.
 
-        ArduPilot refuses it while another client has a session: then a new one is made and sent after a
-        silence.
+        ArduPilot refuses it while another client has a session: then a new one is made and sent when that
+        client has closed its file, or after a silence.
 
         changes: it changes the card. If it was sent twice, a refusal may answer the second execution, and is
             raised at once.
@@ -424,18 +458,20 @@ class ServerSession:
         Raises:
             VehicleLost. SessionBusy: that session did not go away. Else what the request fails with.
         """
-        remedies = _Remedies(closings=0, resets=0)
+        tried = _Tried(self.clock(), opens=False)
         while True:
             operation = make()
             self.vehicle.require(self.clock())
             try:
                 await self.driver.run(operation)
-            except FtpNak as nak:
-                if nak.code not in _TAKEN or self.session is not None or (changes and nak.retransmitted):
-                    raise
-                await self._remedy(nak, remedies)
-            else:
                 return operation
+            except FtpNak as nak:
+                if self.session is not None or (changes and nak.retransmitted):
+                    raise
+                try:
+                    await self._remedy(nak, tried)
+                except SessionTaken:
+                    await self.wait_for_others(tried.began)
 
     async def learn_several_sessions(self) -> None:
         """Learn whether the server has several sessions (`Traits.several_sessions`) while another client has
@@ -457,32 +493,6 @@ class ServerSession:
         traits.several_sessions = not refused and self.others.has_session(now, self.clock())
         self.wake()
 
-    async def _remedy(self, nak: FtpNak, left: _Remedies) -> None:
-        """Do the next thing about a refusal because the session is taken.
-
-        Raises:
-            SessionBusy: nothing is left that applies. FtpNak: nor did anything say that it was taken.
-        """
-        if left.closings and await self._close_ours(nak):
-            left.closings -= 1
-            return
-        if nak.code == NakCode.FAIL:
-            raise nak
-        for seconds in left.silences:
-            if await self.driver.be_silent(seconds):
-                return
-        if not left.resets or self._another_client_heard():
-            raise SessionBusy(_IN_USE) from nak
-        left.resets -= 1
-        session = self.engine.home_session
-        await self._try(Simple(Opcode.RESET_SESSIONS, session=session))
-
-    async def _close_ours(self, nak: FtpNak) -> bool:
-        if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno
-            await self._try(ListDirectory(b"/", False))
-            return True
-        return self._may_have_opened(nak) and await self._close_maybe_open()
-
     async def _try(self, operation: Operation) -> None:
         """Run a remedy whose refusal changes nothing.
 
@@ -495,9 +505,6 @@ class ServerSession:
             raise
         except MavftpfsError:
             pass
-
-    def _another_client_heard(self) -> bool:
-        return self.vehicle.another_client_heard(self.clock())
 
 
 def _lost() -> SessionLost:

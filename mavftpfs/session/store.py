@@ -119,8 +119,8 @@ class Store:
         self._hurry_until = inf
 
     @property
-    def epoch(self) -> int:
-        """Return how often what was read lately came into doubt (see VehicleStore)."""
+    def epoch(self) -> float:
+        """Return when what was read lately last came into doubt (see VehicleStore)."""
         return self._server.epoch
 
     def why_lost(self) -> str | None:
@@ -225,7 +225,7 @@ class Store:
         user = SessionUser(path, self._clock(), writing=opcode != Opcode.OPEN_FILE_RO)
         self._vehicle.require(self._clock(), writing=user.writing)
         async with self._scheduler.turn(user) as turn:
-            yield await turn.open(path, opcode)
+            yield await turn.open(opcode)
             await self._server.close()
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:

@@ -16,7 +16,7 @@ import trio
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import WriteTransfer, is_path_refusal
-from mavftpfs.session.scheduler import LIGHT_USE, Future, Scheduler, SessionUser, Turn
+from mavftpfs.session.scheduler import Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
 from mavftpfs.shared.errors import (
     Armed,
@@ -76,6 +76,7 @@ class Upload(SessionUser):
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
+        self._awaited_since = 0.0  # the first of them
         self._waits_for_finish = False  # until then nothing is sent: refused, or all would go again
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
@@ -101,10 +102,10 @@ class Upload(SessionUser):
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
         self._waits_for_finish, self._losses, self._retry_at = False, 0, 0.0
-        first, finisher = not self.awaited, Future()
+        finisher = Future()
+        if not self.awaited:
+            self._awaited_since = self._clock()
         self._finishers.append(finisher)
-        if first:
-            self._scheduler.limit_wait(self)
         self.wake()
         try:
             await finisher.wait()
@@ -131,6 +132,11 @@ class Upload(SessionUser):
     def awaited(self) -> bool:
         """Whether a caller waits in `finish`."""
         return not all(finisher.ended for finisher in self._finishers)
+
+    @property
+    def awaited_since(self) -> float | None:
+        """See SessionUser."""
+        return self._awaited_since if self.awaited else None
 
     def on_armed_changed(self) -> None:
         """If it waits for a turn, its callers get Armed at once; in a turn it sees that itself. After
@@ -192,7 +198,6 @@ class Upload(SessionUser):
 
     async def _use(self, turn: Turn) -> None:
         """Have a turn."""
-        began = self._clock()
         try:
             session = await self._open(turn)
             stop = await self._write(turn, session)
@@ -203,8 +208,6 @@ class Upload(SessionUser):
                 self._complete(finishers)
         except MavftpfsError as error:
             self._on_failure(error)
-        finally:
-            self.on_turn(began, self._clock())
 
     def _on_failure(self, error: MavftpfsError) -> None:
         """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost
@@ -258,7 +261,7 @@ class Upload(SessionUser):
         self.made_twice |= self.may_exist
         self.may_exist = True
         try:
-            session = await turn.open(self.path, Opcode.CREATE_FILE)
+            session = await turn.open(Opcode.CREATE_FILE)
         except FtpNak as nak:
             self.made_twice |= nak.retransmitted
             raise
@@ -274,15 +277,15 @@ class Upload(SessionUser):
         """
         traits, reached = self._engine.traits, self._source.reached
         try:
-            session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
+            session = await turn.open(Opcode.OPEN_FILE_WO)
             if traits.wo_truncates is None:
-                size = (await turn.open(self.path)).size
+                size = (await turn.open()).size
                 if size is not None:
                     traits.wo_truncates = size < reached
                 if not self._keeps_content:
                     self._cannot_resume = True
                     return None
-                session = await turn.open(self.path, Opcode.OPEN_FILE_WO)
+                session = await turn.open(Opcode.OPEN_FILE_WO)
         except FtpNak:  # the file is gone, or this server opens none like that
             self._cannot_resume = True
             return None
@@ -301,15 +304,15 @@ class Upload(SessionUser):
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         server, stop = self._server, None
-        # A light user that waits already gets the session after these requests. On a slow radio a whole queue
-        # of them takes a quarter of a second.
-        use, queue = turn.rival_use, self._engine.traits.queue_limit
+        # A light user that waits gets the session after these requests. On a slow radio a whole queue of them
+        # takes a quarter of a second.
+        queue = self._engine.traits.queue_limit
         transfer = WriteTransfer(
             session.id,
             self._source,
             self._scheduler.write_chunks,
             root=storage_root(self.path),
-            in_flight=queue // 2 if queue and use is not None and use < LIGHT_USE else None,
+            in_flight=queue // 2 if queue and turn.light_waits else None,
             on_starved=server.wake,
         )
         self._transfer = server.transfer = transfer
@@ -363,13 +366,12 @@ class Upload(SessionUser):
             return Stop.ARMED
         if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
-        now, rival_use, resumable = self._clock(), turn.rival_use, self._may_interrupt
         if transfer.starved and (self.awaited or starved_for >= STARVE):
             return Stop.STARVED
-        if rival_use is None:
-            over = self._keeps_content and now - session.opened_at >= CHECKPOINT_EVERY
+        if turn.contended:
+            over = self._may_interrupt and turn.is_over()
         else:
-            over = resumable and self.gives_way(rival_use, session.opened_at, now, self._engine.rtt)
+            over = self._keeps_content and self._clock() - session.opened_at >= CHECKPOINT_EVERY
         return Stop.YIELD if over else None
 
     def _end_transfer(self) -> None:

@@ -102,6 +102,10 @@ class SessionBusy(MavftpfsError):
     """The server's session stayed taken by someone else (EBUSY)."""
 
 
+class SessionTaken(SessionBusy):
+    """Another client has a file open in the server's session, and was heard: try again once it is closed."""
+
+
 class Armed(MavftpfsError):
     """The vehicle is armed (or was never heard), and the request is not carried out in flight."""
 

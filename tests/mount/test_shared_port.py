@@ -8,12 +8,13 @@ import re
 import signal
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, command, hub_of, wait_until
+from tests.support.mounts import Mount, command, hub_of, mavftpfs, wait_until
 from tests.support.places import FOLDERS, start_place
 from tests.support.vehicles import HOST, free_udp_port
 
@@ -82,6 +83,22 @@ def test_an_upload_goes_on_when_a_second_program_comes(field: Field, kind: str) 
         assert mount.status()["link"]["reopened"] == 1
         assert copying.wait(60) == 0
     assert (place.card / "new").read_bytes() == CONTENT
+
+
+@pytest.mark.holds("promise 6")
+def test_commands_at_once_wait_for_each_other_where_there_is_one_session(field: Field) -> None:
+    """ArduPilot refuses the others while one reads. To each, the others are other clients."""
+    root, got, names = field.local("card"), field.local("got"), [f"f{number}" for number in range(5)]
+    for number, name in enumerate(names):
+        (root / name).write_bytes(bytes([number]) + CONTENT * 2)
+    source = f"udpin:{HOST}:{free_udp_port()}"
+    field.sim(root, "ardupilot", link=source.replace("udpin", "udpout"))
+    with ThreadPoolExecutor(len(names)) as programs:
+        running = [programs.submit(mavftpfs, "get", source, f"/{name}", "--to", got / name) for name in names]
+        for one in running:
+            one.result()
+    for name in names:
+        assert (got / name).read_bytes() == (root / name).read_bytes()
 
 
 def kill_hub(source: str, mounts: list[Mount]) -> None:

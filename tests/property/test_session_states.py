@@ -66,7 +66,9 @@ def test_what_is_open_is_known_or_in_doubt(acts: list[tuple[str, list[str | int]
 
 async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     driver = Answering([])
-    scheduler = Scheduler(cast(Driver, driver), clock=trio.current_time, op_deadline=10.0)
+    scheduler = Scheduler(
+        cast(Driver, driver), clock=trio.current_time, rng=random.Random(1), op_deadline=10.0
+    )
     server = driver.server = scheduler.server
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
@@ -99,7 +101,7 @@ async def _do(scheduler: Scheduler, act: str, path: bytes) -> None:
             async with trio.open_nursery() as nursery:
                 nursery.start_soon(_change, scheduler, path)
                 await trio.sleep(1)
-                await scheduler._close_excluded()
+                await scheduler.tidy()
                 nursery.cancel_scope.cancel()
 
 

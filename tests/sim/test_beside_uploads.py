@@ -104,11 +104,10 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str) -> Non
 
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
-async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str) -> None:
-    """The bytes stay held, and are brought when the vehicle has time."""
+async def test_where_it_empties_files_the_second_waits_as_long_as_the_first_moves(profile: str) -> None:
+    """The first one would have to be sent from its beginning again. Listings go on beside it."""
     here = Rig(profile, FILES, SLOW)
     data = content(600_000, 4)
-    waited: list[float] = []
     async with here.mounted(b"/d") as tree:
         here.faults.requests.clear()
         async with trio.open_nursery() as nursery:
@@ -117,19 +116,14 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str)
             assert await read_file(here.connection, here.root + b"/d/other") == b"q" * 3000  # the trial
             await trio.sleep(2)
             began = trio.current_time()
-            with pytest.raises(RequestTimeout):
-                await copy(tree, b"small", b"b" * 1000)
-            waited.append(trio.current_time() - began)
-            began = trio.current_time()
+            nursery.start_soon(copy, tree, b"small", b"b" * 1000)
             await here.connection.store.list_directory(here.root + b"/d")
-            waited.append(trio.current_time() - began)
-        assert waited[0] <= 2 * OP_DEADLINE + 3, "for close, and for the release behind it"
-        assert waited[1] < 3
+            assert trio.current_time() - began < 3
+        assert trio.current_time() - began > 2 * OP_DEADLINE
         assert here.connection.store.traits.wo_truncates is True
-        await trio.sleep(60)
-        assert here.data(b"/d/small") == b"b" * 1000, "brought later"
         # big twice, small, and an empty file that shows whether the card can rename
         assert here.count(Opcode.CREATE_FILE) <= 2 + 1 + 1
+    assert here.data(b"/d/small") == b"b" * 1000
     assert here.data(b"/d/big") == data
 
 
@@ -242,7 +236,8 @@ async def test_of_two_uploads_none_waits_for_ever() -> None:
         for _ in range(3):
             before = [source.proven.total for source in sources]
             await trio.sleep(60)
-            assert all(source.proven.total > old for source, old in zip(sources, before, strict=True))
+            for source, old in zip(sources, before, strict=True):
+                assert source.proven.total > old or source.proven.total == SIZE
 
 
 @pytest.mark.holds("promise 7")
@@ -289,24 +284,29 @@ async def test_an_upload_that_was_refused_to_go_on_begins_once_more_and_the_next
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 
-async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again() -> None:
-    """Not told at once that it waited too long: that was the time before."""
+@pytest.mark.holds("promise 4")
+async def test_a_reader_waits_as_long_as_an_upload_moves_and_no_longer() -> None:
     here = Rig("mavsdk", {b"/d/old": b"hello"}, LinkSettings(rate=5_000.0, delay=0.05))
     async with here.connected() as connection, trio.open_nursery() as nursery:
         know(connection, "mavsdk")
         upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
-        nursery.start_soon(upload.finish)
+
+        async def finish() -> None:
+            with pytest.raises(RequestTimeout):
+                await upload.finish()
+
+        nursery.start_soon(finish)
         await trio.sleep(1.5)
         sink = MemorySink(5)
         reader = await connection.store.open_reader(path("mavsdk", "old"), sink, expected_size=5)
-        for _ in range(2):
-            began = trio.current_time()
-            reader.want(0, 5, demand=True)
-            with pytest.raises(RequestTimeout):
-                await sink.wait_for(0, 5)
-            assert trio.current_time() - began == pytest.approx(30.0, abs=2.0)
+        reader.want(0, 5, demand=True)
+        await trio.sleep(2 * OP_DEADLINE)
+        assert reader.awaited_since is not None
+        here.faults.ignore(Opcode.WRITE_FILE)
+        began = trio.current_time()
+        assert await sink.wait_for(0, 5) == b"hello"
+        assert trio.current_time() - began == pytest.approx(OP_DEADLINE, abs=2.0)
         reader.close()
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.holds("rule 14.24")

@@ -202,7 +202,7 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> N
     here = Rig("px4", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         async with connection.scheduler.turn(SessionUser(b"/d/f", trio.current_time())) as turn:
-            await turn.open(b"/d/f")
+            await turn.open()
             with pytest.raises(AssertionError):
                 await connection.store.crc32(b"/d/f")
             with pytest.raises(AssertionError):
@@ -311,6 +311,26 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
         nursery.cancel_scope.cancel()
 
 
+async def test_our_own_listings_make_nobody_wait_longer_for_another_client() -> None:
+    """They are answered, and in nobody's turn."""
+    here = Rig("px4-2026", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(read_by_another, here, 60)
+        await trio.sleep(0.5)
+
+        async def list_for_ever() -> None:
+            while True:
+                await connection.store.list_directory(b"/d")
+                await trio.sleep(1.0)
+
+        nursery.start_soon(list_for_ever)
+        began = trio.current_time()
+        with pytest.raises(SessionBusy):
+            await read_file(connection, b"/d/f")
+        assert trio.current_time() - began == pytest.approx(DEFAULTS.op_deadline, abs=1.0)
+        nursery.cancel_scope.cancel()
+
+
 @pytest.mark.parametrize("profile", ONE_SESSION)
 async def test_a_client_that_only_lists_does_not_keep_our_lost_open_open(profile: str) -> None:
     """Its requests keep that session alive; it can only be ours."""
@@ -405,6 +425,65 @@ async def test_a_client_that_opened_a_file_just_before_us_is_waited_for() -> Non
         assert len(times) == 2, "it was refused once, and asked again when the other one had closed its file"
 
 
+async def read_by_another(here: Rig, seconds: int) -> None:
+    """Have another client read a file for so long, and close it."""
+    here.another_asks(Opcode.OPEN_FILE_RO, path(here.profile, "theirs"))
+    for _ in range(seconds):
+        await trio.sleep(1.0)
+        here.another_asks(Opcode.READ_FILE)
+    here.another_asks(Opcode.TERMINATE_SESSION)
+
+
+async def test_a_listing_waits_until_another_client_closed_its_file() -> None:
+    """ArduPilot refuses it until then. Silences came to an end after 14 s."""
+    here = Rig("ardupilot", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(read_by_another, here, 20)
+        await trio.sleep(0.5)
+        listing = await connection.store.list_directory(b"/d")
+        assert {entry.name for entry in listing.entries} == {b"f", b"theirs"}
+        asked = [
+            *here.faults.times(Opcode.LIST_DIRECTORY_WITH_TIME),
+            *here.faults.times(Opcode.LIST_DIRECTORY),
+        ]
+        assert len([at for at in asked if at < 20.0]) <= 2
+
+
+@pytest.mark.parametrize("profile", ONE_SESSION)
+async def test_while_other_clients_close_their_files_nobody_is_told_that_the_session_is_busy(
+    profile: str,
+) -> None:
+    """Commands of ours at once: each waits for the ones before it, however many there are."""
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+
+        async def others() -> None:
+            for _ in range(5):
+                await read_by_another(here, 12)
+
+        nursery.start_soon(others)
+        await trio.sleep(0.5)
+        assert await read_file(connection, path(profile, "f")) == DATA
+        assert trio.current_time() > DEFAULTS.op_deadline
+
+
+async def test_a_user_that_waits_for_another_client_keeps_nobody_from_its_path() -> None:
+    """Its open was refused, so it gave its turn back."""
+    here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        sink = MemorySink(len(DATA))
+        reader = await connection.store.open_reader(b"/d/f", sink, expected_size=len(DATA))
+        nursery.start_soon(read_by_another, here, 12)
+        reader.want(0, len(DATA), demand=True)
+        await trio.sleep(1.0)
+        assert here.count(Opcode.OPEN_FILE_RO) == 1
+        began = trio.current_time()
+        await connection.store.rename(b"/d/f", b"/d/g")
+        assert trio.current_time() - began < 1.0
+        assert await sink.wait_for(0, len(DATA)) == DATA
+        reader.close()
+
+
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ONE_SESSION)
 @pytest.mark.parametrize("reads", [True, False])
@@ -494,7 +573,7 @@ async def test_then_the_caller_that_opens_a_file_still_waits() -> None:
         await took.wait()
         await trio.sleep(1.0)
         (user,) = connection.scheduler.users
-        assert user.awaited
+        assert user.awaited_since is not None
 
 
 @pytest.mark.holds("rule 14.9")

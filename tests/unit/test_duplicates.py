@@ -1,6 +1,7 @@
 """Which answers tell that the network doubles requests, and which only that we asked twice.
 
-The first put everything in doubt for ten minutes (session.doubt): a card that pauses must not do that.
+For the first, ACKs are distrusted for ten minutes (`ServerSession.distrust`): a card that pauses must not do
+that.
 """
 
 from __future__ import annotations

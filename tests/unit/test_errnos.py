@@ -43,7 +43,7 @@ def test_every_opcode_code_and_errno_gives_a_real_errno(opcode: int) -> None:
 
 def test_every_error_class_is_in_the_table() -> None:
     """A new class must not become EIO because nobody thought of it."""
-    inherits = {errors.FtpNak, errors.LinkClosed, errors.ProtocolError}
+    inherits = {errors.FtpNak, errors.LinkClosed, errors.ProtocolError, errors.SessionTaken}
     assert set(all_error_classes()) - inherits == set(errnos._BY_CLASS)
 
 

@@ -1,5 +1,4 @@
-"""Which tasks want the session, which goes first, when a turn ends, as tables; what a reader wants of a
-file."""
+"""Which user of the session is next, when a turn ends, as tables; what a reader wants of a file."""
 
 from __future__ import annotations
 
@@ -7,6 +6,7 @@ import random
 from typing import cast
 
 import pytest
+import trio
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
@@ -14,13 +14,13 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import (
-    LONG_WAIT,
-    MAX_TURN,
-    MIN_TURN,
-    RELIEF,
+    LEAST_TURN,
+    LONGEST_TURN,
+    MOST_USE,
     USE_MEMORY,
     Scheduler,
     SessionUser,
+    Turn,
 )
 from mavftpfs.session.vehicle import Vehicle
 from tests.support.transfers import MemorySink
@@ -34,17 +34,19 @@ class NoLink:
 
 
 def scheduler() -> Scheduler:
-    return Scheduler(cast(Driver, NoLink()), clock=lambda: 0.0)
+    return Scheduler(cast(Driver, NoLink()), clock=lambda: 0.0, rng=random.Random(1))
 
 
-def heavy(seconds: float = 5.0) -> SessionUser:
+def user_of(seconds: float, waiting_since: float | None = None) -> SessionUser:
+    """Return a user that had the session for so long until 100."""
     user = SessionUser(b"/f")
     user.on_turn(100.0 - seconds, 100.0)
+    user.waiting_since = waiting_since
     return user
 
 
 def test_use_fades_but_not_while_it_waits() -> None:
-    user = heavy(2.0)
+    user = user_of(2.0)
     assert user.used(100.0) == 2.0
     assert user.used(100.0 + USE_MEMORY / 2) == pytest.approx(1.0)
     assert user.used(100.0 + 2 * USE_MEMORY) == 0.0
@@ -55,42 +57,47 @@ def test_use_fades_but_not_while_it_waits() -> None:
     assert user.used(131.0) == 3.0
 
 
-def test_who_used_little_goes_first_until_another_waited_long() -> None:
-    busy, light = heavy(), SessionUser(b"/g")
-    busy.waiting_since = 100.0
-    light.waiting_since = 101.0
-    assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)
-    late = 100.0 + LONG_WAIT
-    assert busy.rank(late, 0.02) < light.rank(late, 0.02)
-    assert light.rank(late, 1.0) < busy.rank(late, 1.0)
-
-
-def test_who_waited_long_keeps_the_session_for_a_while() -> None:
-    user = heavy()
-    user.waiting_since = 100.0
-    began = 100.0 + LONG_WAIT
-    assert user.gives_way(0.0, began - 0.1, began, 0.02)
-    assert not user.gives_way(0.0, began, began + 0.1, 0.02)
-    assert user.gives_way(0.0, began, began + RELIEF, 0.02)
+def test_a_user_that_used_little_goes_first_until_another_waited_three_seconds() -> None:
+    copy, small = user_of(5.0, 100.0), user_of(0.0, 102.9)
+    assert small.score(102.9) < copy.score(102.9)
+    small.waiting_since = 103.1
+    assert copy.score(103.1) < small.score(103.1)
 
 
 @pytest.mark.parametrize(
-    ("slice_", "use", "rival", "rtt", "gives_way"),
+    ("use", "waited", "rival_use", "rival_waited", "rtt", "lasts"),
     [
-        (0.0, 5.0, 0.0, 0.02, True),  # an editor beside a copy goes first
-        (0.1, 0.0, 0.0, 0.02, False),  # two newcomers do not alternate all the time
-        (0.4, 0.0, 0.0, 0.02, True),
-        (0.9 * MIN_TURN, 5.0, 5.0, None, False),  # two copies alternate
-        (1.1 * MIN_TURN, 5.0, 5.0, None, True),
-        (1.1 * MIN_TURN, 5.0, 5.0, 0.2, False),
-        (2.1, 5.0, 5.0, 0.2, True),
-        (1.1 * MAX_TURN, 5.0, 5.0, 5.0, True),
+        (5.0, 0.0, 0.0, 0.0, 0.02, 0.0),  # an editor beside a copy goes first
+        (5.0, 0.9, 0.0, 0.0, 0.3, 0.0),
+        (5.0, 3.5, 0.0, 0.0, 0.02, LEAST_TURN),  # but not before one that waited long
+        (5.0, 0.0, 5.0, 0.0, 0.02, LEAST_TURN),  # two copies alternate
+        (5.0, 0.5, 5.0, 0.0, 0.02, LEAST_TURN),
+        (5.0, 0.0, 5.0, 0.0, 0.2, 2.0),
+        (5.0, 0.0, 5.0, 0.0, 5.0, LONGEST_TURN),
+        (0.0, 0.0, 0.0, 0.0, 0.02, MOST_USE),  # two newcomers
+        (0.0, 0.0, 5.0, 0.0, 0.02, 0.6),
     ],
 )
-def test_when_a_turn_ends(
-    slice_: float, use: float, rival: float, rtt: float | None, gives_way: bool
+async def test_how_long_a_turn_lasts_while_another_user_waits(
+    use: float, waited: float, rival_use: float, rival_waited: float, rtt: float, lasts: float
 ) -> None:
-    assert heavy(use).gives_way(rival, 100.0, 100.0 + slice_, rtt) is gives_way
+    now, engine = 100.0, Engine(random.Random(1), Flow())
+    engine.__class__ = type("Engine", (Engine,), {"rtt": rtt})
+    link = NoLink()
+    link.engine = engine
+    one = Scheduler(cast(Driver, link), clock=lambda: now, rng=random.Random(1))
+    turn = Turn(one, user_of(use, 100.0 - waited))
+    one._queue[user_of(rival_use, 100.0 - rival_waited)] = None
+    while not turn.is_over():
+        now += 0.01
+        assert now < 110.0
+    assert now - 100.0 == pytest.approx(lasts, abs=0.11)
+
+
+async def test_a_turn_without_a_rival_goes_on() -> None:
+    turn = Turn(scheduler(), user_of(5.0))
+    await trio.lowlevel.checkpoint()
+    assert not turn.is_over()
 
 
 # --- a reader
