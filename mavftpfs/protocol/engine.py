@@ -234,7 +234,8 @@ class Engine:
         self._heard_at = now
         timed = not newest.repeated and newest.sent_at > self._burst_heard_at
         rtt = timers.sample(newest, now) if timed else None
-        self.flow.on_replies(now, rtt, count, newest.order, ledger.order)
+        size = newest.size if newest.manner.bulk else MAX_DATA
+        self.flow.on_replies(now, rtt, count, newest.order, ledger.order, size)
         passed = []
         for order, request in ledger.outstanding.items():
             if order > newest.order:

@@ -16,26 +16,27 @@ growing, a queue stands, or much is lost.
 A serial port has a receive buffer of unknown size in front of a slow server. Bytes that overflow it are lost
 silently. So at a serial port the window is 16 at most, and two requests go out at once, not three.
 
-A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
-pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
-pace.
+One token bucket in bytes holds back what goes out: its rate is the pace, at most the user's `bwlimit=`. A
+request is charged with its own bytes and those of the reply that it expects.
 
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
-stands `pacing`, for servers that queue five requests. The user's `bwlimit=` is an upper limit of the pace."""
+stand `pauses`, for cards that pause, and `pacing`, for servers that queue five requests."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from math import inf, sqrt
 
+from mavftpfs.protocol.bucket import Bucket
 from mavftpfs.protocol.pacing import Pacer
+from mavftpfs.protocol.pauses import KNOWN, Pauses
 from mavftpfs.protocol.payload import MAX_DATA
 
 # The table of constants: all that decide the window. Requests, unless a unit is given.
 
 FIRST = 8
-"""The window at first: as much as two packets of an ordinary TCP connection. A server pauses if no answer
-comes for the time that so many usually take."""
+"""The window at first: as much as two packets of an ordinary TCP connection."""
 
 LEAST = 4
 """The narrowest window: so few are no load, and with fewer a loss is noticed late."""
@@ -83,10 +84,6 @@ LEAST_TRIP = 0.0005
 """Seconds: no round trip counts for less. Both ends of a fast path work in batches. The requests of so long a
 time keep them busy; more would only wait, and cost them time."""
 
-KNOWN = 30.0
-"""Seconds for which it is believed that a server pauses, and that the shortest round trip is right. Then two
-rounds with a STEP less than fills the path measure that again."""
-
 QUEUE_SHARE = 0.15
 """A queue stands if the quickest answer of a round took longer than the shortest round trip: by 15 % of that
 (LITTLE at most), plus TICK, plus twice the jitter of the round, which is no queue."""
@@ -113,19 +110,39 @@ BOLDER = 0.06
 """Only a share is used of what the window has beyond the path, and of the reserve for pauses. Each round adds
 so much to the share. A round that lost more than usual takes a STEP of it away: a short queue overflowed."""
 
-PAUSE, LONGEST_PAUSE = 0.02, 0.4
-"""Seconds without an answer after which it is a pause, and after which it is a silence."""
-
-BRIDGE = 0.35
-"""While a server pauses, requests go on at this share of its rate. Else it would have nothing to do for a
-round trip after the pause. Most of these requests overflow its buffer."""
-
-BRIDGE_FROM = 0.03
-"""Seconds: with a shorter round trip there is no reserve and no bridge. The requests in a server's buffer
-last for so long."""
-
-OVERHEAD = 58
+OVERHEAD, FULL = 58, 58 + MAX_DATA
 """Bytes that a request and its answer take on the link besides the data that one of them carries."""
+
+
+@dataclass(slots=True)
+class Round:
+    """What was seen since a round began.
+
+    Attributes:
+        began: when. end: the order of the first request that was sent after that.
+        answered, lost: how many requests were. size: bytes of the answered ones and their answers.
+        starved: there was room and nothing to send, so the rate of answers says little.
+        least: the shortest round trip, in seconds. total: the sum of all. timed: how many there were.
+    """
+
+    began: float = 0.0
+    end: int = -1
+    answered: int = 0
+    lost: int = 0
+    size: int = 0
+    starved: bool = False
+    least: float = inf
+    total: float = 0.0
+    timed: int = 0
+
+    def waited(self, shortest: float, times: float = 1.0, reserve: float = 0.0) -> bool:
+        """Return whether even the quickest answer waited in a queue: `times` as long as what counts as a
+        little. reserve: seconds that it waited for another reason."""
+        if self.least == inf:
+            return False
+        little = min(QUEUE_SHARE * shortest, LITTLE) + TICK
+        jitter = self.total / self.timed - self.least
+        return self.least > shortest + times * little + 2.0 * jitter + reserve
 
 
 class Flow:
@@ -141,22 +158,23 @@ class Flow:
         loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
             server that pauses, does not count.
         alone: no other FTP client was heard lately.
-        pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`.
-        starved: there was room and nothing to send.
+        limited: requests wait for `bwlimit=`.
     """
 
     def __init__(
         self, *, serial: bool = False, limit: int | None = None, bwlimit: float | None = None
     ) -> None:
-        self._ceiling = inf if bwlimit is None else bwlimit / (OVERHEAD + MAX_DATA)  # full requests a second
-        self.alone = False
+        self._bwlimit = inf if bwlimit is None else bwlimit
+        self.alone = self.limited = False
         self.loss = 0.0
-        self._depth = DEPTH_SERIAL if serial else DEPTH
         self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
         self.window = min(FIRST, self.cap)
         self._pacer: Pacer | None = None
-        self._hurried = False
+        self._bucket = Bucket((DEPTH_SERIAL if serial else DEPTH) * FULL, TICK)
+        self._bucket.rate = self._bwlimit
+        self._cost = float(FULL)  # bytes that a usual request and its answer take on the link
+        self._hurried, self._ready_at = False, inf
         self._starting, self._flat = True, 0
         self._before_silence = 0
         # What is known of the path.
@@ -165,20 +183,20 @@ class Flow:
         self._shortest, self._shortest_seen = inf, 0.0
         self._probing = 0  # rounds that are left of the search for the shortest round trip
         self._spread = 0.0
-        self._usual_loss, self._per_answer = 0.0, 1.0  # so many requests are to bring one answer
+        self._per_answer = 1.0  # so many requests are to bring one answer
         self._bold = 1.0
-        # The pauses of a server.
-        self._answered_at, self._wake = inf, inf
-        self._paused_at, self.pause = -inf, 0.0
-        # The round.
-        self._round, self._round_end, self._round_start = 0, -1, 0.0
-        self._answered = self._lost = 0
-        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
-        self.starved = False
-        # The pace.
-        self._pace = inf  # requests that may go out in a second
-        self._tokens, self._tokens_at = float(DEPTH), 0.0
-        self._blocked, self._lent = False, 0.0  # _lent: tokens that an urgent request need not wait for
+        self._pauses = Pauses()
+        self._rounds, self._round = 0, Round()
+
+    @property
+    def starved(self) -> bool:
+        """Whether there was room and nothing to send, in this round."""
+        return self._round.starved
+
+    @property
+    def pause(self) -> float:
+        """Seconds without an answer that prove no loss, because the server pauses; not while `starved`."""
+        return 0.0 if self._pacer is not None else self._pauses.length
 
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
@@ -187,14 +205,15 @@ class Flow:
         if limit is None or self.cap == self._limit:
             self._pacer = None
         elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer, self.pause = Pacer(self.cap, self._limit), 0.0
+            self._pacer = Pacer(self.cap, self._limit)
+            self._bucket.rate = self._bwlimit
 
     # --- what may go out
 
     def begin(self) -> None:
         """Begin to look at all operations: `room` is called for each that has something to send."""
-        self._hurried = self._blocked = False
-        self._lent, self._wake = 0.0, inf
+        self._hurried = self.limited = False
+        self._ready_at = inf
         if self._pacer is not None:
             self._pacer.begin()
 
@@ -206,29 +225,32 @@ class Flow:
         elif self._hurried:  # an urgent answer should not queue behind our slack
             room -= min(SLACK + 1, self.window // 2)
         elif self.pause:
-            room += int(self._beyond(now, paced) * self._rate)
+            room += int(
+                self._pauses.beyond(now, self._shortest, self._reserve() if paced else 0.0) * self._rate
+            )
+            if self._pauses.grows(now, self._shortest):
+                self._ready_at = min(self._ready_at, now + FIRST / self._rate)
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
-        pace = self._highest_pace()
-        if room > 0 and pace < inf and (not urgent or pace == self._ceiling):
-            earned = (now - self._tokens_at) * pace
-            self._tokens = min(max(self._depth, pace * TICK), self._tokens + earned)
-            self._tokens_at = now
-            tokens = self._tokens + (DEPTH if urgent else 0)
-            if tokens < room:
-                self._blocked, self._lent = True, max(self._lent, tokens - self._tokens)
-                self.starved |= self.limited
-            room = min(room, max(0, int(tokens)))
+        if room > 0:
+            # What is urgent may overdraw: a little of it is no load.
+            cost, level = (
+                (FULL, self._bucket.level(now) + DEPTH * FULL)
+                if urgent
+                else (self._cost, self._bucket.level(now))
+            )
+            if level < room * cost:
+                room = max(0, int(level / cost))
+                self._ready_at = min(
+                    self._ready_at, self._bucket.holds_at((room + 1) * cost - DEPTH * FULL * urgent)
+                )
+                self.limited = self._bucket.rate == self._bwlimit
+                self._round.starved |= self.limited
         return room
 
-    def _highest_pace(self) -> float:
-        """Return how many requests may go out in a second. A Pacer has a pace of its own."""
-        return self._ceiling if self._pacer is not None else min(self._pace, self._ceiling)
-
-    @property
-    def limited(self) -> bool:
-        """Whether requests wait for `bwlimit=`."""
-        return self._blocked and self._highest_pace() == self._ceiling
+    def _set_rate(self, pace: float) -> None:
+        """Let so many chunks go out in a second, if `bwlimit=` allows that. A Pacer has a pace of its own."""
+        self._bucket.rate = min(self._bwlimit, pace * self._cost if self._pacer is None else inf)
 
     def _room_beside_pacer(
         self, pacer: Pacer, room: int, in_flight: int, now: float, paced: bool, urgent: bool
@@ -239,31 +261,13 @@ class Flow:
         beyond = pacer.room_for_urgent if urgent else pacer.room
         return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
 
-    def _beyond(self, now: float, paced: bool) -> float:
-        """Return seconds of requests for which there is room beyond the window because a server pauses."""
-        if now >= self._paused_at + KNOWN or self._shortest < BRIDGE_FROM:
-            return 0.0
-        silence = now - self._answered_at
-        if silence > PAUSE:
-            bridge = min(LONGEST_PAUSE, silence)
-        else:  # after a pause its requests are answered a round trip later
-            bridge = self.pause if now < self._paused_at + self._shortest else 0.0
-        if silence < LONGEST_PAUSE:
-            self._wake = now + FIRST / self._rate
-        return max(BRIDGE * bridge, self._reserve() if paced else 0.0)
-
     def _reserve(self) -> float:
         """Return for how many seconds answers should wait in the link's queue."""
         return 0.0 if self._probing else self._bold * QUEUE
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
-        if self._pacer is not None and (not self._blocked or self._pacer.urgent_at > -inf):
-            return self._pacer.next_at()
-        lacking = 1.0 - self._tokens - self._lent
-        if not self._blocked or lacking <= 0.0:
-            return self._wake
-        return min(self._wake, self._tokens_at + lacking / self._highest_pace() + 1e-6)
+        return self._ready_at if self._pacer is None else min(self._ready_at, self._pacer.next_at())
 
     # --- what happens
 
@@ -272,68 +276,72 @@ class Flow:
         they and their answers carry, at most."""
         if self._pacer is not None:
             self._pacer.on_sent(count, now)
-        by_size = self._highest_pace() == self._ceiling < inf
-        cost = (count * OVERHEAD + size) / (OVERHEAD + MAX_DATA) if by_size else count
-        self._tokens = max(-float(DEPTH), self._tokens - cost)
+        self._bucket.charge(count * OVERHEAD + size)
 
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""
-        self.starved = True
-        self._answered_at = inf
+        self._round.starved = True
+        self._pauses.on_starved()
         if self._pacer is not None:
             self._pacer.on_starved()
 
-    def on_replies(self, now: float, rtt: float | None, count: int, newest: int, next_order: int) -> None:
-        """Note that `count` requests, which went out together, were answered together. rtt: None if it is not
-        known which of their transmissions were. newest: the order of the last of those. next_order: the order
-        that the next transmission will get."""
-        self._answered += count
-        gap, self._answered_at = now - self._answered_at, now
-        # An answer that ends a pause has waited for its end. After a run of losses none has.
-        waited = rtt is not None and rtt > self._shortest + gap / 2 and self._rate > 0.0
-        if waited and gap > PAUSE + FIRST / self._rate and self._pacer is None:
-            self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
-        elif now >= self._paused_at + KNOWN:
-            self.pause = 0.0
+    def on_replies(
+        self,
+        now: float,
+        rtt: float | None,
+        count: int,
+        newest: int,
+        next_order: int,
+        size: int = MAX_DATA,
+    ) -> None:
+        """Note that `count` requests, which went out together, were answered together.
+
+        rtt: None if it is not known which of their transmissions were. newest: the order of the last of
+        those. next_order: the order that the next transmission will get. size: bytes of data that each of
+        them, or its answer, carries.
+        """
+        this = self._round
+        this.answered += count
+        this.size += count * (OVERHEAD + size)
+        self._pauses.on_answers(now, rtt, self._shortest, self._rate)
         if rtt is not None:
-            self._least = min(self._least, rtt)
+            this.least = min(this.least, rtt)
             if rtt <= self._shortest:
                 self._shortest, self._shortest_seen = rtt, now
-            self._total_rtt += rtt * count
-            self._rtts += count
+            this.total += rtt * count
+            this.timed += count
         if self._before_silence:
             self.window, self._before_silence = min(self.cap, self._before_silence), 0
-        elif self._starting and not self.starved:
+        elif self._starting and not this.starved:
             most = max(2 * FIRST, START * self._to_fill())
             self.window = max(self.window, min(self.cap, self.window + count, int(most)))
         if self._pacer is not None:
             self._pacer.on_replies(now, rtt, count, newest, next_order)
-        over = newest >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
-        enough = self._answered >= ROUNDS or self._starting or self.starved
+        over = newest >= this.end and (this.end < 0 or now >= this.began + TICK)
+        enough = this.answered >= ROUNDS or self._starting or this.starved
         # At the start a queue grows fast: a few answers that waited in one are enough.
-        if not (over and enough) and not (self._starting and self._rtts >= FIRST and self._queued()):
+        if not (over and enough) and not (
+            self._starting and this.timed >= FIRST and this.waited(self._shortest)
+        ):
             return
-        self._round += 1  # it is over
-        if self._round_end >= 0 and now > self._round_start:
-            self._learn(now, now - self._round_start)
+        self._rounds += 1
+        if this.end >= 0 and now > this.began:
+            self._learn(this, now)
+        pace = inf
         if not self._starting and self._rate > 0.0 and self._shortest >= LEAST_TRIP:
-            self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
-        else:
-            self._pace = inf
-        self._round_end, self._round_start = next_order, now
-        self._answered = self._lost = 0
-        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
-        self.starved = False
+            pace = self._rate * (1.0 if self._rounds % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
+        self._set_rate(pace)
+        self._round = Round(now, next_order)
 
     def on_loss(self, order: int) -> None:
         """Note that the transmission numbered `order` is taken to be lost."""
-        self._lost += 1
+        self._round.lost += 1
         if self._pacer is not None:
             self._pacer.on_loss(order)
 
     def on_spurious(self) -> None:
         """Note that a transmission which was taken to be lost was answered after all."""
-        self._lost = max(0, self._lost - 1)
+        self._round.lost = max(0, self._round.lost - 1)
 
     def on_silence(self, unheard: int = SILENT) -> None:
         """Note that nothing at all was heard for a retransmission timeout, after so many transmissions."""
@@ -347,29 +355,32 @@ class Flow:
 
     # --- rounds
 
-    def _learn(self, now: float, took: float) -> None:
-        total = self._answered + self._lost
+    def _learn(self, this: Round, now: float) -> None:
+        """Learn from a round that is over."""
+        total = this.answered + this.lost
         # Requests that arrive while a server pauses overflow its buffer, and answers wait. That says nothing
-        # of the link. It shows until a round trip after the pause.
-        paused = self.pause > 0.0 and self._paused_at + self._shortest >= self._round_start
+        # of the link.
+        paused = self.pause > 0.0 and self._pauses.touch(this.began, self._shortest)
         waits = self._reserve() if self.pause else 0.0
-        congested = self._lost > 0 and not paused and self._queued(1.0, waits)
-        usual = self._usual_loss * total
-        lost_too_much = congested or (not paused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
-        self._learn_averages(now, total, losses=not (paused or self._queued()))
-        if congested and not self.starved and self._queued(2.0, waits):
+        congested = this.lost > 0 and not paused and this.waited(self._shortest, 1.0, waits)
+        usual = self.loss * total
+        lost_too_much = congested or (not paused and this.lost > usual + UNUSUAL * sqrt(usual + 1.0))
+        self._learn_loss(this, losses=not (paused or this.waited(self._shortest)))
+        self._learn_trips(this, now)
+        if congested and not this.starved and this.waited(self._shortest, 2.0, waits):
             self._rates.clear()  # the path has the rate of this round
-        rate, before = self._answered / took, self._rate
-        if rate > before or not self.starved:
+        rate, before = this.answered / (now - this.began), self._rate
+        if rate > before or not this.starved:
             self._rates.append(rate)
         self._rate = max(self._rates, default=0.0)
-        if self.starved:
+        if this.starved:
             return
+        self._cost = this.size / this.answered
         if not paused:
             self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
         if self._starting:
             self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
-            overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
+            overflown = this.lost >= max(2 * FIRST, MOST_LOSS * total) or this.waited(self._shortest)
             self._starting = self._flat < FLAT_ROUNDS and (paused or not overflown)
         if self._starting:
             return
@@ -378,41 +389,33 @@ class Flow:
             window = max(1, int((1.0 - STEP) * to_fill))
         else:
             spread = min(self._rate * self._spread, to_fill)
-            step = STEP * (to_fill + spread) if self._round % CYCLE == 0 or rate > before else 0.0
+            step = STEP * (to_fill + spread) if self._rounds % CYCLE == 0 or rate > before else 0.0
             window = max(LEAST, round(to_fill + SLACK + self._bold * (spread + step)))
         self.window = min(self.cap, window)
 
-    def _learn_averages(self, now: float, total: int, *, losses: bool) -> None:
-        """Average the share of losses and the round trips. losses: those of this round are the link's."""
-        loss, memory = self._lost / total, min(SMOOTHING, total / LOSS_MEMORY)
-        if losses or loss < self.loss:
+    def _learn_loss(self, this: Round, *, losses: bool) -> None:
+        """Average the share of losses. losses: those of this round are the link's."""
+        total = this.answered + this.lost
+        loss, memory = this.lost / total, min(SMOOTHING, total / LOSS_MEMORY)
+        if loss < self.loss or (losses and self._starting):
             self.loss += (loss - self.loss) * memory
-        if loss < self._usual_loss:
-            self._usual_loss += (loss - self._usual_loss) * memory
         elif losses:
-            self._usual_loss += (loss - self._usual_loss) * memory * (1.0 if self._starting else LOSS_RISE)
-        plain = self._round % CYCLE == 1
-        self._per_answer = 1.0 if plain else 1.0 / (1.0 - min(self._usual_loss, MOST_LOSS))
-        least = self._least
-        if least == inf:
+            self.loss += (loss - self.loss) * memory * LOSS_RISE
+        plain = self._rounds % CYCLE == 1
+        self._per_answer = 1.0 if plain else 1.0 / (1.0 - min(self.loss, MOST_LOSS))
+
+    def _learn_trips(self, this: Round, now: float) -> None:
+        """Learn from the round trips of a round, and look for the shortest one from time to time."""
+        if this.least == inf:
             return
         if self._probing:
             self._probing -= 1
         elif now >= self._shortest_seen + KNOWN and not (self._starting or self._pacer):
             self._probing = 3
         if self._probing == 1:
-            self._shortest, self._shortest_seen = least, now
-        spread = self._total_rtt / self._rtts - self._shortest
+            self._shortest, self._shortest_seen = this.least, now
+        spread = this.total / this.timed - self._shortest
         self._spread += (min(spread, LITTLE) - self._spread) * SMOOTHING
-
-    def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
-        """Return whether even the quickest answer of the round waited in a queue: `times` as long as what
-        counts as a little. reserve: seconds that it waited for another reason."""
-        if self._least == inf:
-            return False
-        little = min(QUEUE_SHARE * self._shortest, LITTLE) + TICK
-        jitter = self._total_rtt / self._rtts - self._least
-        return self._least > self._shortest + times * little + 2.0 * jitter + reserve
 
     def _to_fill(self) -> float:
         """Return how many requests fill the path, as far as is known."""

@@ -48,7 +48,7 @@ class Path:
 
 def test_random_loss_does_not_shrink_it() -> None:
     path = Path(rate=1000.0, base=0.1, rounds=20)
-    path.rounds(40, lost=10)
+    path.rounds(150, lost=10)
     assert path.window >= 80
     assert path.flow.loss == pytest.approx(10 / path.window, rel=0.2)
 
@@ -166,7 +166,7 @@ def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
     path.rounds(1, lost=path.window // 2)
     assert path.flow.loss == 0.0
     path.rounds(10)
-    path.rounds(10, lost=path.window // 10)
+    path.rounds(60, lost=path.window // 10)
     assert 0.03 < path.flow.loss < 0.15
 
 
