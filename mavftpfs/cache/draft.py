@@ -122,6 +122,7 @@ class Draft:
         changes: counts the changes of the content.
         state: see State.
         sending: the buffer of the present attempt, only while SENDING.
+        verified: see OpenFile.verified.
     """
 
     def __init__(self, content: Content, base: Known | None) -> None:
@@ -132,6 +133,7 @@ class Draft:
         self.changes = 0
         self.state = State.DIRTY if base is None else State.CLEAN
         self.sending: SendBuffer | None = None
+        self.verified = ""
         self._in_place = False  # the present attempt, or the last one
         self._sent_in_place = False  # by an earlier attempt
         self._held = ExtentSet()

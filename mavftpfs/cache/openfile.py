@@ -33,6 +33,11 @@ class OpenFile:
         """Whether write, truncate and flush do something. fsync may do something on any handle."""
         return False
 
+    @property
+    def verified(self) -> str:
+        """How the vehicle's copy was compared with what was written, in words; "" if nothing was sent."""
+        return ""
+
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end of the handle's size.
 

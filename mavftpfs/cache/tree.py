@@ -364,10 +364,6 @@ class Tree:
             await self._writing.namespace.rename(source, target, noreplace=noreplace)
             self._local.follow_rename(source, target)
 
-    async def withdraw(self, path: bytes) -> bool | None:
-        """Take back what was written to an open file; see OpenFile.take_back. None also if it is not open."""
-        return await self._writing.withdraw(self._remote(path))
-
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
         return [self._below(remote) for remote in self._writing.undelivered()]
@@ -410,7 +406,7 @@ class Tree:
     # --- news and housekeeping
 
     async def refresh(self) -> None:
-        """As forget_caches; a mount may have to be waited for (client/mounted.py)."""
+        """As forget_caches; a mount may have to be waited for (client/mountfiles.py)."""
         self.forget_caches()
 
     def forget_caches(self) -> None:

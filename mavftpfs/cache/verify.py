@@ -62,6 +62,7 @@ class Verifier:
                 raise VerificationFailed(f"{path!r} is not there any more")
             if size != draft.size:
                 raise VerificationFailed(f"{path!r} has {size} bytes there, {draft.size} were written")
+        draft.verified = "size" if crc32 is None else "size and CRC32"
         if crc32 is not None:
             self.counts["verified_by_crc"] += 1
         elif doubted and why is not None:

@@ -214,14 +214,6 @@ class Writeback:
                 await self._undo_truncate(node)
             raise
 
-    async def withdraw(self, path: bytes) -> bool | None:
-        """See Tree.withdraw."""
-        nodes = self._context.nodes
-        node = nodes.get(path)
-        if node is None or not node.undelivered:
-            node = nodes.broken.get(path, node)
-        return None if node is None else await self._deliverer.withdraw(node)
-
     async def _undo_truncate(self, node: Node) -> None:
         """Forget the draft of a call that failed: its bytes are not wanted any more. If the vehicle may have
         some of them, the draft is kept, and delivered later."""

@@ -177,6 +177,12 @@ class WriteFile(ReadFile):
             node.delivered_since_open = False
         node.writers += 1
         self._changed: int | None = None  # the node's generation when this handle changed the file
+        self._verified = ""
+
+    @property
+    def verified(self) -> str:
+        """See OpenFile.verified."""
+        return self._verified
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data`; see OpenFile.write."""
@@ -277,9 +283,10 @@ class WriteFile(ReadFile):
     async def _deliver(self, *, ends_write: bool = False) -> None:
         """Deliver for a program. If the rest of the old file cannot be fetched, there is no whole file that
         could be delivered later, so the file breaks."""
-        node = self._node
+        node, draft = self._node, self._node.draft
         try:
             await self._parts.deliverer.deliver(node)
+            self._verified = "" if draft is None else draft.verified
         except MavftpfsError as error:
             lacks_base = node.draft is not None and not node.draft.whole and not isinstance(error, Armed)
             if ends_write or lacks_base:

@@ -8,7 +8,6 @@ import os
 import select
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,14 +16,15 @@ from mavftpfs.cli import report
 from mavftpfs.cli.drawing import changing_line
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
+from mavftpfs.client.mounts import PATIENCE, Status, all_statuses, socket_of, statuses_at
 from mavftpfs.client.options import at_source, split_words
-from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of, statuses_at
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon, places
 from mavftpfs.mount.members import Member
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.options import TABLE, Options
+from mavftpfs.shared.private import own_directories
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
@@ -152,7 +152,7 @@ def _start_logging(options: Options, *, foreground: bool, debug: bool) -> None:
         if foreground:
             daemon.log_to_stderr(level)
         else:
-            daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
+            daemon.log_in_background(own_directories()[-1] / "mavftpfs.log", level)
     except OSError as exc:
         raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
     daemon.warn_of_gone(options)
@@ -160,7 +160,7 @@ def _start_logging(options: Options, *, foreground: bool, debug: bool) -> None:
 
 def _control_path(place: str) -> Path | None:
     try:
-        directory = control.usable_directory(control.own_directories())
+        directory = control.usable_directory()
     except control.ControlError as exc:
         logging.getLogger("mavftpfs").warning("%s", exc)
         return None
@@ -177,7 +177,7 @@ def umount(args: argparse.Namespace) -> int:
 
 def _umount(place: str, *, lazy: bool) -> int:
     try:
-        socket = find_socket(place)
+        socket = socket_of(place)
         request = {"command": "umount", "lazy": lazy}
         with changing_line(say, SAY_AGAIN) as show:
             progress = _Delivery(socket, show)
@@ -204,21 +204,13 @@ def _umount_all(place: str, vehicles: list[str], *, lazy: bool) -> int:
 
 
 def _umount_unasked(place: str, *, lazy: bool) -> int:
-    """Unmount where the mount's process was killed, or lost its socket.
-
-    systemd removes a user's sockets at logout.
-    """
-    held = 0
-    with suppress(control.NobodyThere):  # we may not ask
-        held = status_of(place).get("held", {}).get("files", 0)
+    """Unmount where the mount's process was killed, or has no socket because no directory can hold it."""
+    alive = not mountpoint.is_dead(place)
     mountpoint.unmount(place, lazy=lazy)
-    if held:
-        say(
-            f"{count_files(held)} not on the vehicle yet: the mount delivers by itself now, and its "
-            "log says what becomes of it (it cannot be asked: its socket was removed)"
-        )
-        return ExitCode.UNDELIVERED
-    return _after_a_killed_mount()
+    if not alive:
+        return _after_a_killed_mount()
+    say("the mount cannot be asked: it delivers by itself what is held, and its log says what becomes of it")
+    return ExitCode.UNDELIVERED
 
 
 class _Delivery:

@@ -30,7 +30,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from mavftpfs.client import control
 from mavftpfs.client.mountpoint import mounts
-from mavftpfs.client.status import status_of
+from mavftpfs.client.mounts import status_of
 from mavftpfs.mount.daemon import signals_held
 
 HOST = "127.0.0.1"

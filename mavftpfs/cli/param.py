@@ -196,7 +196,8 @@ async def _diff_vehicles(args: Args, target: Target) -> int:
             try:
                 if not place:
                     raise VehicleLost("it is not mounted now")
-                found[name] = await client.read_parameters(await open_mount(place, ROOT, target.options))
+                async with open_mount(place, ROOT, target.options) as session:
+                    found[name] = await client.read_parameters(session)
             except MavftpfsError as exc:
                 say(f"vehicle {name} is left out: {exc}")
                 code = ExitCode.INCOMPLETE

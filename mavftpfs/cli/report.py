@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mavftpfs.client.status import Status, is_read_only, second_vehicle
+from mavftpfs.client.mounts import Status
+from mavftpfs.client.status import is_read_only, second_vehicle
 from mavftpfs.shared.readable import count_files, printable, readable_size, readable_time, time_left
 
 WATCH_PERIOD = 1.0

@@ -21,7 +21,8 @@ import trio
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.leftovers import rescue, spool_for
-from mavftpfs.client.status import holder_of, snapshot
+from mavftpfs.client.mounts import holder_of
+from mavftpfs.client.status import snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link

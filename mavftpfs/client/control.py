@@ -1,9 +1,15 @@
-"""The control socket: how `status` and `umount` talk to a running mount. Layer: client.
+"""The control socket: how commands and programs talk to a running mount. Layer: client.
 
-One Unix socket (0600, in a 0700 directory) for each mount, named after a hash of the mountpoint. One
-request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and
-the session is closed. This is the side of the commands: plain blocking code, because they should start at
-once. The mount's side is `controlserver`.
+One Unix socket for each mount, named after a hash of the mountpoint. One request and one reply, each a JSON
+object on a line; the reply to `umount` comes when all is delivered and the session is closed. These lines
+stay as they are, so that mounts of all versions can be asked and ended. A request for `files` is followed by
+the messages of client.wire.
+
+The socket is the user's alone (0600). That of root's mount is in SYSTEM: it serves the user that `uid=`
+names, too.
+
+This is the side of the commands: plain blocking code, because they should start at once. The mount's side is
+mount.controlserver.
 """
 
 from __future__ import annotations
@@ -11,28 +17,38 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import select
 import socket
+import stat
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mavftpfs.shared.errors import MountFailed
-from mavftpfs.shared.private import directories_of, own_directories, private_directory
-
-__all__ = ["directories_of", "own_directories"]
+from mavftpfs.shared.private import own_directories, private_directory
 
 Reply = dict[str, Any]
 
 MAX_LINE = 1 << 20
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
+SYSTEM = Path("/run/mavftpfs")
+FOREIGN = "another user's mount: only that user and root may use it by commands"
+BOUND = Path("/proc/net/unix")
+"""The kernel's table of sockets that are bound."""
 _SUFFIX = ".sock"
+_OURS = re.compile(r"^/.*/mavftpfs/[0-9a-f]{20}\.sock$")
 
 
 class ControlError(MountFailed):
     """The mount's process refused, or did not answer in time."""
+
+
+class Refused(ControlError):
+    """The mount's process refused; the text says why."""
 
 
 class NobodyThere(ControlError):
@@ -48,18 +64,30 @@ def socket_name(mountpoint: str) -> str:
     return digest[:20] + _SUFFIX
 
 
-def usable_directory(directories: list[Path]) -> Path:
-    """Return the first directory that is, or can be made, this user's alone.
+def usable_directory(preferred: Path | None = None) -> Path:
+    """Return a directory for this user's sockets, which is made if need be.
 
     Raises:
-        ControlError: none can.
+        ControlError: none can be made.
     """
-    found = private_directory(directories, longest_name=len(socket_name("")))
+    if os.getuid() == 0 and _is_roots(SYSTEM):
+        return SYSTEM
+    places = [*([] if preferred is None else [preferred]), *own_directories()]
+    found = private_directory(places, longest_name=len(socket_name("")))
     if found is not None:
         return found
-    raise ControlError(
-        f"no private directory for the control socket (tried {', '.join(map(str, directories))})"
-    )
+    raise ControlError(f"no private directory for the control socket (tried {', '.join(map(str, places))})")
+
+
+def _is_roots(directory: Path) -> bool:
+    """Make a directory that all may enter; return whether only root may change what is in it."""
+    with suppress(OSError):
+        with suppress(FileExistsError):
+            directory.mkdir()
+            directory.chmod(0o755)  # whatever the umask is
+        facts = directory.lstat()
+        return stat.S_ISDIR(facts.st_mode) and facts.st_uid == 0 and not facts.st_mode & 0o022
+    return False
 
 
 # -- asking ---------------------------------------------------------------------------------------
@@ -69,8 +97,7 @@ def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], N
     """Send one request and return the reply; `meanwhile` is called about each second while there is none.
 
     Raises:
-        NobodyThere: the process is gone.
-        ControlError: it does not answer within `timeout` seconds, or refuses.
+        NobodyThere: the process is gone. Refused. ControlError: it does not answer within `timeout` seconds.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -87,40 +114,51 @@ def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], N
         reply = json.loads(line)
     except (ConnectionError, FileNotFoundError) as exc:
         raise NobodyThere("the mount's process is gone") from exc
+    except PermissionError as exc:
+        raise Refused(FOREIGN) from exc
     except (OSError, ValueError) as exc:
         raise ControlError(f"no answer from the mount's process: {exc}") from exc
-    if not isinstance(reply, dict) or not reply.get("ok"):
-        raise ControlError(str(reply.get("error")) if isinstance(reply, dict) else "malformed answer")
+    return granted(reply)
+
+
+def granted(reply: object) -> Reply:
+    """Return a reply.
+
+    Raises:
+        Refused: the reply says why. ControlError: it is none.
+    """
+    if not isinstance(reply, dict):
+        raise ControlError("malformed answer")
+    if not reply.get("ok"):
+        raise Refused(str(reply.get("error")))
     return reply
 
 
-def find_socket(mountpoint: str, directories: list[Path]) -> Path:
-    """Return the socket of the mount on `mountpoint`.
+# -- finding --------------------------------------------------------------------------------------
+
+
+def find_socket(mountpoint: str, uid: int | None = None) -> Path:
+    """Return the socket of the mount on `mountpoint`, of this user, of root or of `uid`.
 
     Raises:
         NobodyThere: there is none.
     """
-    for directory in directories:
-        path = directory / socket_name(mountpoint)
-        if _is_socket(path):
+    for path in all_sockets(uid):
+        if path.name == socket_name(mountpoint):
             return path
     raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
 
 
-def all_sockets(directories: list[Path]) -> Iterator[Path]:
-    """Yield the sockets of all mounts of this user, the dead ones too."""
-    for directory in directories:
-        try:
-            names = sorted(os.listdir(directory))
-        except OSError:
-            continue
-        paths = [directory / name for name in names if name.endswith(_SUFFIX)]
-        yield from filter(_is_socket, paths)
-
-
-def _is_socket(path: Path) -> bool:
-    """Return whether there is a socket that we may see; False in another user's directories."""
+def all_sockets(uid: int | None = None) -> Iterator[Path]:
+    """Yield the sockets at which mounts of this user, of root or of `uid` listen in this network namespace,
+    wherever they are."""
+    owners = {0, os.getuid(), uid}
     try:
-        return path.is_socket()
+        lines = BOUND.read_text(errors="surrogateescape").splitlines()
     except OSError:
-        return False
+        return
+    for path in dict.fromkeys(line.split(maxsplit=7)[-1] for line in lines):
+        if _OURS.search(path):
+            with suppress(OSError):  # it is another user's
+                if os.stat(path).st_uid in owners:
+                    yield Path(path)

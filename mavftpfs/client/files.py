@@ -1,7 +1,7 @@
 """The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
 Two programs should not share the vehicle's only FTP session. So while a mount of the vehicle is up, its files
-(client/mounted.py) are used in place of a second connection. `Files` and `File` say what both offer. Paths
+(client/mountfiles.py) are used in place of a second connection. `Files` and `File` say what both offer. Paths
 are normalised (shared.model.normalise).
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager, nullcontext, suppress
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NoReturn, Protocol
@@ -20,18 +20,18 @@ import trio
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.control import NobodyThere
-from mavftpfs.client.mounted import CLOSING_TIME, STATUS_PATIENCE, WITHDRAWAL_TIME, MountedFiles
-from mavftpfs.client.mountpoint import OUR_TYPE, canonical, enclosing_mount, mounts
-from mavftpfs.client.several import Unnamed
-from mavftpfs.client.status import (
-    Facts,
-    final_name,
-    has_link,
+from mavftpfs.client.mountfiles import MountFiles, connect
+from mavftpfs.client.mounts import (
+    STATUS_PATIENCE,
+    Status,
     is_wanted,
-    several_above,
-    told_by,
+    mounts_on,
+    require_usable,
+    status_of,
     vehicle_below,
 )
+from mavftpfs.client.several import Unnamed
+from mavftpfs.client.status import Facts
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import HEARD_SOON, Connection
@@ -41,13 +41,17 @@ from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
 from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import name_text
 
+WITHDRAWAL_TIME = 45.0
+"""Seconds to take back what was written: a request or two without an answer."""
+CLOSING_TIME = 5.0
+"""Seconds to close a file of which nothing more is delivered."""
 READ_SIZE = 128 * 1024
 _TICK = 0.2
 """Seconds between two questions whether a lost vehicle is heard again."""
 
 
 class File(Protocol):
-    """An open file: cache.openfile.OpenFile, or MountedFile. All calls raise only MavftpfsError.
+    """An open file: cache.openfile.OpenFile, or one of a mount's. All calls raise only MavftpfsError.
 
     A file that is written ends by `Writing`.
     """
@@ -55,6 +59,11 @@ class File(Protocol):
     @property
     def size(self) -> int:
         """Bytes; of a file being written they follow what was written."""
+
+    @property
+    def verified(self) -> str:
+        """How what was written was compared with the card by the last fsync or release: "size and CRC32",
+        "size", or "" if nothing was sent."""
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end."""
@@ -79,7 +88,7 @@ class File(Protocol):
 
 
 class Files(Protocol):
-    """A tree of files: cache.tree.Tree, or MountedFiles. All calls raise only MavftpfsError."""
+    """A tree of files: cache.tree.Tree, or that of a mount. All calls raise only MavftpfsError."""
 
     async def stat(self, path: bytes) -> Stat:
         """Return a path's attributes."""
@@ -178,7 +187,6 @@ class Writing:
         part."""
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             there = await self._file.take_back()
-            # A fork closes a copy of a mount's descriptor, which delivers what was written until then.
             self.there = None if there and not whole else there
 
     def _raise_undelivered(self, error: BaseException) -> NoReturn:
@@ -253,7 +261,7 @@ class Session:
     async def acknowledged(self, path: bytes) -> int | None:
         """Return the bytes that the vehicle has of a file that is being sent; None if it is not. Raises: as
         `lost`."""
-        name = final_name(self.on_vehicle(path).decode(errors="replace"))
+        name = self.on_vehicle(path).decode(errors="replace")
         transfers = (await self.status())["transfers"]
         sent = {facts["path"]: facts["done"] for facts in transfers if facts["direction"] == "write"}
         return sent.get(name)
@@ -265,9 +273,6 @@ class Session:
     async def size_now(self, path: bytes) -> int:
         """Ask the vehicle for a file's size, even if one is known."""
         await self.files.refresh()
-        if self.mountpoint is not None:  # only an open makes the kernel ask again
-            async with reading(self.files, path):
-                pass
         return (await self.files.stat(path)).size
 
 
@@ -313,88 +318,78 @@ async def walk(files: Files, top: bytes) -> tuple[Found, Unlisted]:
 # -- which mount ----------------------------------------------------------------------------------
 
 
-def mountpoint_of(source: str) -> tuple[str, bytes] | None:
-    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None.
-
-    The directory of a mount of all vehicles counts as a mountpoint.
-    """
-    place, _, subtree = source.partition("#")
-    if not place or (":" in place and not place.startswith("/")):
-        return None
-    found = enclosing_mount(place) or _below_several(place)
-    if found is None:
-        return None
-    mountpoint, below = found
-    return mountpoint, normalise(os.fsencode(f"{below}/{subtree}"))
-
-
-def _below_several(place: str) -> tuple[str, str] | None:
-    """Return (directory, path below it) if a path leads into the directory of a mount of all vehicles."""
-    path = canonical(place)
-    above = several_above(path)
-    return None if above is None else (above, path[len(above) :])
-
-
-async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
-    """Return the files of the mount that has this link now, if it is of the wanted vehicle and we may read
-    it."""
-    for status in await mounts_on(spec):
-        if is_wanted(status, options):
-            session = session_on(status, options.root, options)
-            return session if options.target_system else replace(session, unnamed=_heard_by(status, spec))
-    return None
-
-
-def _heard_by(status: Facts, spec: LinkSpec) -> Unnamed:
-    """Return the vehicles that a mount hears on its link."""
-    heard = heartbeats_in(status)
-    return Unnamed(spec.description, status["vehicle"]["system"], lambda: heard)
-
-
-def heartbeats_in(status: Facts) -> list[Heartbeat]:
-    """Return what a mount heard of the components on its link."""
-    return [
-        Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
-        for facts in status["connection"]["heard"]
-    ]
-
-
-async def mounts_on(spec: LinkSpec) -> list[Facts]:
-    """Return the status of each mount that has this link now and may be read by us."""
-    found = []
-    for mountpoint in [path for path, mount in mounts().items() if mount.type == OUR_TYPE]:
-        with suppress(errors.LinkClosed):
-            status = await mount_status(mountpoint)
-            if has_link(status, spec):
-                found.append(status)
-    return found
-
-
-async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Session:
-    """Return the files below `subtree` of a mount.
+@asynccontextmanager
+async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> AsyncIterator[Session]:
+    """Give the files below `subtree` of a mount to the body.
 
     Raises:
         LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is no directory.
         UsageError: the options ask for another vehicle or component.
     """
-    status = await mount_status(mountpoint, several=True)
+    status = await usable_status(mountpoint)
     if "members" in status:
         mountpoint = vehicle_below(status, subtree, options)
-        status = await mount_status(mountpoint)
+        status = await usable_status(mountpoint)
+    if "members" in status:
+        raise errors.LinkClosed(f"the mount on {mountpoint} is one of several vehicles now")
     system, component = status["vehicle"]["system"], status["vehicle"]["component"]
     if options.target_system not in (0, system) or options.target_component not in (0, component):
         raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")
     root = normalise(os.fsencode(status["root"]) + b"/" + subtree)
-    session = session_on(status, root, options)
-    if subtree != ROOT:
-        place = name_text(os.fsencode(mountpoint) + subtree)
-        try:
-            kind = (await session.files.stat(ROOT)).kind
-        except errors.NotFound as exc:
-            raise errors.NotFound(f"{place}: {os.strerror(errno.ENOENT)}") from exc
-        if kind is EntryKind.FILE:
-            raise errors.NotADirectory(f"{place} is a file; give a directory, and the file's name behind it")
-    return session
+    async with _session_on(status, mountpoint, root, options) as session:
+        if subtree != ROOT:
+            place = name_text(os.fsencode(mountpoint) + subtree)
+            try:
+                kind = (await session.files.stat(ROOT)).kind
+            except errors.NotFound as exc:
+                raise errors.NotFound(f"{place}: {os.strerror(errno.ENOENT)}") from exc
+            if kind is EntryKind.FILE:
+                raise errors.NotADirectory(
+                    f"{place} is a file; give a directory, and the file's name behind it"
+                )
+        yield session
+
+
+@asynccontextmanager
+async def _session_on(
+    status: Status, mountpoint: str, root: bytes, options: Options
+) -> AsyncIterator[Session]:
+    """Give the files below `root` of a vehicle to the body, by the mount with this status."""
+    dial = partial(connect, status, mountpoint)
+    files = MountFiles(dial, mountpoint, os.fsencode(status["root"]), root, read_only=options.read_only)
+    try:
+        yield Session(files, files.status, root, mountpoint, options.connect_timeout)
+    finally:
+        files.close()
+
+
+async def usable_status(mountpoint: str) -> Status:
+    """Return the status of a mount.
+
+    Raises:
+        LinkClosed: it does not answer, or does not serve this program; the text says why.
+    """
+    ask = partial(status_of, mountpoint, STATUS_PATIENCE)
+    try:
+        status = await trio.to_thread.run_sync(ask, abandon_on_cancel=True)
+    except NobodyThere as exc:
+        raise errors.LinkClosed(str(exc)) from exc
+    require_usable(status, mountpoint)
+    return status
+
+
+async def find_mount(spec: LinkSpec, options: Options) -> Status | None:
+    """Return the status of the mount that has this link now, if it is of the wanted vehicle and serves us.
+
+    Raises:
+        LinkClosed: it is of another version.
+    """
+    look = partial(mounts_on, spec)
+    for status in await trio.to_thread.run_sync(look, abandon_on_cancel=True):
+        if not status.get("problem") and is_wanted(status, options):
+            require_usable(status, status["mountpoint"])
+            return status
+    return None
 
 
 async def vehicles_below(mountpoint: str) -> dict[str, str]:
@@ -403,7 +398,7 @@ async def vehicles_below(mountpoint: str) -> dict[str, str]:
     Raises:
         LinkClosed: the mount does not answer. UsageError: it is of a single vehicle.
     """
-    status = await mount_status(mountpoint, several=True)
+    status = await usable_status(mountpoint)
     if "members" not in status:
         raise errors.UsageError(
             f"only one vehicle is mounted on {mountpoint}; name a FILE to compare it with"
@@ -414,30 +409,18 @@ async def vehicles_below(mountpoint: str) -> dict[str, str]:
     }
 
 
-def session_on(status: Facts, root: bytes, options: Options) -> Session:
-    """Return the files below `root` of a vehicle, by the mount with this status."""
-    mountpoint, mounted = status["mountpoint"], os.fsencode(status["root"])
-    files = MountedFiles(mountpoint, mounted, root, read_only=options.read_only)
-    return Session(files, partial(mount_status, mountpoint), root, mountpoint, options.connect_timeout)
+def _heard_by(status: Status, spec: LinkSpec) -> Unnamed:
+    """Return the vehicles that a mount hears on its link."""
+    heard = heartbeats_in(status)
+    return Unnamed(spec.description, status["vehicle"]["system"], lambda: heard)
 
 
-async def mount_status(mountpoint: str, *, several: bool = False) -> Facts:
-    """Return the status that a mount tells to users that may read its files. several: it may be a mount of
-    several vehicles.
-
-    Raises:
-        LinkClosed: it does not answer, or is not what it was.
-    """
-    ask = partial(told_by, mountpoint, STATUS_PATIENCE)
-    try:
-        status = await trio.to_thread.run_sync(ask, abandon_on_cancel=True)
-    except NobodyThere as exc:
-        raise errors.LinkClosed(str(exc)) from exc
-    if status.get("problem"):
-        raise errors.LinkClosed(f"the mount on {mountpoint}: {status['problem']}")
-    if "members" in status and not several:
-        raise errors.LinkClosed(f"the mount on {mountpoint} is one of several vehicles now")
-    return status
+def heartbeats_in(status: Status) -> list[Heartbeat]:
+    """Return what a mount heard of the components on its link."""
+    return [
+        Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
+        for facts in status["connection"]["heard"]
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,12 +432,24 @@ class Target:
     sinks: Sinks = NO_SINKS
     mount: tuple[str, bytes] | None = None
 
-    async def mounted(self) -> Session | None:
-        """Return the files of the mount that is to be used, None if there is none."""
+    @asynccontextmanager
+    async def mounted(self) -> AsyncIterator[Session | None]:
+        """Give the files of the mount that is to be used to the body, None if there is none."""
         if self.mount is not None:
-            return await open_mount(*self.mount, self.options)
+            async with open_mount(*self.mount, self.options) as session:
+                yield session
+            return
         assert self.spec is not None
-        return await find_mount(self.spec, self.options)
+        status = await find_mount(self.spec, self.options)
+        if status is None:
+            yield None
+            return
+        unnamed = None if self.options.target_system else _heard_by(status, self.spec)
+        root = self.options.root
+        async with _session_on(status, status["mountpoint"], root, self.options) as session:
+            if root != ROOT and (await session.files.stat(ROOT)).kind is EntryKind.FILE:
+                raise errors.NotADirectory(f"{root!r} is not a directory")
+            yield replace(session, unnamed=unnamed)
 
     @asynccontextmanager
     async def session(
@@ -467,10 +462,10 @@ class Target:
         Raises:
             LinkClosed, VehicleLost, NoFtp: no answer within connect_timeout, with the reason.
         """
-        mounted = await self.mounted() if use_mount else None
-        if mounted is not None:
-            yield mounted
-            return
+        async with self.mounted() if use_mount else nullcontext() as mounted:
+            if mounted is not None:
+                yield mounted
+                return
         assert self.spec is not None
         deadline = trio.current_time() + self.options.connect_timeout
         up = attached(self.spec, self.options, sinks=self.sinks, list_root=list_root, writing=writing)

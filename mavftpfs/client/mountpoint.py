@@ -14,7 +14,7 @@ import stat
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +57,7 @@ def canonical(path: str) -> str:
 
 
 def enclosing_mount(path: str) -> tuple[str, str] | None:
-    """Return (mountpoint of ours, path below it or "") for a mountpoint, or a path below one; else None.
+    """Return (mountpoint of ours, path on the mount or "") for a mountpoint, or a path below one; else None.
 
     Symbolic links are followed only if the path as it is spelled does not lead there.
     """
@@ -69,7 +69,9 @@ def _enclosing(path: str) -> tuple[str, str] | None:
     while mountpoint not in table and mountpoint != "/":
         mountpoint = os.path.dirname(mountpoint)
     mount = table.get(mountpoint)
-    return (mountpoint, path[len(mountpoint) :]) if mount is not None and mount.type == OUR_TYPE else None
+    if mount is None or mount.type != OUR_TYPE:
+        return None
+    return mountpoint, mount.root.rstrip("/") + path[len(mountpoint) :]
 
 
 def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
@@ -136,13 +138,18 @@ def why_not_mounted(path: str, said: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """What the kernel's table says of a mount. number: no other mount has it as long as this one is used;
-    uid: of the user that mounted it, None if that is not told."""
+    """What the kernel's table says of a mount.
+
+    number: no other mount has it as long as this one is used. uid: of the user that mounted it, None if that
+    is not told. root: the directory of the file system that is seen there, for a bind mount of a part of it.
+    others: all places where the same file system is mounted."""
 
     number: str
     type: str
     source: str
     uid: int | None
+    root: str = "/"
+    others: Sequence[str] = ()
 
 
 def is_ours(path: str, *, table: str = MOUNT_TABLE) -> bool:
@@ -165,14 +172,18 @@ def is_dead(path: str, *, table: str = MOUNT_TABLE) -> bool:
 def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
     """Return mountpoint -> the mount on top of it, from the kernel's table."""
     found: dict[str, Mounted] = {}
+    places: dict[str, list[str]] = {}
     for line in Path(table).read_text(errors="surrogateescape").splitlines():
         left, _, right = line.partition(" - ")
         columns = left.split(" ")
         if len(columns) > 4:
+            number, _, device, root, place = [*columns[:3], *map(_unescape, columns[3:5])]
             kind, source, words = [*right.split(" "), "", ""][:3]
             uid = re.search(r"(?:^|,)user_id=(\d+)", words)
-            mounted = Mounted(columns[0], kind, _unescape(source), int(uid[1]) if uid else None)
-            found[_unescape(columns[4])] = mounted
+            others = places.setdefault(device, [])
+            others.append(place)
+            mounted = Mounted(number, kind, _unescape(source), int(uid[1]) if uid else None, root, others)
+            found[place] = mounted
     return found
 
 

@@ -25,8 +25,6 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NotDelivered,
     NotFound,
-    NotTaken,
-    OtherRefusal,
     UsageError,
 )
 from mavftpfs.shared.model import ROOT
@@ -255,8 +253,6 @@ async def set_values(session: Session, changes: Sequence[Change], progress: Prog
             await file.write(0, text.encode())
     except NotDelivered as exc:
         cause = exc.__cause__
-        if isinstance(cause, OtherRefusal):  # a mount tells a number
-            raise NotTaken("not all of it was set") from exc
         raise cause if isinstance(cause, MavftpfsError) else exc from None
     progress.end(size)
 

@@ -11,9 +11,10 @@ from typing import Any
 import trio
 
 from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
-from mavftpfs.client.files import Target, heartbeats_in, mount_status, mounts_on
+from mavftpfs.client.files import Target, heartbeats_in, usable_status
 from mavftpfs.client.listening import listening
-from mavftpfs.client.status import second_vehicle, with_vehicles
+from mavftpfs.client.mounts import mounts_on, with_vehicles
+from mavftpfs.client.status import second_vehicle
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer, names_of
@@ -42,14 +43,15 @@ async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     if target.mount is not None:
         return _shown(await _by_mount(target.mount[0]), show)
     assert target.spec is not None
-    found = _shown(_of_mounts(await mounts_on(target.spec)), show)
+    mounted = await trio.to_thread.run_sync(mounts_on, target.spec, abandon_on_cancel=True)
+    found = _shown(_of_mounts([status for status in mounted if not status.get("problem")]), show)
     try:
         async with opened(target.spec, target.options) as link:
             async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
                 found += _shown([entry], show)
     except LinkClosed:  # the mount is another user's, and does not share the port
         holder = await mount_with(target.spec)
-        if holder is None:
+        if holder is None or holder.get("problem"):
             raise
         return _shown(_of_mount(holder), show)
     return sorted(found, key=itemgetter("system", "component"))
@@ -63,7 +65,7 @@ def _shown(entries: list[Entry], show: Callable[[Entry], None]) -> list[Entry]:
 
 async def _by_mount(mountpoint: str) -> list[Entry]:
     """Return what a mount, or the mounts of several vehicles, tell."""
-    status = await mount_status(mountpoint, several=True)
+    status = await usable_status(mountpoint)
     if "members" in status:
         _, *below = await trio.to_thread.run_sync(with_vehicles, status)
         return [_own_entry(vehicle) for vehicle in below if not vehicle.get("problem")]

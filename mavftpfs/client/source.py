@@ -6,13 +6,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mavftpfs.client.control import NobodyThere
-from mavftpfs.client.files import Target, mountpoint_of
-from mavftpfs.client.mounted import STATUS_PATIENCE
+import trio
+
+from mavftpfs.client.files import Target, is_directory, open_mount
+from mavftpfs.client.mounts import mountpoint_of, several_at
 from mavftpfs.client.options import at_source
-from mavftpfs.client.status import several_at, told_by
 from mavftpfs.link.uri import parse_source, require_expanded
-from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT
 from mavftpfs.shared.options import Options
 
@@ -31,7 +31,7 @@ def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[s
     mount = mountpoint_of(source)
     if mount is None or mount[1] == ROOT or several_at(mount[0]) is not None:
         return None
-    if (paths or lists) and _may_be_directory(source, mount[0]):
+    if (paths or lists) and trio.run(_may_be_directory, *mount):
         return None
     found = []
     for word in (source, *paths):
@@ -44,13 +44,13 @@ def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[s
     return mount[0], found
 
 
-def _may_be_directory(source: str, mountpoint: str) -> bool:
+async def _may_be_directory(mountpoint: str, path: bytes) -> bool:
     """Return whether a path in a mount is a directory, or the mount cannot tell."""
     try:
-        status = told_by(mountpoint, STATUS_PATIENCE)  # a mount that was stopped would keep us for ever
-    except NobodyThere:
+        async with open_mount(mountpoint, ROOT, Options()) as session:
+            return await is_directory(session.files, path)
+    except MavftpfsError:
         return True
-    return bool(status.get("problem")) or os.path.isdir(source)
 
 
 def target_of(source: str, options: Options) -> Target:

@@ -7,25 +7,18 @@ that the vehicle has acknowledged.
 from __future__ import annotations
 
 import os
-import re
-import secrets
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import trio
 
-from mavftpfs.cache.reserved import MAX_NAME, fits_rename
-from mavftpfs.client.compare import BY_CRC32, BY_SIZE
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, written
-from mavftpfs.client.mounted import WITHDRAWAL_TIME
+from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.status import BESIDE
 from mavftpfs.shared.errors import (
-    CrossDevice,
     IsADirectory,
     LinkError,
     MavftpfsError,
@@ -35,16 +28,11 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     UsageError,
 )
-from mavftpfs.shared.model import join, normalise, split
+from mavftpfs.shared.model import join, normalise
 from mavftpfs.shared.readable import name_text, readable
 
 Tell = Callable[[bytes, int, str], None]
 """Called with the path of a file that was put, its size, and how it was verified."""
-
-_WAYS = {
-    "verified_by_size": BY_SIZE.how,
-    "verified_by_crc": BY_CRC32.how,
-}
 
 ASK_PERIOD = 0.25
 """Seconds between two looks at how much the vehicle has acknowledged."""
@@ -158,25 +146,11 @@ async def put_alone(
 
 
 async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: Progress, tell: Tell) -> None:
-    before = (await session.status())["cache"]
-    size = await put_file(session, local, remote, progress)
-    after: Mapping[str, Any] = {}
-    with suppress(LinkError):  # the mount is gone, but the file is on the vehicle
-        after = (await session.status())["cache"]
-    tell(remote, size, how_verified(before, after))
+    tell(remote, *await put_file(session, local, remote, progress))
 
 
-def how_verified(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """Return how a file was verified, from the counts of a status; "" if they do not tell. If a mount
-    verified another file meanwhile, return the weaker of both ways."""
-    for way, words in _WAYS.items():
-        if after.get(way, 0) > before.get(way, 0):
-            return words
-    return ""
-
-
-async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> int:
-    """Put one file, and return its size.
+async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> tuple[int, str]:
+    """Put one file, and return its size, and how it was verified.
 
     Raises:
         UsageError: it cannot be read. NotFound, NotADirectory: its directory is not there. NotDelivered.
@@ -185,7 +159,7 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
         with local.open("rb") as source:
             planned = os.fstat(source.fileno()).st_size
             progress.begin(name_text(session.on_vehicle(remote)), planned)
-            size = await _send(session, source, remote, progress)
+            sent = await _send(session, source, remote, progress)
     except OSError as exc:
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
@@ -195,7 +169,7 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
         there = exc.there if isinstance(exc, NotDelivered) else False  # nothing was written yet
         raise NotDelivered(told, there=there) from exc
     progress.end(planned)
-    return size
+    return sent
 
 
 @contextmanager
@@ -214,71 +188,20 @@ def _naming(session: Session, remote: bytes, progress: Progress) -> Iterator[Non
 def _undelivered(session: Session, remote: bytes, error: MavftpfsError, progress: Progress) -> str:
     """Return which file was not delivered, why, and how many were."""
     name = name_text(session.on_vehicle(remote))
-    reason = _with_final_name(str(error), remote).removeprefix(f"{name_text(remote)}: ")
+    reason = readable(str(error)).removeprefix(f"{name_text(remote)}: ")
     done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
     return f"{name} was not delivered: {reason}{done}"
 
 
-async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
-    if session.mountpoint is not None:
-        try:
-            return await _send_beside(session, source, remote, progress)
-        except CrossDevice:  # this server cannot rename
-            source.seek(0)
+async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> tuple[int, str]:
     file = await emptied(session.files, remote)
     progress.untouched = False
     try:
         async with watched(session, remote, progress), written(file) as writing:
-            return await _copy(source, file)
+            size = await _copy(source, file)
     finally:
         progress.untouched = writing.there is False
-
-
-async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
-    """Write a new file beside the old one, and rename it. Else a mount would deliver half a file of an
-    interrupted put. After a killed put the new file stays."""
-    files = session.files
-    beside = _beside(session, remote)
-    file = await files.create(beside, exclusive=True)
-    try:
-        async with watched(session, beside, progress), written(file):
-            size = await _copy(source, file)
-    except NotDelivered as exc:
-        if exc.there is not False:
-            await _remove(files, beside)
-        raise NotDelivered(str(exc), there=False) from exc.__cause__  # `remote` was not touched
-    progress.untouched = False
-    try:
-        await files.rename(beside, remote)
-    except BaseException as exc:
-        await _remove(files, beside)
-        if isinstance(exc, RequestTimeout | LinkError):
-            raise NotDelivered(str(exc), there=None) from exc
-        raise
-    return size
-
-
-def _beside(session: Session, remote: bytes) -> bytes:
-    """Return a new name beside a file, which tells the file's own name where that fits."""
-    parent, name = split(remote)
-    short = join(parent, f"{BESIDE}{secrets.token_hex(4)}".encode())
-    told = short + b"-" + name
-    whole = session.on_vehicle(told)
-    return told if len(split(told)[1]) <= MAX_NAME and fits_rename(whole, whole) else short
-
-
-def _with_final_name(text: str, remote: bytes) -> str:
-    """Return a text with a file's name in place of the name beside it, which means nothing to people."""
-    name = name_text(split(remote)[1])
-    beside = re.escape(BESIDE) + f"[0-9a-f]+(-{re.escape(name)})?"
-    return re.sub(beside, lambda _: name, readable(text))
-
-
-async def _remove(files: Files, path: bytes) -> None:
-    """Remove a file that is not wanted any more, if that can be done."""
-    with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
-        patience.shield = True
-        await files.unlink(path)
+    return size, file.verified
 
 
 async def _copy(source: BinaryIO, file: File) -> int:

@@ -94,16 +94,15 @@ class Watch:
             nursery.start_soon(self.keeping.hand_on_all)
             while True:
                 try:
-                    mounted = await target.mounted()
-                    if mounted is None:
-                        await self._run_on_link(target)
-                    else:
-                        self._complaints.over("link")
-                        if mounted.unnamed is not None:
-                            self._complaints.tell("others", mounted.unnamed.note(ON_COMMAND_LINE))
-                        contact = MountContact(mounted)
-                        while True:
-                            await self.serve(contact)
+                    async with target.mounted() as mounted:
+                        if mounted is not None:
+                            self._complaints.over("link")
+                            if mounted.unnamed is not None:
+                                self._complaints.tell("others", mounted.unnamed.note(ON_COMMAND_LINE))
+                            contact = MountContact(mounted)
+                            while True:
+                                await self.serve(contact)
+                    await self._run_on_link(target)
                 except (LinkError, RequestTimeout) as exc:
                     self._complaints.tell("link", str(exc))
                 self._break_silence()
@@ -113,7 +112,8 @@ class Watch:
         assert target.spec is not None
 
         async def is_mounted() -> bool:
-            return await target.mounted() is not None
+            async with target.mounted() as mounted:
+                return mounted is not None
 
         async with opened(target.spec, target.options) as link:
             self._complaints.over("link")

@@ -39,6 +39,7 @@ class Invalidator:
         self._pending: set[int] = set()
         self._wake = trio.Event()
         self._calls: set[object] = set()
+        self._ended = False
         self._drops = trio.CapacityLimiter(MAX_DROPS)
         # Without a limit: a call that queued and was cancelled would count as running.
         self._limiter = trio.CapacityLimiter(math.inf)
@@ -47,6 +48,10 @@ class Invalidator:
     def busy(self) -> bool:
         """Whether a thread is inside the kernel's call at this moment."""
         return bool(self._calls)
+
+    def end(self) -> None:
+        """Tell nothing any more: the kernel's mount is about to go, and commands still end their files."""
+        self._ended = True
 
     def on_changed(self, path: bytes) -> None:
         """Make the kernel drop its pages and attributes of a path, because its bytes changed."""
@@ -69,6 +74,12 @@ class Invalidator:
         """Make the kernel drop a file's pages and attributes. Other files do not wait for it, since one of
         its pages may be read from a lost vehicle just now."""
         async with self._drops:
+            await self._tell(ino, attr_only=False)
+
+    async def forget_pages(self, path: bytes) -> None:
+        """Make the kernel drop its pages and attributes of a path; return when it has dropped them."""
+        ino = self._inodes.known(path)
+        if ino is not None:
             await self._tell(ino, attr_only=False)
 
     async def forget_attributes(self, ino: int) -> None:
@@ -94,6 +105,8 @@ class Invalidator:
 
     async def _in_thread(self, calls: Sequence[Callable[[], None]]) -> None:
         await trio.lowlevel.checkpoint_if_cancelled()
+        if self._ended:
+            return
         running = object()
         self._calls.add(running)
         action = partial(self._call, running, calls)

@@ -10,24 +10,29 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import signal
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import trio
 
 import mavftpfs
+from mavftpfs.client import wire
 from mavftpfs.client.connect import NO_SINKS, Sinks
-from mavftpfs.client.control import Reply
-from mavftpfs.client.controlserver import Command, ControlServer
+from mavftpfs.client.control import FOREIGN, SYSTEM, Reply
+from mavftpfs.client.mounts import network_namespace
 from mavftpfs.link.uri import LinkSpec
+from mavftpfs.mount.controlserver import ControlServer
 from mavftpfs.mount.daemon import Report, ending_signals
-from mavftpfs.shared.errors import ExitCode, MavftpfsError, exit_code_for
+from mavftpfs.mount.fileserver import FileServer
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, UsageError, exit_code_for
 from mavftpfs.shared.options import Options
 
 log = logging.getLogger("mavftpfs.mount")
@@ -83,6 +88,7 @@ class Life(ABC):
         self._ended = trio.Event()
         self._control: ControlServer | None = None
         self._started = time.time()
+        self._id = secrets.token_hex(8)
 
     # -- what the two kinds of mount say
 
@@ -177,16 +183,20 @@ class Life(ABC):
                     case State.LEAVING:
                         self.hurry()
 
-    async def start_control(self, commands: Mapping[str, Command], nursery: trio.Nursery) -> None:
-        """Answer `mavftpfs status`, `umount`, and the commands given."""
-        if self.request.control is None:
+    async def start_control(self, nursery: trio.Nursery, files: FileServer | None = None) -> None:
+        """Answer `mavftpfs status`, `umount`, and commands and programs that use files."""
+        path = self.request.control
+        if path is None:
             return
 
         async def status(_: Reply) -> Reply:
             return {"status": self.facts()}
 
-        own = {"status": status, "umount": self._umount}
-        server = ControlServer(self.request.control, {**own, **commands})
+        commands = {"status": status, "umount": self._umount}
+        if files is not None:
+            commands["files"] = partial(self._serve_files, files)
+        mode = 0o666 if path.parent == SYSTEM else 0o600
+        server = ControlServer(path, commands, files=files, refusal=self._refusal, mode=mode)
         try:
             await nursery.start(server.run)
         except OSError as exc:
@@ -194,20 +204,52 @@ class Life(ABC):
         else:
             self._control = server
 
+    def _refusal(self, uid: int) -> str:
+        """Return why a user may not use the mount by commands, or ""."""
+        served = uid in (0, os.getuid(), self.request.options.uid)
+        return "" if served else FOREIGN
+
+    async def _serve_files(self, files: FileServer, request: Reply) -> Reply:
+        if request.get("version") != wire.VERSION:
+            raise UsageError(
+                f"this mount is of mavftpfs {mavftpfs.__version__}, and the program of another version"
+            )
+        refusal = files.refusal()
+        if refusal:
+            raise UsageError(refusal)
+        return {"id": self._id}
+
     async def _umount(self, request: Reply) -> Reply:
+        if request["uid"] not in (0, os.getuid()):
+            raise MountFailed(
+                f"another user mounted {self.request.mountpoint}, and only uid {os.getuid()} or root may"
+            )
         await self.unmount(lazy=bool(request.get("lazy")))
         await self._ended.wait()
         return {"exit_code": int(self._code), "pid": os.getpid(), "message": "; ".join(self._last_words)}
 
+    def identity(self) -> dict[str, Any]:
+        """Return what any program that may look at the mount is told of it, JSON-able: which mount this is,
+        and where it can be asked."""
+        if self._control is not None:
+            self._control.be_reachable()
+        return {
+            "mountpoint": self.request.mountpoint,
+            "source": self.request.source,
+            "version": mavftpfs.__version__,
+            "protocol": wire.VERSION,
+            "id": self._id,
+            "socket": None if self._control is None else str(self._control.path),
+            "network_namespace": network_namespace(),
+        }
+
     def facts(self) -> dict[str, Any]:
         """Return the status for people and scripts; JSON-able."""
         return {
-            "mountpoint": self.request.mountpoint,
+            **self.identity(),
             "state": "unmounting" if self.state is State.LEAVING else "mounted",
             "problem": None,
-            "source": self.request.source,
             "pid": os.getpid(),
-            "version": mavftpfs.__version__,
             "uptime": round(time.time() - self._started, 1),
             **self.status(),
         }

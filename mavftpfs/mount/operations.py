@@ -83,17 +83,18 @@ class Operations(pyfuse3.Operations):
         inodes: InodeTable | None = None,
         refresh: Refresh = _no_refresh,
         space: Callable[[], Space | None] = lambda: None,
-        status: Callable[[], dict[str, Any]] = dict,
+        told: Callable[[], dict[str, Any]] = dict,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`now_ns()`: the time of day, nanoseconds since 1970 UTC."""
+        """`told()`: what the attribute of the mount tells, JSON-able. `now_ns()`: the time of day,
+        nanoseconds since 1970 UTC."""
         super().__init__()
         self._tree = tree
         self.op_deadline = presentation.op_deadline
         self._presentation = presentation
         self._refresh = refresh
         self._space = space
-        self._status = status
+        self._told = told
         self._now_ns = now_ns
         self._set_by_users = UserAttributeTable()
         self.inodes = InodeTable() if inodes is None else inodes
@@ -367,14 +368,14 @@ class Operations(pyfuse3.Operations):
         """Remove an empty directory."""
         path = self._child(parent_inode, name)
         await self._tree.rmdir(path)
-        self._gone(path)
+        self.note_gone(path)
 
     @handler
     async def unlink(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
         """Remove a file; programs that have it open keep it."""
         path = self._child(parent_inode, name)
         await self._tree.unlink(path)
-        self._gone(path)
+        self.note_gone(path)
 
     @handler
     async def rename(
@@ -392,10 +393,7 @@ class Operations(pyfuse3.Operations):
         old = self._child(parent_inode_old, name_old)
         new = self._child(parent_inode_new, name_new)
         await self._tree.rename(old, new, noreplace=bool(flags & pyfuse3.RENAME_NOREPLACE))
-        self.inodes.rename(old, new)
-        self._set_by_users.move(old, new)
-        self._entry_changed(old)
-        self._entry_changed(new)
+        self.note_renamed(old, new)
 
     async def _not_on_a_card(self, *_: object) -> NoReturn:
         raise FUSEError(errno.EPERM)
@@ -418,10 +416,10 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def getxattr(self, inode: int, name: bytes, ctx: RequestContext) -> bytes:
-        """Return a file's checksum or the root's status; unknown names never touch the link."""
+        """Return a file's checksum, or which mount this is; unknown names never touch the link."""
         path = self._path(inode)
-        if name == XATTR_STATUS and inode == ROOT_INO:
-            return json.dumps(self._status(), default=str).encode()
+        if name == XATTR_STATUS:  # of any directory: a part of the mount may be mounted elsewhere, too
+            return json.dumps(self._told(), default=str).encode()
         if name != XATTR_CRC32:
             raise FUSEError(pyfuse3.ENOATTR)
         if (await self._tree.stat(path)).kind is not EntryKind.FILE:
@@ -430,21 +428,45 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def listxattr(self, inode: int, ctx: RequestContext) -> list[bytes]:
-        """List the root's status only: if checksums were listed, `cp -a` would ask for that of every log."""
+        """List the root's attribute only: if checksums were listed, `cp -a` would ask for that of every
+        log."""
         return [XATTR_STATUS] if inode == ROOT_INO else []
+
+    # -- what changed, through the kernel or not --------------------------------------------------
+
+    def note_entry(self, path: bytes) -> None:
+        """Note that a name came or went; the kernel asks for its directory's attributes again by itself."""
+        self._set_by_users.entries_changed(split(path)[0], self._now_ns())
+
+    def note_gone(self, path: bytes) -> None:
+        """Note that a name was removed."""
+        self.inodes.unlink(path)
+        self._set_by_users.drop(path)
+        self.note_entry(path)
+
+    def note_renamed(self, old: bytes, new: bytes) -> None:
+        """Note that a name, and everything below it, has another path."""
+        self.inodes.rename(old, new)
+        self._set_by_users.move(old, new)
+        self.note_entry(old)
+        self.note_entry(new)
+
+    def lose_name(self, path: bytes) -> None:
+        """Take the name from an inode, because its file is broken or was taken back. Programs that open the
+        path then get another inode, and so never a page of that file; who reads it keeps it."""
+        self.inodes.unlink(path)
 
     # -- helpers ----------------------------------------------------------------------------------
 
     @contextmanager
     def _losing_its_name(self, handle: FileHandle) -> Iterator[None]:
-        """Take the name from the inode of a file that the body breaks. Programs that open the path then get
-        another inode, and so never a page of the broken file."""
+        """Take the name from the inode of a file that the body breaks."""
         try:
             yield
         except MavftpfsError:
             inode = self.inodes.get(handle.ino)
             if handle.file.broken and inode is not None and inode.path is not None:
-                self.inodes.unlink(inode.path)
+                self.lose_name(inode.path)
             raise
 
     def _inode(self, ino: int) -> Inode:
@@ -507,19 +529,10 @@ class Operations(pyfuse3.Operations):
             entry.st_mode &= ~_WRITE_BITS
         return entry
 
-    def _gone(self, path: bytes) -> None:
-        self.inodes.unlink(path)
-        self._set_by_users.drop(path)
-        self._entry_changed(path)
-
     def _made(self, path: bytes, mode: int) -> None:
         kept = self._set_by_users.at(path)
         kept.mode, kept.atime_ns = stat_bits.S_IMODE(mode), self._now_ns()
-        self._entry_changed(path)
-
-    def _entry_changed(self, path: bytes) -> None:
-        """A name came or went; the kernel asks for its directory's attributes again by itself."""
-        self._set_by_users.entries_changed(split(path)[0], self._now_ns())
+        self.note_entry(path)
 
     async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
         self._made(path, mode)

@@ -17,25 +17,22 @@ import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
-from mavftpfs.client.control import Reply
-from mavftpfs.client.controlserver import Command
 from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
-from mavftpfs.client.status import also_mounted, network_namespace
+from mavftpfs.client.mounts import also_mounted
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.farewell import say_goodbye
+from mavftpfs.mount.fileserver import FileServer
 from mavftpfs.mount.handles import InodeTable
 from mavftpfs.mount.invalidator import Invalidator
 from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
 from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import fuse_words
-from mavftpfs.shared.errors import ExitCode
+from mavftpfs.mount.toldfiles import ToldFiles
+from mavftpfs.shared.errors import ExitCode, MountFailed
 
 ASKING_TIME = 2.0
 """Seconds for other mounts to tell which vehicle they have."""
-
-FORGETTING_TIME = 2.0
-"""Seconds for the kernel to forget what it cached, for a command that waits for that."""
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
 """Connects to the vehicle. Its argument is called for paths whose bytes changed."""
@@ -66,6 +63,7 @@ class SingleMount(Life):
         self._loop = FuseLoop()
         self._status: Callable[[], Mapping[str, Any]] = dict
         self._attached: Attached | None = None
+        self._files: FileServer | None = None
 
     async def serve(self, nursery: trio.Nursery) -> None:
         """See Life.serve."""
@@ -80,17 +78,21 @@ class SingleMount(Life):
                 inodes=inodes,
                 refresh=invalidator.forget_attributes,
                 space=vehicle.space,
-                status=self.facts,
+                told=self.identity,
             )
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
+            self._files = FileServer(ToldFiles(vehicle.tree, operations, invalidator), self.facts)
             words = fuse_words(self.request.options, self.request.source)
             notes = await self._notes(vehicle)
             if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
                 unmount(self.request.mountpoint, lazy=True)
             with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
-                self.enter(State.MOUNTED)
-                await self.start_control(_commands(vehicle, operations, invalidator), nursery)
-                await self._answer(invalidator, lambda: _together(vehicle.notice(), *notes))
+                try:
+                    self.enter(State.MOUNTED)
+                    await self.start_control(nursery, self._files)
+                    await self._answer(invalidator, lambda: _together(vehicle.notice(), *notes))
+                finally:
+                    invalidator.end()
 
     async def _notes(self, vehicle: Attached) -> list[str]:
         """Return what a user should know of this computer's kernel and mounts."""
@@ -106,8 +108,12 @@ class SingleMount(Life):
         try:
             yield
         finally:
-            if self.state is not State.STARTING:
-                await say_goodbye(tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED))
+            try:
+                if self._files is not None:
+                    await self._files.close()
+            finally:
+                if self.state is not State.STARTING:
+                    await say_goodbye(tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED))
 
     async def _answer(self, invalidator: Invalidator, notice: Callable[[], str]) -> None:
         async with trio.open_nursery() as nursery:
@@ -123,6 +129,12 @@ class SingleMount(Life):
     async def unmount(self, *, lazy: bool) -> None:
         """See Life.unmount."""
         if self.state is State.MOUNTED:
+            users = [] if self._files is None or lazy else self._files.users
+            if users:
+                raise MountFailed(
+                    f"{self.request.mountpoint} is in use by process {' and '.join(map(str, users))}; "
+                    "let it end, and try again"
+                )
             action = partial(unmount, self.request.mountpoint, lazy=lazy)
             await trio.to_thread.run_sync(action, abandon_on_cancel=True)
             self.leave()
@@ -137,14 +149,23 @@ class SingleMount(Life):
         """See Life.hurry."""
         if self._attached is not None:
             self._attached.connection.store.hurry()
+        if self._files is not None:
+            self._files.hurry()
         self.stop()
+
+    def identity(self) -> dict[str, Any]:
+        """See Life.identity; also of which vehicle."""
+        vehicle = self._status().get("vehicle", {})
+        return {
+            **super().identity(),
+            "vehicle": {name: vehicle.get(name) for name in ("system", "component")},
+        }
 
     def status(self) -> Mapping[str, Any]:
         """See Life.status."""
         client = self.request.options
         return {
             "root": os.fsdecode(client.root),
-            "network_namespace": network_namespace(),
             "read_only": client.read_only,
             **self._status(),
         }
@@ -153,25 +174,3 @@ class SingleMount(Life):
 def _together(*lines: str) -> str:
     """Return what a user should know in one line."""
     return "; ".join(filter(None, lines))
-
-
-def _commands(vehicle: Attached, operations: Operations, invalidator: Invalidator) -> dict[str, Command]:
-    """Return what only a mount of one vehicle can be asked by its control socket."""
-
-    async def forget(_: Reply) -> Reply:
-        vehicle.tree.forget_caches()
-        # The kernel waits for lookups that are under way, and these wait for the vehicle.
-        with trio.move_on_after(FORGETTING_TIME):
-            await invalidator.forget_beliefs()
-        return {}
-
-    async def withdraw(request: Reply) -> Reply:
-        path = os.fsencode(request["path"])
-        there = await vehicle.tree.withdraw(path)
-        if there is False:
-            operations.inodes.unlink(path)  # a reader keeps the withdrawn file, under a number of its own
-        with trio.move_on_after(FORGETTING_TIME):
-            await invalidator.forget_name(path)
-        return {"there": there}
-
-    return {"forget": forget, "withdraw": withdraw}

@@ -67,7 +67,7 @@ class Supervisor(Life):
             listening(link, options, self._on_heard),
         ):
             self.enter(State.MOUNTED)
-            await self.start_control({}, nursery)
+            await self.start_control(nursery)
             async with plain_nursery() as tasks:
                 tasks.start_soon(self._keep_members, tasks)
                 tasks.start_soon(self._tell_when_up)
@@ -183,7 +183,7 @@ class Supervisor(Life):
         process, place = self._processes[member.name], self._place(member)
         request = {"command": "umount", "lazy": lazy}
         try:
-            socket = control.find_socket(place, control.own_directories())
+            socket = control.find_socket(place)
             action = partial(control.ask, socket, request, timeout=END_PATIENCE)
             reply = await trio.to_thread.run_sync(action)
         except control.ControlError as exc:

@@ -126,7 +126,6 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.WriteFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
     errors.NotVerified: errno.EIO,
-    errors.OtherRefusal: errno.EIO,
     errors.MountFailed: errno.EIO,
     errors.NoFtp: errno.EIO,
     errors.NotDelivered: errno.EIO,
@@ -137,8 +136,6 @@ def errno_for(error: BaseException) -> int:
     """Return the errno a system call ends with; total: anything unknown is EIO."""
     if isinstance(error, errors.FtpNak):
         return _errno_of_nak(error.opcode, error.code, error.server_errno)
-    if isinstance(error, errors.OtherRefusal):
-        return error.number or errno.EIO
     for cls in type(error).__mro__:
         if cls in _BY_CLASS:
             return _BY_CLASS[cls]

@@ -174,18 +174,6 @@ class NotVerified(MavftpfsError):
     """The bytes on the card are in doubt, and the vehicle told no checksum (EIO); they are compared later."""
 
 
-class OtherRefusal(MavftpfsError):
-    """A mount refused with an errno for which there is no class here.
-
-    Attributes:
-        number: the errno.
-    """
-
-    def __init__(self, reason: str, number: int = 0) -> None:
-        super().__init__(reason)
-        self.number = number
-
-
 class MountFailed(MavftpfsError):
     """The kernel side cannot be set up or taken down."""
 

@@ -50,15 +50,11 @@ def own_directories() -> list[Path]:
     A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
     """
     runtime, home = os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("HOME")
-    given = [Path(runtime) / "mavftpfs"] if runtime else []
-    return list(dict.fromkeys([*given, *directories_of(os.getuid(), home)]))
-
-
-def directories_of(uid: int, home: str | None = None) -> list[Path]:
-    """Return where any user's sockets may lie; home: if it is not the one in the table of users."""
     with suppress(KeyError):
-        home = home or pwd.getpwuid(uid).pw_dir
-    return [Path(f"/run/user/{uid}/mavftpfs"), Path(home or "/tmp") / ".cache" / "mavftpfs"]
+        home = home or pwd.getpwuid(os.getuid()).pw_dir
+    given = [Path(runtime) / "mavftpfs"] if runtime else []
+    usual = [Path(f"/run/user/{os.getuid()}/mavftpfs"), Path(home or "/tmp") / ".cache" / "mavftpfs"]
+    return list(dict.fromkeys([*given, *usual]))
 
 
 def private_directory(directories: list[Path], *, longest_name: int) -> Path | None:

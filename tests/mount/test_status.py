@@ -144,7 +144,8 @@ def test_another_user_is_told_in_a_line(
     state.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
     for words, code, why in (
-        (("umount", mount.path), ExitCode.MOUNT_FAILED, "another user mounted it"),
+        (("umount", mount.path), ExitCode.MOUNT_FAILED, "another user's mount"),
+        (("ls", mount.path), ExitCode.NO_VEHICLE, f"the mount on {mount.path}: another user's mount"),
         (("recover",), ExitCode.USAGE, "Permission denied"),
     ):
         refused = by_nobody(mount, *words, code=code)
@@ -154,7 +155,6 @@ def test_another_user_is_told_in_a_line(
     assert shown == (small_tree / "README.txt").read_text()
     assert str(mount.path) in by_nobody(mount, "status").stdout
     assert "README.txt" in by_nobody(mount, "ls", mount.source).stdout.splitlines()  # they share the port
-    assert f"mounted on {mount.path}" in by_nobody(mount, "scan", mount.source).stdout
     refused = by_nobody(mount, "hub", "--stop", mount.source, code=ExitCode.USAGE)
     assert (refused.stdout, "the hub of another user has this port" in refused.stderr) == ("", True)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.status import is_wanted
+from mavftpfs.client.mounts import is_wanted
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.options import Options

@@ -39,6 +39,7 @@ class FakeFile:
     path: bytes = b""
     made: bool = False
     direct_io = keep_cache = broken = False
+    verified = ""
 
     @property
     def size(self) -> int:
@@ -70,6 +71,7 @@ class FakeFile:
 
     async def take_back(self) -> bool | None:
         self.closed = True
+        self.tree.taken_back.append(self.path)
         if self.made:
             del self.tree.files[self.path]
         return False
@@ -101,6 +103,7 @@ class FakeTree:
     opened: list[FakeFile] = field(default_factory=list)
     times: dict[bytes, int] = field(default_factory=dict)
     left: list[bytes] = field(default_factory=list)
+    taken_back: list[bytes] = field(default_factory=list)
     on_call: Callable[[str, bytes], None] = lambda name, path: None
 
     async def pause(self, name: str, path: bytes = b"") -> None:
@@ -215,6 +218,9 @@ class FakeTree:
     def recover_to(self, directory: Path) -> Sequence[Path]:
         self.calls.append(("recover_to", os.fsencode(directory)))
         return [directory / os.fsdecode(path.lstrip(b"/")) for path in self.left]
+
+    async def refresh(self) -> None:
+        await self.pause("refresh")
 
     async def crc32(self, path: bytes) -> int:
         await self.pause("crc32", path)

@@ -26,14 +26,13 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotDelivered,
     NotFound,
-    ReadOnly,
     RequestTimeout,
     UsageError,
     VehicleLost,
     exit_code_for,
 )
 from mavftpfs.shared.model import EntryKind, split
-from tests.ops.faketree import FakeFile, FakeTree, quiet, session_of
+from tests.ops.faketree import FakeTree, session_of
 
 BIG = bytes(range(251)) * 2000
 
@@ -242,79 +241,15 @@ async def test_mv_ends_where_the_source_has_shrunk_meanwhile() -> None:
 # -- by a mount -----------------------------------------------------------------------------------
 
 
-async def put_by_mount(tree: Card, local: Path, session: Session | None = None) -> None:
-    """Put the file `a` to /x."""
-    session = session or session_of(tree, mountpoint="/mnt/drone")
-    batch = (local / "a", collect(local / "a", recursive=False))
-    await put_paths(session, [batch], b"/x", Progress(), print)
-
-
-@pytest.mark.parametrize("renames", [True, False])
-async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
-    local: Path, renames: bool
-) -> None:
-    tree = Card({b"/x": b"old"})
-    tree.renames = renames
-    await put_by_mount(tree, local)
-    assert tree.files == {b"/x": BIG}
-    opened = [path for name, path in tree.calls if name == "open"]
-    assert (b"/x" in opened) is not renames
-
-
-async def test_by_a_mount_an_error_names_the_file_and_not_what_is_written_beside(local: Path) -> None:
-    tree = Card({b"/x": b"old"})
-
-    def refuse(name: str, path: bytes) -> None:
-        if name == "create":
-            raise ReadOnly(f"{os.fsdecode(path)}: Read-only file system (the vehicle is armed)")
-
-    tree.on_call = refuse
-    with pytest.raises(NotDelivered) as caught:
-        await put_by_mount(tree, local)
-    assert str(caught.value) == ("/x was not delivered: Read-only file system (the vehicle is armed)")
-
-
-@pytest.mark.parametrize(
-    ("fails", "error", "there"),
-    [
-        ("fsync", RequestTimeout("no answer"), False),
-        ("rename", RequestTimeout("no answer"), None),
-        ("rename", LinkClosed("the mount is gone"), None),
-        ("rename", ReadOnly("armed"), False),
-    ],
-)
-async def test_by_a_mount_what_is_there_is_said_of_the_file_and_not_of_what_is_written_beside(
-    local: Path, monkeypatch: pytest.MonkeyPatch, fails: str, error: MavftpfsError, there: bool | None
-) -> None:
-    """Even if all of the file beside got there at last."""
-    tree = Card({b"/x": b"old"})
-    tree.failing[fails] = error
-
-    async def take_back(file: FakeFile) -> bool:
-        file.tree.files[file.path] = file.content
-        return True
-
-    monkeypatch.setattr(FakeFile, "take_back", take_back)
-    with pytest.raises(NotDelivered) as caught:
-        await put_by_mount(tree, local)
-    assert caught.value.there is there
-    assert tree.files == {b"/x": b"old"}
-
-
 async def test_a_mount_that_does_not_tell_how_far_it_is_ends_no_put(
     local: Path, autojump_clock: trio.testing.MockClock
 ) -> None:
     tree = Card(delays={"fsync": 5.0})
 
-    asked = 0
-
     async def status() -> dict[str, Any]:
-        nonlocal asked
-        asked += 1
-        if asked > 1:  # it was asked before anything was sent
-            raise LinkClosed("the mount does not answer")
-        return await quiet()
+        raise LinkClosed("the mount does not answer")
 
     session = Session(cast(Files, tree), status, mountpoint="/mnt/drone")
-    await put_by_mount(tree, local, session)
+    batch = (local / "a", collect(local / "a", recursive=False))
+    await put_paths(session, [batch], b"/x", Progress(), print)
     assert tree.files == {b"/x": BIG}

@@ -16,7 +16,7 @@ from pyfuse3 import FUSEError, RequestContext
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Space
-from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.client.mountpoint import XATTR_CRC32
 from mavftpfs.mount.handles import ROOT_INO, DirectoryHandle, Presentation
 from mavftpfs.mount.operations import UNKNOWN_SPACE, Operations
 from mavftpfs.shared.errors import ListingIncomplete, PathTooLong
@@ -190,7 +190,6 @@ async def test_unknown_attributes_never_ask_the_tree(name: bytes) -> None:
     ino = await ino_of(ops, b"a.txt")
     tree.calls.clear()
     assert await failure(ops.getxattr(ino, name, CTX)) == errno.ENODATA
-    assert await failure(ops.getxattr(ino, XATTR_STATUS, CTX)) == errno.ENODATA
     assert tree.calls == []
 
 

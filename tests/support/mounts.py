@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mavftpfs.cli import main, ports
-from mavftpfs.client.control import ControlError, ask, find_socket, own_directories
+from mavftpfs.client.control import ControlError, ask, find_socket
 from tests.support.logs import assert_clean, suspects
 from tests.support.vehicles import PROJECT, Process, Program
 
@@ -199,7 +199,7 @@ class Mount:
 
     def status(self) -> dict[str, Any]:
         """Return what it says of itself."""
-        socket = find_socket(os.path.realpath(self.path), own_directories())
+        socket = find_socket(os.path.realpath(self.path))
         facts: dict[str, Any] = ask(socket, {"command": "status"}, timeout=20)["status"]
         return facts
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +18,7 @@ from mavftpfs import __main__
 from mavftpfs.cli import commands
 from mavftpfs.cli import main as cli
 from mavftpfs.client import connect as compose
-from mavftpfs.client import control, status
+from mavftpfs.client import control, mounts
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import (
     ExitCode,
@@ -345,31 +343,16 @@ def test_commands_that_only_ask_load_no_event_loop(tmp_path: Path, words: list[s
 # -- status and umount ----------------------------------------------------------------------------
 
 
-@pytest.fixture
-def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The only directory in which control sockets are looked for."""
-    directory = tmp_path / "run"
-    directory.mkdir()
-    monkeypatch.setattr(control, "own_directories", lambda: [directory])
-    monkeypatch.setattr(status, "mounts", dict)  # not those of other tests that run just now
-    return directory
-
-
-def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_of_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "BOUND", tmp_path / "none")  # not those of other tests that run just now
+    monkeypatch.setattr(mounts, "mounts", dict)
     code, line = complaint(capsys, "status", str(tmp_path / "mnt"))
     assert code == 3
     assert str(tmp_path / "mnt") in line
     assert cli.main(["status"]) == 0
     assert "no vehicle" in capsys.readouterr().out
-
-
-def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = sockets / "dead.sock"
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(path))
-    assert cli.main(["status", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == []
-    assert not path.exists()
 
 
 # -- signing keys ---------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import socket
 import stat
 from collections.abc import AsyncIterator, Mapping
@@ -18,9 +19,10 @@ import trio
 import trio.testing
 
 from mavftpfs.cli.main import main
-from mavftpfs.client import control, controlserver
+from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere, Reply, all_sockets, ask, find_socket
-from mavftpfs.client.controlserver import Command, ControlServer
+from mavftpfs.mount import controlserver
+from mavftpfs.mount.controlserver import Command, ControlServer
 from mavftpfs.shared.errors import ExitCode, UsageError
 
 pytestmark = pytest.mark.real_time
@@ -176,8 +178,8 @@ async def test_a_mount_of_a_version_that_tells_less_is_named_in_a_line(
         return {"status": told}
 
     with TemporaryDirectory() as name:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", name)
-        place = control.usable_directory(control.own_directories()) / control.socket_name("/mnt/old")
+        place = Path(name) / "mavftpfs" / control.socket_name("/mnt/old")
+        place.parent.mkdir()
         async with serving(place, {"status": status}):
             code = await trio.to_thread.run_sync(main, ["status", "/mnt/old"])
     said = capsys.readouterr()
@@ -185,38 +187,87 @@ async def test_a_mount_of_a_version_that_tells_less_is_named_in_a_line(
     assert said.out.startswith("/mnt/old: its program is of version 0.0.9")
 
 
+async def test_a_socket_whose_directory_was_removed_is_bound_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd removes a user's runtime directory at logout."""
+    with TemporaryDirectory() as name:
+        runtime, home = Path(name) / "run", Path(name) / "home"
+        monkeypatch.setattr(controlserver, "LOOK_PERIOD", 0.02)
+        monkeypatch.setattr(control, "SYSTEM", Path("/proc/none"))
+        monkeypatch.setattr(control, "own_directories", lambda: [home])
+        runtime.mkdir(mode=0o700)
+        async with serving(runtime / "s.sock", {"echo": echo}) as server:
+            shutil.rmtree(runtime)
+            runtime.touch()  # it is not made again by us
+            with trio.fail_after(60):
+                while server.path == runtime / "s.sock":  # noqa: ASYNC110
+                    await trio.sleep(0.01)
+            assert server.path == home / "s.sock"
+            assert (await ask_from_outside(server.path, {"command": "echo"}))["ok"]
+        assert not (home / "s.sock").exists()
+
+
 # -- places ---------------------------------------------------------------------------------------
 
 
-def test_a_private_directory_is_made() -> None:
+def test_a_private_directory_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     with TemporaryDirectory() as name:  # a socket's path may not be as long as pytest's directories
         short = Path(name)
-        chosen = control.usable_directory([short / "missing" / "deep" / "x", short / "run" / "mavftpfs"])
+        monkeypatch.setattr(control, "SYSTEM", short / "no" / "such" / "place")
+        places = [short / "missing" / "deep" / "x", short / "run" / "mavftpfs"]
+        monkeypatch.setattr(control, "own_directories", lambda: places)
+        chosen = control.usable_directory()
         assert chosen == short / "run" / "mavftpfs"
         assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
-        assert control.usable_directory([chosen]) == chosen
+        assert control.usable_directory(chosen) == chosen
 
 
-def test_a_directory_that_others_may_enter_or_own_is_not_used(tmp_path: Path) -> None:
+def test_a_directory_that_others_may_enter_or_own_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     open_to_all, link = tmp_path / "open", tmp_path / "link"
     open_to_all.mkdir()
-    open_to_all.chmod(0o755)
+    open_to_all.chmod(0o777)
     link.symlink_to(tmp_path)
     too_long = tmp_path / ("x" * 100)
+    monkeypatch.setattr(control, "SYSTEM", open_to_all)
+    monkeypatch.setattr(control, "own_directories", lambda: [open_to_all, link, too_long])
     with pytest.raises(ControlError, match="open"):
-        control.usable_directory([open_to_all, link, too_long])
+        control.usable_directory()
 
 
-def test_the_directory_of_another_user_holds_no_socket_of_ours(tmp_path: Path) -> None:
-    """sudo and su leave HOME and XDG_RUNTIME_DIR as they were."""
-    closed = tmp_path / "closed"
-    closed.mkdir(mode=0)
-    user = os.geteuid()
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may make that directory")
+def test_root_s_sockets_are_where_all_users_find_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(control, "SYSTEM", tmp_path / "system")
+    before = os.umask(0o077)
     try:
-        if user == 0:
-            os.seteuid(65534)
-        with pytest.raises(NobodyThere, match="no vehicle of yours"):
-            find_socket("/mnt/drone", [closed / "mavftpfs"])
-        assert list(all_sockets([closed / "mavftpfs"])) == []
+        assert control.usable_directory() == tmp_path / "system"
     finally:
-        os.seteuid(user)
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "system").stat().st_mode) == 0o755
+
+
+async def test_a_socket_is_found_wherever_it_is_but_not_another_user_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """sudo and su leave HOME and XDG_RUNTIME_DIR as they were, or change them."""
+    with TemporaryDirectory() as name:
+        directory = Path(name) / "mavftpfs"
+        directory.mkdir(mode=0o700)
+        path = directory / control.socket_name("/mnt/drone")
+        async with serving(path, {"echo": echo}):
+            assert find_socket("/mnt/drone") == path
+            assert path in all_sockets()
+            user = os.geteuid()
+            with pytest.raises(NobodyThere, match="no vehicle of yours"):
+                find_socket("/mnt/another")
+            try:
+                if user == 0:
+                    os.seteuid(65534)
+                    assert path not in all_sockets()
+            finally:
+                os.seteuid(user)
+        assert path not in all_sockets()

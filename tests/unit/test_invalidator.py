@@ -63,6 +63,18 @@ async def test_busy_while_a_thread_is_in_the_kernel_even_if_nobody_waits() -> No
     await idle(lambda: not invalidator.busy)
 
 
+async def test_a_kernel_that_is_about_to_go_is_told_nothing_more() -> None:
+    inodes, kernel = InodeTable(), Kernel()
+    inodes.lookup(b"/f")
+    invalidator = Invalidator(inodes, kernel.notify)
+    await invalidator.forget_pages(b"/f")
+    told = len(kernel.calls)
+    invalidator.end()
+    await invalidator.forget_pages(b"/f")
+    await invalidator.forget_attributes(7)
+    assert len(kernel.calls) == told == 1
+
+
 async def test_a_file_of_which_a_page_is_being_read_delays_no_other_file() -> None:
     inodes, kernel, gate = InodeTable(), Kernel(), threading.Event()
     slow, other = inodes.lookup(b"/slow").ino, inodes.lookup(b"/other").ino

@@ -36,7 +36,6 @@ LAYERS: dict[str, set[str]] = {
     },
     "api": {"shared", "protocol", "link", "parameters", "cache", "session", "client"},
     "__init__": {"api"},
-    "trio": {"api"},
 }
 """Layer -> the layers below it that it may import. `__main__` runs the top one."""
 

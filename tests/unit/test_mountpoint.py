@@ -41,7 +41,9 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
         LINE.format("/mnt/b", "ext4"),
         "garbage",
     )
-    assert mounts(path)["/mnt/my drone\\x"] == Mounted("36", "fuse.mavftpfs", "udpin:0", 0)
+    first = mounts(path)["/mnt/my drone\\x"]
+    assert first == Mounted("36", "fuse.mavftpfs", "udpin:0", 0, "/", first.others)
+    assert set(first.others) == {"/mnt/my drone\\x", "/mnt/a", "/mnt/b"}  # the same file system, as it seems
     assert is_ours("/mnt/a", table=path)
     assert not is_ours("/mnt/b", table=path)
     assert not is_ours("/mnt/c", table=path)

@@ -1,4 +1,4 @@
-"""client.status: which vehicle of several is meant, and whether its mount is up."""
+"""client.mounts: which vehicle of several is meant, and whether its mount is up."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.status import vehicle_below
+from mavftpfs.client.mounts import vehicle_below
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
 from mavftpfs.shared.options import Options
 

@@ -1,0 +1,372 @@
+"""Which mounts are up, and what each says of itself. Layer: client.
+
+The extended attribute of a mount's root names its control socket. Users that may not read the attribute
+(root, for users' mounts) look for the socket by the name of the mountpoint. Then the mount is asked by its
+socket. Of a mount that does not answer, or does not serve this user, only what the attribute tells is known,
+with `state` and `problem`."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mavftpfs import __version__
+from mavftpfs.client import control, wire
+from mavftpfs.client.control import ControlError, NobodyThere, Refused
+from mavftpfs.client.mountpoint import (
+    OUR_TYPE,
+    XATTR_STATUS,
+    Mounted,
+    canonical,
+    enclosing_mount,
+    mounts,
+    vehicles_below,
+)
+from mavftpfs.client.status import Facts
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
+from mavftpfs.link.samelink import same_link
+from mavftpfs.link.uri import LinkSpec, parse_source
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+from mavftpfs.shared.model import normalise
+from mavftpfs.shared.options import Options
+
+Status = Mapping[str, Any]
+
+PATIENCE = 10.0
+"""Seconds for a mount to answer: it does so without asking the vehicle."""
+STATUS_PATIENCE = 3.0
+"""Seconds for a mount to answer a command that could do without it."""
+
+_OF_ONE_VEHICLE = frozenset(("vehicle", "link", "transfers", "held", "connection", "cache"))
+"""Keys that the status of a mount of one vehicle has; a mount of another version may not tell them."""
+
+
+# -- asking ---------------------------------------------------------------------------------------
+
+
+def all_statuses() -> list[Status]:
+    """Return the status of each mount that this user may see, the dead ones too, by mountpoint."""
+    found = {status["mountpoint"]: status for status in _of_mounts(PATIENCE)}
+    known = {control.socket_name(path) for path in found}
+    for socket in control.all_sockets():
+        if socket.name not in known:
+            # The kernel does not show it any more, but it still delivers; or it is in another mount
+            # namespace.
+            with suppress(ControlError):  # only the mount itself could say which one it is
+                status = _ask(socket, PATIENCE)
+                found.setdefault(status["mountpoint"], status)
+    return [found[path] for path in sorted(found)]
+
+
+def _of_mounts(patience: float) -> Iterator[Status]:
+    """Yield the status of each mount in the kernel's table that this user may see."""
+    for path, mount in mounts().items():
+        if mount.type == OUR_TYPE and mount.root == "/":  # else it is a part of another one
+            with suppress(NobodyThere):
+                yield _status_of(path, mount, patience)
+
+
+def status_of(mountpoint: str, patience: float = PATIENCE) -> Status:
+    """Return the status of one mount; if it does not tell it, `state` (dead, mute) and `problem` in words.
+
+    Raises:
+        NobodyThere: no vehicle is mounted there, or this user may not ask.
+    """
+    mount = mounts().get(mountpoint)
+    if mount is not None and mount.type == OUR_TYPE:
+        return _status_of(mountpoint, mount, patience)
+    try:
+        return _ask(control.find_socket(mountpoint), patience)
+    except NobodyThere:  # it may have left its socket
+        raise _nobody(mountpoint) from None
+
+
+def socket_of(mountpoint: str) -> Path:
+    """Return the control socket of a mount, which may not answer any more.
+
+    Raises:
+        NobodyThere: there is none, or this user may not know it.
+    """
+    mount = mounts().get(mountpoint)
+    if mount is None or mount.type != OUR_TYPE:
+        return control.find_socket(mountpoint)
+    answer = _questions.ask(mountpoint, mount, PATIENCE)
+    told = json.loads(answer) if isinstance(answer, bytes) else {}
+    return _socket(told, mountpoint, mount)
+
+
+def _socket(told: Facts, mountpoint: str, mount: Mounted) -> Path:
+    """Return a mount's socket: the one that its attribute names, or the one with its mountpoint's name.
+
+    Raises:
+        NobodyThere: there is none.
+    """
+    if told.get("socket"):
+        return Path(told["socket"])
+    for path in dict.fromkeys((mountpoint, *mount.others)):
+        with suppress(NobodyThere):
+            return control.find_socket(path, mount.uid)
+    raise _nobody(mountpoint)
+
+
+def _status_of(path: str, mount: Mounted, patience: float) -> Status:
+    """Return what a mount says. Raises: as status_of."""
+    answer = _questions.ask(path, mount, patience)
+    told: Facts = {"mountpoint": path, "source": mount.source}
+    if isinstance(answer, bytes):
+        told = json.loads(answer)
+    elif answer == errno.ENOTCONN:
+        return _unasked(told, "dead", f"DEAD: its program is gone; run: mavftpfs umount {path}")
+    elif answer not in (errno.EACCES, errno.EPERM):
+        return _unasked(told, "mute", f"its program does not answer: {os.strerror(answer)}")
+    try:
+        status = _ask(_socket(told, path, mount), patience)
+    except Refused as exc:
+        if not isinstance(answer, bytes):
+            raise _nobody(path) from None
+        return _unasked(told, "foreign", str(exc))
+    except NobodyThere:
+        if "link" in told:  # a mount of version 0.2 tells everything by its attribute
+            return told
+        if not isinstance(answer, bytes):  # this user may not know it
+            raise _nobody(path) from None
+        return _unasked(told, "mute", f"its socket {told.get('socket')} cannot be reached from here")
+    except ControlError as exc:
+        return _unasked(told, "mute", f"its program does not answer: {exc}")
+    if told.get("id") not in (None, status.get("id")):  # the same place in another mount namespace
+        return _unasked(told, "mute", "its socket cannot be reached from here")
+    return status
+
+
+def _nobody(mountpoint: str) -> NobodyThere:
+    return NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
+
+
+def _unasked(told: Facts, state: str, problem: str) -> Status:
+    return {**told, "state": state, "problem": problem}
+
+
+def _ask(socket: Path, patience: float) -> Status:
+    """Return what a mount says at its control socket, with all keys on which others rely."""
+    status: Status = control.ask(socket, {"command": "status"}, timeout=patience)["status"]
+    if "members" in status or status.keys() >= _OF_ONE_VEHICLE:
+        return status
+    theirs = status.get("version", "unknown")
+    problem = f"its program is of version {theirs}, this one of {__version__}: unmount it, and mount it again"
+    return _unasked(status, "mute", problem)
+
+
+class _Questions:
+    """Reads the attribute of mounts, each in a thread, because a mount that was stopped never answers. It
+    keeps one thread, however often it is asked."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[str, Future[bytes | int]] = {}
+
+    def ask(self, path: str, mount: Mounted, patience: float) -> bytes | int:
+        """Return the attribute, or the errno; ETIMEDOUT after so many seconds."""
+        with self._lock:
+            answer = self._open.get(mount.number)
+            if answer is None:
+                answer = Future()
+                threading.Thread(target=self._read, args=(path, mount, answer), daemon=True).start()
+                self._open[mount.number] = answer
+        try:
+            return answer.result(patience)
+        except TimeoutError:
+            return errno.ETIMEDOUT
+
+    def _read(self, path: str, mount: Mounted, answer: Future[bytes | int]) -> None:
+        found: bytes | int
+        try:
+            found = os.getxattr(path, XATTR_STATUS)
+        except OSError as exc:
+            found = exc.errno or errno.EIO
+        with self._lock:
+            del self._open[mount.number]
+        answer.set_result(found)
+
+
+_questions = _Questions()
+
+
+def require_usable(status: Status, mountpoint: str) -> None:
+    """Check that a mount that was asked answers, and speaks this program's version of the protocol.
+
+    Raises:
+        LinkClosed: it does not; the text says why, or which side is to be upgraded.
+    """
+    if status.get("problem"):
+        raise LinkClosed(f"the mount on {mountpoint}: {status['problem']}")
+    theirs = 0 if "members" in status else status.get("protocol", 0)
+    if "members" in status or theirs == wire.VERSION:
+        return
+    version = status.get("version", "unknown")
+    what = f"the mount on {mountpoint} is of mavftpfs {version}, this program of {__version__}"
+    if theirs < wire.VERSION:
+        raise LinkClosed(f"{what}; unmount it, and mount it again: mavftpfs umount {mountpoint}")
+    raise LinkClosed(f"{what}; upgrade this program")
+
+
+# -- mounts of all vehicles -----------------------------------------------------------------------
+
+
+def several_at(place: str) -> Status | None:
+    """Return the status of the mount of all vehicles below a directory; None if there is none."""
+    try:
+        status = _ask(control.find_socket(place), PATIENCE)
+    except ControlError:
+        return None
+    return status if "members" in status else None
+
+
+def several_above(path: str) -> str | None:
+    """Return the directory at or above a path below which all vehicles are mounted; None if there is none."""
+    while path != "/":
+        if several_at(path) is not None:
+            return path
+        path = os.path.dirname(path)
+    return None
+
+
+def vehicle_below(status: Status, subtree: bytes, options: Options) -> str:
+    """Return the mountpoint of the vehicle that the options ask for, below a mount of several vehicles.
+
+    Raises:
+        UsageError: the options do not say which one. NotFound: `subtree` names one that is not there.
+        LinkClosed: it is not mounted now.
+    """
+    place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
+    first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
+    wanted = str(options.target_system)
+    if first.isdigit():
+        raise NotFound(f"no vehicle is mounted on {place}/{first}")
+    if not options.target_system and len(names) == 1:
+        (wanted,) = names
+    elif not options.target_system:
+        shown = ", ".join(names) or "none yet"
+        raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
+    if wanted not in names:
+        raise LinkClosed(f"no vehicle {wanted} is mounted below {place}")
+    if names[wanted]["state"] != "mounted":
+        why = names[wanted]["problem"] or names[wanted]["state"]
+        raise LinkClosed(f"vehicle {wanted} is not mounted below {place}: {why}")
+    return os.path.join(place, wanted)
+
+
+def statuses_at(place: str) -> list[Status]:
+    """Return the statuses that belong to a mountpoint, or to the directory of a mount of all vehicles.
+
+    The first one is dead if the process that started the vehicles' mounts is gone.
+
+    Raises:
+        NobodyThere: no vehicle is mounted there, or this user may not ask.
+    """
+    try:
+        return with_vehicles(status_of(place))
+    except NobodyThere:
+        vehicles = [status_of(path) for path in vehicles_below(place)]
+        if not vehicles:
+            raise
+        told = {"mountpoint": place, "source": vehicles[0]["source"]}
+        problem = f"DEAD: no more vehicles are mounted; run: mavftpfs umount {place}"
+        return [{**_unasked(told, "dead", problem), "vehicles": vehicles}, *vehicles]
+
+
+def with_vehicles(status: Status) -> list[Status]:
+    """Return the statuses that belong to one mountpoint: its own, and those of its vehicles if it has
+    several, which are also under `vehicles` of the first."""
+    if "members" not in status:
+        return [status]
+    vehicles: list[Status] = []
+    for path in vehicles_below(status["mountpoint"]):
+        with suppress(NobodyThere):
+            vehicles.append(status_of(path))
+    return [{**status, "vehicles": vehicles}, *vehicles]
+
+
+# -- which mount has a link -------------------------------------------------------------------------
+
+
+def network_namespace() -> str:
+    """Return what tells this process's network namespace from others that exist now."""
+    facts = os.stat("/proc/self/ns/net")
+    return f"{facts.st_dev}:{facts.st_ino}"
+
+
+def has_link(status: Status, spec: LinkSpec) -> bool:
+    """Return whether the mount with this status has that link. A port belongs to a network namespace."""
+    with suppress(MavftpfsError, KeyError):  # it cannot be asked, or is of an older version
+        return status["network_namespace"] == network_namespace() and same_link(
+            parse_source(status["source"]), spec
+        )
+    return False
+
+
+def mounts_on(spec: LinkSpec) -> list[Status]:
+    """Return the status of each mount of one vehicle that has a link, of other users' what they tell."""
+    return [status for status in _of_mounts(STATUS_PATIENCE) if has_link(status, spec)]
+
+
+def holder_of(spec: LinkSpec) -> Status | None:
+    """Return the status of the mount that has a link, also of another user's; None if there is none."""
+    return next((status for status in all_statuses() if has_link(status, spec)), None)
+
+
+def also_mounted(spec: LinkSpec, vehicle: Facts) -> str:
+    """Return a line about the mounts of a vehicle on a link, or "". vehicle: the facts of its status."""
+
+    def is_same(status: Status) -> bool:
+        same = all(status["vehicle"][key] == vehicle[key] for key in ("system", "component"))
+        return same and has_link(status, spec)
+
+    known = [status for status in all_statuses() if not status.get("problem") and "vehicle" in status]
+    places = [status["mountpoint"] for status in known if is_same(status)]
+    if not places:
+        return ""
+    return (
+        f"this vehicle is mounted on {' and '.join(places)}, too; a change through one mount may show in the "
+        f"other one 20 s later; to have only one, run: mavftpfs umount {places[0]}"
+    )
+
+
+def is_wanted(status: Status, options: Options) -> bool:
+    """Return whether a mount is of the vehicle that the options ask for, and that vehicle still answers
+    there."""
+    vehicle, component = status["vehicle"], options.target_component
+    autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
+    return (
+        options.target_system in (0, vehicle["system"])
+        and (component == vehicle["component"] or (component == 0 and autopilot))
+        and status["link"]["state"] != "replaced"
+    )
+
+
+def mountpoint_of(source: str) -> tuple[str, bytes] | None:
+    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None.
+
+    The directory of a mount of all vehicles counts as a mountpoint.
+    """
+    place, _, subtree = source.partition("#")
+    if not place or (":" in place and not place.startswith("/")):
+        return None
+    found = enclosing_mount(place) or _below_several(place)
+    if found is None:
+        return None
+    mountpoint, below = found
+    return mountpoint, normalise(os.fsencode(f"{below}/{subtree}"))
+
+
+def _below_several(place: str) -> tuple[str, str] | None:
+    """Return (directory, path below it) if a path leads into the directory of a mount of all vehicles."""
+    path = canonical(place)
+    above = several_above(path)
+    return None if above is None else (above, path[len(above) :])

@@ -1,0 +1,228 @@
+"""The mount's side of the control socket (client.control has the commands' side). Layer: mount.
+
+Each client sends one line and gets one line, and that ends it; a line that asks for `files` is followed by
+the messages of client.wire, which mount.fileserver answers. The mount needs file descriptors for itself. So
+only MAX_CLIENTS clients are taken at once, and one that asks nothing is ended. Those that use files do not
+count as such, so `status` and `umount` are answered however many there are."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import socket
+import struct
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import trio
+
+from mavftpfs.client.control import MAX_LINE, ControlError, Reply, usable_directory
+from mavftpfs.mount.fileserver import FileServer
+from mavftpfs.shared.errors import MavftpfsError
+
+log = logging.getLogger("mavftpfs.control")
+
+Command = Callable[[Reply], Awaitable[Reply]]
+
+ASKING_PATIENCE = 2.0
+"""Seconds for a client to send its line: a command of ours asks right after it has connected."""
+REPLY_PATIENCE = 10.0
+"""Seconds for us to hand it the reply."""
+QUEUE = 128
+"""Clients that wait in the kernel until they are taken."""
+MAX_CLIENTS = 8
+"""Clients that are taken at once for a line; others wait in the kernel's queue."""
+LOOK_PERIOD = 2.0
+"""Seconds between two looks whether the socket is still in its place."""
+_NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
+_PAUSE = 0.1
+"""Seconds until a connection is taken after there was no descriptor for it."""
+_CREDENTIALS = struct.Struct("3i")
+
+
+class ControlServer:
+    """Answers requests at a socket path: one `command` after its name, and those for files.
+
+    Attributes: path: where the socket is; it gets another place if its directory is removed, as systemd does
+    at logout.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        commands: Mapping[str, Command],
+        *,
+        files: FileServer | None = None,
+        refusal: Callable[[int], str] = lambda uid: "",
+        mode: int = 0o600,
+    ) -> None:
+        """refusal: returns why a user (by number) is not served, or "". mode: of the socket. A command finds
+        the number of the user that asks in its request, as `uid`."""
+        self.path = path
+        self.files = files
+        self._commands = commands
+        self._refusal = refusal
+        self._mode = mode
+        self._listener: trio.SocketListener | None = None
+        self._ours = 0
+        self._accepting = trio.CancelScope()
+        self._room = trio.Semaphore(MAX_CLIENTS)
+        self._is_short = False
+        self.closed = trio.Event()
+
+    async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
+        """Serve until `close`, then until the clients at work have their replies.
+
+        Raises:
+            OSError: the socket cannot be bound.
+        """
+        self._bind()
+        try:
+            async with trio.open_nursery() as clients:
+                task_status.started()
+                with self._accepting:
+                    async with trio.open_nursery() as tasks:
+                        tasks.start_soon(self._accept, clients)
+                        tasks.start_soon(self._stay_reachable)
+                self._stop_listening()
+        finally:
+            if self._is_in_place():  # while we delivered, the next mount may have put its socket there
+                self.path.unlink(missing_ok=True)
+            self.closed.set()
+
+    def close(self) -> None:
+        """Take no more clients."""
+        self._accepting.cancel()
+
+    def _bind(self) -> None:
+        self._listener = _bind(self.path, self._mode)
+        self._ours = self.path.lstat().st_ino
+
+    def _stop_listening(self) -> None:
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.socket.close()
+
+    def _is_in_place(self) -> bool:
+        with suppress(OSError):
+            return self.path.lstat().st_ino == self._ours
+        return False
+
+    async def _stay_reachable(self) -> None:
+        while True:
+            self.be_reachable()
+            await trio.sleep(LOOK_PERIOD)
+
+    def be_reachable(self) -> None:
+        """Bind again, perhaps elsewhere, if the socket was removed."""
+        old = self._listener
+        if old is None or self._is_in_place():
+            return
+        try:
+            self.path = usable_directory(self.path.parent) / self.path.name
+            self._bind()
+        except (OSError, ControlError) as error:
+            log.debug("the control socket was removed, and has no other place: %s", error)
+            return
+        log.info("the control socket was removed, and is now %s", self.path)
+        old.socket.close()
+
+    async def _accept(self, nursery: trio.Nursery) -> None:
+        """Take clients until cancelled, as many as there is room for."""
+        while True:
+            await self._room.acquire()
+            nursery.start_soon(self._serve_client, await self._next())
+
+    async def _next(self) -> trio.SocketStream:
+        """Return the next connection. The log says once in a mount that there was no descriptor for one."""
+        while True:
+            try:
+                assert self._listener is not None
+                return await self._listener.accept()
+            except trio.ClosedResourceError:
+                await trio.lowlevel.checkpoint()  # there is another listener now
+            except OSError as error:
+                if error.errno not in _NO_DESCRIPTORS:
+                    raise
+                if not self._is_short:
+                    self._is_short = True
+                    log.warning("no descriptor is left for a command (%s)", os.strerror(error.errno))
+                await trio.sleep(_PAUSE)
+
+    async def _serve_client(self, stream: trio.SocketStream) -> None:
+        try:
+            with suppress(trio.BrokenResourceError, trio.ClosedResourceError):  # it may go away at any time
+                try:
+                    wants_files, process = await self._serve_line(stream)
+                finally:
+                    self._room.release()
+                if wants_files and self.files is not None:
+                    await self.files.serve(stream, process)
+        finally:
+            await trio.aclose_forcefully(stream)
+
+    async def _serve_line(self, stream: trio.SocketStream) -> tuple[bool, int]:
+        """Answer a client's line. Return whether it is to be served files, and its process."""
+        process, uid, _ = _CREDENTIALS.unpack(
+            stream.socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        )
+        line = b""
+        with trio.move_on_after(ASKING_PATIENCE):
+            line = await _receive_line(stream)
+        reply, wants_files = await self._answer(line, uid)
+        with trio.move_on_after(REPLY_PATIENCE):
+            await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
+        return wants_files, process
+
+    async def _answer(self, line: bytes, uid: int) -> tuple[Reply, bool]:
+        """Return the reply to a line, and whether files are asked for and granted."""
+        try:
+            request = json.loads(line)
+            name = request["command"]
+            command = self._commands[name]
+        except (ValueError, KeyError, TypeError, RecursionError):  # the last for a line of many brackets
+            return failure("not a command of this mount"), False
+        refused = self._refusal(uid)
+        if refused:
+            return failure(refused), False
+        try:
+            return {"ok": True, **await command({**request, "uid": uid})}, name == "files"
+        except MavftpfsError as exc:
+            return failure(str(exc)), False
+        except Exception as exc:
+            log.exception("bug in a control command")
+            return failure(f"internal error: {exc!r}"), False
+
+
+def _bind(path: Path, mode: int) -> trio.SocketListener:
+    """Bind and listen; the socket is never visible with wider permissions than `mode`."""
+    path.unlink(missing_ok=True)  # of a mount that was killed; a living one was refused before
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    mask = os.umask(0o777 & ~mode)
+    try:
+        listener.bind(str(path))
+        listener.listen(QUEUE)
+    except OSError:
+        listener.close()
+        raise
+    finally:
+        os.umask(mask)
+    return trio.SocketListener(trio.socket.from_stdlib_socket(listener))
+
+
+def failure(reason: str) -> Reply:
+    """Return the reply of a command that did not work."""
+    return {"ok": False, "error": reason}
+
+
+async def _receive_line(stream: trio.SocketStream) -> bytes:
+    line = b""
+    while b"\n" not in line and len(line) < MAX_LINE:
+        data = await stream.receive_some(4096)
+        if not data:
+            break
+        line += data
+    return line.partition(b"\n")[0]
