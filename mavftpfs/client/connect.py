@@ -188,7 +188,7 @@ async def attached(
 ) -> AsyncIterator[Attached]:
     """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
 
-    list_root: False if the body asks for something at once itself.
+    list_root: False if the body asks for something at once itself, as a command that waits for other clients.
     writing: the tree may be changed, if the options do not forbid it. Its held bytes then lie in a spool that
     survives the process. rescue_for: `Attached.notice` moves what earlier mounts left there to a recovery
     directory named after this SOURCE. It is called when its line can be shown to a person. Without rescue_for
@@ -199,7 +199,7 @@ async def attached(
         UsageError: the remote root is not a directory.
     """
     deadline = trio.current_time() + options.connect_timeout
-    settings = connect_options(options)
+    settings = replace(connect_options(options), patient=not list_root)
     async with (
         opened(spec, options) as link,
         connected(link, settings, on_payload=sinks.payload, on_frame=sinks.frame) as connection,

@@ -81,9 +81,13 @@ class ConnectOptions(Options):
     """The options, and the key that is in the file of `signing_key`.
 
     With `bwlimit` nothing is read by bursts, whose pace is the server's.
+
+    patient: wait for another client as long as it is heard and has a file open, as a command does that a
+        person may interrupt; otherwise SessionBusy after `op_deadline`.
     """
 
     key: bytes | None = None
+    patient: bool = False
 
 
 class Connection:
@@ -146,6 +150,7 @@ class Connection:
             clock=clock,
             rng=rng,
             op_deadline=options.op_deadline,
+            patient=options.patient,
             read_mode=options.read_mode if options.bwlimit is None else "window",
             chunk=options.chunk,
         )

@@ -231,6 +231,7 @@ class Scheduler:
     """Serialises all use of the server session.
 
     op_deadline: seconds in which a user gets the session, or is told that it is not to be had.
+    patient: see ConnectOptions.
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
@@ -246,12 +247,13 @@ class Scheduler:
         clock: Callable[[], float],
         rng: random.Random,
         op_deadline: float = 30.0,
+        patient: bool = False,
         read_mode: ReadMode = "window",
         chunk: int | None = None,
     ) -> None:
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
-        self.server = ServerSession(driver, clock, rng, op_deadline)
+        self.server = ServerSession(driver, clock, rng, op_deadline, patient=patient)
         self.server.on_reads_distrusted = self._on_reads_distrusted
         self.clock = clock
         self.users: dict[SessionUser, None] = {}

@@ -110,6 +110,7 @@ class ServerSession:
     """Opens and closes files, and knows what is open.
 
     op_deadline: seconds to wait for a Terminate of whose failure a caller is told.
+    patient: see ConnectOptions.
 
     Attributes:
         session: what is open; None if nothing is, or if it is not believed any more. transfer: what reads or
@@ -131,12 +132,15 @@ class ServerSession:
         clock: Callable[[], float],
         rng: random.Random,
         op_deadline: float = 30.0,
+        *,
+        patient: bool = False,
     ) -> None:
         self.driver = driver
         self.engine = driver.engine
         self.vehicle = driver.vehicle
         self.clock = clock
         self.op_deadline = op_deadline
+        self.patient = patient
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: set[tuple[int, bytes]] = set()
@@ -338,13 +342,12 @@ class ServerSession:
             self.maybe_open.clear()
         if not taken:
             raise nak
-        if self.clock() >= self.busy_at(tried.began):
-            raise SessionBusy(_IN_USE) from nak
         if nak.code == NakCode.FILE_EXISTS and not tried.listed:
             tried.listed = True
             await self._try(ListDirectory(b"/", False))
             return
-        if ours and await self._close_maybe_open():
+        in_time = self.clock() - tried.began < self.op_deadline
+        if ours and in_time and await self._close_maybe_open():
             tried.closed = True
             return
         if nak.code == NakCode.FAIL:
@@ -362,7 +365,7 @@ class ServerSession:
     def busy_at(self, since: float) -> float:
         """Return when a caller that waits for other clients since then is told that the session is busy: they
         closed no file for `op_deadline`."""
-        return max(since, self.others.closed_at) + self.op_deadline
+        return inf if self.patient else max(since, self.others.closed_at) + self.op_deadline
 
     async def wait_for_others(self, since: float) -> None:
         """Wait until no other client has a file open.

@@ -112,6 +112,9 @@ class Store:
         self._vehicle = scheduler.server.vehicle
         self._clock = scheduler.clock
         self._op_deadline = scheduler.server.op_deadline
+        self._longest_change = (
+            inf if scheduler.server.patient else self._op_deadline + MOST_REST + VERIFY_LIMIT
+        )
         self._sent = 0
         self._under_way = 0
         self._late_copies = scheduler.server.late_copies
@@ -381,7 +384,7 @@ class Store:
             RequestTimeout: the body did not begin in time.
         """
         self._vehicle.require(self._clock(), writing=not in_flight)
-        until = trio.current_time() + self._op_deadline + MOST_REST + VERIFY_LIMIT
+        until = trio.current_time() + self._longest_change
         with trio.CancelScope(deadline=until) as scope:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:

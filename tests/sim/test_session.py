@@ -467,6 +467,18 @@ async def test_while_other_clients_close_their_files_nobody_is_told_that_the_ses
         assert trio.current_time() > DEFAULTS.op_deadline
 
 
+@pytest.mark.parametrize("profile", ONE_SESSION)
+async def test_a_command_waits_for_another_client_as_long_as_that_reads(profile: str) -> None:
+    here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    options = ConnectOptions(patient=True)
+    async with here.connected(options) as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(read_by_another, here, 90)
+        await trio.sleep(0.5)
+        await connection.store.list_directory(here.root + b"/d")
+        assert await read_file(connection, path(profile, "f")) == DATA
+        assert trio.current_time() > 90.0
+
+
 async def test_a_user_that_waits_for_another_client_keeps_nobody_from_its_path() -> None:
     """Its open was refused, so it gave its turn back."""
     here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
