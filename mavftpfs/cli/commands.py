@@ -239,12 +239,12 @@ class _Delivery:
 
     def _explain(self, pid: int) -> None:
         self._explained = True
-        from mavftpfs.client.leftovers import recovered_directory
+        from mavftpfs.client.undelivered import recovered_directory
         from mavftpfs.mount.farewell import DRAIN_LIMIT
 
         say(
-            "not everything is on the vehicle yet: it is delivered for at most "
-            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory()}"
+            f"uploading pending changes for up to {readable_time(DRAIN_LIMIT)}; files not uploaded by then "
+            f"are saved in {recovered_directory()}"
         )
         say(f"Ctrl-C ends only the waiting; to keep the rest now: kill {pid}")
 
@@ -265,7 +265,7 @@ def _with_what_is_left(line: str) -> str:
 
 def left_by_killed_mounts_line() -> str:
     """Return a line about what killed mounts held, or ""."""
-    from mavftpfs.client.leftovers import left_by_killed_mounts
+    from mavftpfs.client.undelivered import left_by_killed_mounts
 
     left = left_by_killed_mounts()
     if not left:

@@ -137,7 +137,7 @@ def _held_lines(status: Status) -> Iterator[str]:
 
 def _part_goes() -> str:
     """Return where the part of a file goes of which a write failed."""
-    from mavftpfs.client.leftovers import recovered_directory
+    from mavftpfs.client.undelivered import recovered_directory
 
     return f"umount moves the part that was written to {recovered_directory()}"
 

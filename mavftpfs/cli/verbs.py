@@ -28,13 +28,18 @@ from mavftpfs.client import download, logs, names, upload
 from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
-from mavftpfs.client.leftovers import recovered_directory, recovery_directory
 from mavftpfs.client.progress import Progress, noting_losses
 from mavftpfs.client.recover import put_back
-from mavftpfs.client.recovered import Recovered, chosen, recovered_below
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
+from mavftpfs.client.undelivered import (
+    Recovered,
+    chosen,
+    recovered_below,
+    recovered_directory,
+    recovery_directory,
+)
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import (

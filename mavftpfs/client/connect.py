@@ -20,10 +20,10 @@ import trio
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.leftovers import rescue, spool_for
 from mavftpfs.client.mounts import holder_of
 from mavftpfs.client.status import snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
+from mavftpfs.client.undelivered import rescue, spool_for
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
 from mavftpfs.link.hublink import Wish

@@ -15,7 +15,7 @@ from mavftpfs.client.compare import Match, compare
 from mavftpfs.client.connect import VERSION_PATIENCE
 from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.recovered import Recovered, recovered_in
+from mavftpfs.client.undelivered import Recovered, recovered_in
 from mavftpfs.client.upload import put_file
 from mavftpfs.shared.errors import (
     NotDelivered,

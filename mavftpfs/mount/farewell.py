@@ -9,7 +9,7 @@ from pathlib import Path
 import trio
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.leftovers import recovery_directory, what_to_do
+from mavftpfs.client.undelivered import recovery_directory, what_to_do
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.readable import count_files
 

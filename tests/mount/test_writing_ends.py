@@ -233,7 +233,7 @@ def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: 
     wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
     with mount.started(*MAVFTPFS, "umount", mount.path) as second:
         assert second.stderr is not None
-        assert "not everything is on the vehicle yet" in second.stderr.readline()
+        assert "uploading pending changes" in second.stderr.readline()
         vehicle.resume()
         assert second.wait(60) == 0
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
@@ -293,8 +293,8 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
         assert child.stderr is not None
         first, second, third = (child.stderr.readline() for _ in range(3))
         assert first == (
-            "mavftpfs: not everything is on the vehicle yet: it is delivered for at most 5 min, "
-            f"then the rest is kept in {state}\n"
+            "mavftpfs: uploading pending changes for up to 5 min; files not uploaded by then "
+            f"are saved in {state}\n"
         )
         assert second == (
             f"mavftpfs: Ctrl-C ends only the waiting; to keep the rest now: kill {process.popen.pid}\n"

@@ -12,7 +12,7 @@ import pytest
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client import leftovers
+from mavftpfs.client import undelivered
 from mavftpfs.link.messages import Address
 from mavftpfs.mount import farewell
 from tests.ops.faketree import FakeTree
@@ -66,14 +66,14 @@ async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
 
 @pytest.mark.holds("promise 3")
 def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
-    with leftovers.spool_for(Address(1, 2)) as one, leftovers.spool_for(Address(1, 2)) as two:
+    with undelivered.spool_for(Address(1, 2)) as one, undelivered.spool_for(Address(1, 2)) as two:
         assert one is not None
         assert two is not None
         assert one.path != two.path
         assert one.path.parent == two.path.parent == state / "mavftpfs" / "spool" / "1-2"
         for path in (one.path, one.path.parent, one.path.parent.parent, state / "mavftpfs"):
             assert stat.S_IMODE(path.stat().st_mode) == 0o700
-    with leftovers.spool_for(None) as unknown:
+    with undelivered.spool_for(None) as unknown:
         assert unknown is not None
         assert unknown.path.parent.name == "unknown"
 
@@ -84,10 +84,10 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     (dead.path / "000001.json").write_text('{"path": "/f"}')
     dead.close()
     spool = SpoolDirectory(state / "base")
-    assert leftovers.rescue(spool, "tcp:x:1").startswith(
+    assert undelivered.rescue(spool, "tcp:x:1").startswith(
         "1 file of an earlier mount did not reach the vehicle; it is in "
     )
-    assert leftovers.rescue(spool, "tcp:x:1") == ""
+    assert undelivered.rescue(spool, "tcp:x:1") == ""
     spool.close()
 
 
@@ -104,7 +104,7 @@ def test_a_part_is_listed_because_recover_does_not_put_it_back(state: Path, fact
     (dead.path / "000001.json").write_text(facts)
     dead.close()
     spool = SpoolDirectory(state / "base")
-    assert f"; {told}" in leftovers.rescue(spool, "tcp:x:1")
+    assert f"; {told}" in undelivered.rescue(spool, "tcp:x:1")
     spool.close()
 
 
@@ -114,5 +114,5 @@ def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPat
 
     spool = SpoolDirectory(state / "base")
     monkeypatch.setattr(SpoolDirectory, "rescue", fail)
-    assert "the disk is full" in leftovers.rescue(spool, "x")
+    assert "the disk is full" in undelivered.rescue(spool, "x")
     spool.close()

@@ -1,21 +1,54 @@
-"""The files below `recovered`, which did not reach a vehicle. Layer: client; prints nothing.
+"""Files that did not reach a vehicle: where they lie on this computer, and their descriptions. Layer: client.
 
-A mount that ends with undelivered files moves them there, with a `NAME.json` beside each file
-(cache.recovery). The next mount moves there what a killed mount held.
+A mount keeps undelivered bytes in a spool. When it ends it moves them to a recovery directory, with a
+`NAME.json` beside each file (cache.recovery). After a kill the next mount of the vehicle does that.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import re
+import shlex
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mavftpfs.cache.recovery import SpoolDirectory, left_in
+from mavftpfs.link.messages import Address
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import normalise
+from mavftpfs.shared.readable import count_files
+
+log = logging.getLogger("mavftpfs.mount")
+
+
+# -- directories ----------------------------------------------------------------------------------
+
+
+def state_directory() -> Path:
+    """Return where this user's mounts keep files that must survive them (XDG base directories)."""
+    given = os.environ.get("XDG_STATE_HOME", "")
+    base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
+    return base / "mavftpfs"
+
+
+def recovered_directory() -> Path:
+    """Return where all mounts of this user leave files that did not reach a vehicle."""
+    return state_directory() / "recovered"
+
+
+def recovery_directory(source: str) -> Path:
+    """Return a new name for what one mount leaves behind now."""
+    what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
+    return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
+
+
+# -- recovered files -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,3 +165,68 @@ def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
             raise UsageError(f"{name} is not a recovered file; list them with: mavftpfs recover")
         found += [copy for copy in recovered_in(path.parent) if copy.file.name == path.name]
     return found
+
+
+def what_to_do(source: str, directory: Path) -> str:
+    """Return the command for people that have a recovery directory: `recover` refuses parts."""
+    found = recovered_in(directory)
+    them = "it" if len(found) == 1 else "them"
+    if all(copy.hindrance for copy in found):
+        return f"list {them} by: mavftpfs recover"
+    return f"put {them} back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
+
+
+# -- spools ---------------------------------------------------------------------------------------
+
+
+def spool_base(vehicle: Address | None) -> Path:
+    """Return where the mounts of one vehicle have their spools: by its address, whatever the link."""
+    name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
+    return state_directory() / "spool" / name
+
+
+def left_by_killed_mounts() -> list[Path]:
+    """Return the undelivered files that killed mounts of this user left. The next mount of each vehicle
+    offers them."""
+    try:
+        slots = sorted((state_directory() / "spool").glob("*/slot*"))
+    except OSError:  # another user's, in whose environment this program runs
+        return []
+    return [data for slot in slots for data in left_in(slot)]
+
+
+@contextmanager
+def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
+    """Claim a spool directory for the length of the body; None if this user can have none."""
+    base = spool_base(vehicle)
+    try:
+        spool = SpoolDirectory(base)
+    except OSError as exc:
+        log.warning("what waits for the vehicle will not survive this process: %s: %s", base, exc)
+        yield None
+        return
+    try:
+        yield spool
+    finally:
+        spool.close()
+
+
+def rescue(spool: SpoolDirectory, source: str) -> str:
+    """Move the files that a killed mount of this vehicle, or of another one with its system id, left to a
+    recovery directory; return a line on them, or ""."""
+    directory = recovery_directory(source)
+    try:
+        found = spool.rescue(directory)
+    except OSError as exc:
+        message = (
+            f"an earlier mount left files that did not reach their vehicle in {spool.path.parent}: {exc}"
+        )
+    else:
+        if not found:
+            return ""
+        place = f"it is in {directory}" if len(found) == 1 else f"they are in {directory}"
+        message = (
+            f"{count_files(len(found))} of an earlier mount did not reach the vehicle; {place}; "
+            + what_to_do(source, directory)
+        )
+    return message
