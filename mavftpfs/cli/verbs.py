@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import trio
 
-from mavftpfs.cli import watching
+from mavftpfs.cli import listing, watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line, say
 from mavftpfs.cli.drawing import shown
 from mavftpfs.client import download, logs, names, upload
@@ -526,12 +526,7 @@ def ls(args: Args) -> int:
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
         return ExitCode.OK
-    terminal = sys.stdout.isatty()
-    colours = terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-    look = names.Look(args.detailed, args.units, terminal, colours)
-    for line in names.lines(listings, look):
-        sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
-    sys.stdout.flush()
+    listing.show(listings, detailed=args.detailed, units=args.units)
     return ExitCode.OK
 
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.client.fetch import known_time
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, reading, walk, written
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared import readonly
@@ -27,7 +24,7 @@ from mavftpfs.shared.errors import (
     UsageError,
 )
 from mavftpfs.shared.model import ROOT, EntryKind, is_virtual, join, normalise, split
-from mavftpfs.shared.readable import name_text, printable, readable_size
+from mavftpfs.shared.readable import name_text
 
 
 def parse_paths(texts: Sequence[str]) -> tuple[list[bytes], int | None]:
@@ -131,22 +128,6 @@ Entry = dict[str, Any]
 Listing = tuple[str | None, list[Entry]]
 """A directory's name and what it holds; None: the path is a file, the only entry."""
 
-_DIRECTORY_STYLE = "\x1b[1;34m"
-_LOG_STYLE = "\x1b[32m"
-_PLAIN = "\x1b[0m"
-_LOGS = (".ulg", ".bin", ".tlog", ".log")
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """How names are printed. detailed: with size and time; units: sizes as 1.2 MB; terminal: without
-    characters that a terminal would obey; colours: directories and logs stand out."""
-
-    detailed: bool = False
-    units: bool = False
-    terminal: bool = False
-    colours: bool = False
-
 
 async def list_paths(session: Session, paths: Sequence[bytes], *, recursive: bool = False) -> list[Listing]:
     """Return the entries of directories, and files themselves, as JSON-able facts."""
@@ -177,51 +158,6 @@ def _entry(path: bytes, name: bytes, found: Stat) -> Entry:
         "size": found.size,
         "mtime": found.mtime,
     }
-
-
-def lines(listings: Sequence[Listing], look: Look) -> Iterator[str]:
-    """Yield the lines of several paths as ls prints them: paths of files, then directories with headings."""
-    files = [entry for directory, entries in listings if directory is None for entry in entries]
-    yield from (_line(entry, look, entry["path"]) for entry in files)
-    apart = bool(files)
-    for directory, entries in listings:
-        if directory is None:
-            continue
-        if len(listings) > 1:
-            if apart:
-                yield ""
-            yield f"{_shown(directory, look)}:"
-        yield from (_line(entry, look, entry["name"]) for entry in entries)
-        apart = True
-
-
-def _line(entry: Entry, look: Look, called: str) -> str:
-    name = _shown(called, look)
-    if look.colours:
-        name = _coloured(name, entry)
-    if entry["kind"] == "directory":
-        name += "/"
-    if not look.detailed:
-        return name
-    size = readable_size(entry["size"]) if look.units else str(entry["size"])
-    return f"{size:>12} {when(entry['mtime'])} {name}"
-
-
-def when(mtime: int) -> str:
-    """Return a time in UTC, or a dash if it is not known."""
-    if known_time(mtime) is None:
-        return f"{'-':<16}"
-    return datetime.fromtimestamp(mtime, UTC).strftime("%Y-%m-%d %H:%M")
-
-
-def _coloured(name: str, entry: Entry) -> str:
-    if entry["kind"] == "directory":
-        return f"{_DIRECTORY_STYLE}{name}{_PLAIN}"
-    return f"{_LOG_STYLE}{name}{_PLAIN}" if name.lower().endswith(_LOGS) else name
-
-
-def _shown(name: str, look: Look) -> str:
-    return printable(name) if look.terminal else name
 
 
 async def checksum_paths(
