@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import pwd
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
@@ -21,6 +22,7 @@ from mavftpfs import __version__
 from mavftpfs.client import control, wire
 from mavftpfs.client.control import ControlError, NobodyThere, Refused
 from mavftpfs.client.mountpoint import (
+    MOUNT_TABLE,
     OUR_TYPE,
     XATTR_STATUS,
     Mounted,
@@ -331,11 +333,35 @@ def also_mounted(spec: LinkSpec, vehicle: Facts) -> str:
     known = [status for status in all_statuses() if not status.get("problem") and "vehicle" in status]
     places = [status["mountpoint"] for status in known if is_same(status)]
     if not places:
-        return ""
+        return by_others(spec)
     return (
         f"this vehicle is mounted on {' and '.join(places)}, too; a change through one mount may show in the "
         f"other one 20 s later; to have only one, run: mavftpfs umount {places[0]}"
     )
+
+
+def by_others(spec: LinkSpec, *, table: str = MOUNT_TABLE) -> str:
+    """Return a line about mounts of other users on a link, or "". This user may not ask them, so they may be
+    of another vehicle on the link."""
+    found = []
+    for place, mount in mounts(table).items():
+        if mount.type == OUR_TYPE and mount.uid not in (None, os.getuid()):
+            with suppress(UsageError):
+                if same_link(parse_source(mount.source), spec):
+                    found.append(f"{place} (user {_user(mount.uid)})")
+    if not found:
+        return ""
+    return (
+        f"this link is mounted on {' and '.join(sorted(found))}, too; if that is the same vehicle, a change "
+        "through one mount may show in the other one 20 s later"
+    )
+
+
+def _user(uid: int | None) -> str:
+    """Return the name of a user, or the number if there is none."""
+    with suppress(KeyError):
+        return pwd.getpwuid(uid or 0).pw_name
+    return str(uid)
 
 
 def is_wanted(status: Status, options: Options) -> bool:
