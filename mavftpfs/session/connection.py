@@ -239,7 +239,7 @@ class Connection:
         self._tell("armed" if armed else "disarmed")
 
     def _move_away(self) -> None:
-        """Somebody else uses our address: replies could not be told apart, so take the next component id."""
+        """Take the next component id: another program uses this one, and replies could not be told apart."""
         own = self.vehicle.own
         # More are more likely our own echo than neighbours.
         if own.component - OWN_COMPONENT <= 5:

@@ -1,12 +1,13 @@
 """Other FTP clients of the vehicle: may one have a file open there? Layer: session; pure.
 
-Servers with one session give it to the client that opens last, or refuse the second one. PX4 of September
-2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and ArduPilot that
-of a client that paused for 3 s. So nothing is opened while another client may have a file open: from its
-first request that uses a session, until its Terminate or Reset, or 10 s after its last request was heard.
-An open that is refused leaves things as they were: it is often a question (is this name free?), or came just
-before another client closed its file. When a client closed its file, each one that waits does so for a moment
-longer, by chance: then the first one's open is heard by the others.
+Servers with one session refuse the second client, or give the session to the client that opens last: PX4 of
+September 2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and
+ArduPilot ends that of a client that paused for 3 s. So this connection opens nothing while another client may
+have a file open: from that client's first request that uses a session, until its Terminate or Reset, or 10 s
+after the last request that was heard. A refused open changes nothing: clients ask so whether a name is free.
+
+After another client closed its file, this connection waits a moment longer, by chance. If several programs
+wait, the first one that opens a file is heard by the others.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
 
 
 class OtherClients:
-    """What was heard of them.
+    """Records what was heard of other clients.
 
     Attributes:
         session: the id that was used last, or closed; None while none was.
@@ -54,7 +55,7 @@ class OtherClients:
     def hear(self, payload: bytes, now: float) -> int | None:
         """Take a request of another client, or an answer to one; return the id of the session that it uses.
 
-        None: it uses none. Listings, checksums and changes of names do not: a ground station that shows
+        None for listings, checksums and changes of names, which use no session: a ground station that shows
         directories makes nobody's bytes doubtful.
         """
         opcode, answered = _opcode_of(payload)
@@ -101,13 +102,13 @@ class OtherClients:
 
 
 def took_session(payload: bytes) -> bool:
-    """Return whether what was heard shows that another client has the session that all share."""
+    """Return whether this payload shows that another client has the session that all share."""
     opcode, answered = _opcode_of(payload)
     return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
 
 
 def asks_to_open(payload: bytes) -> bool:
-    """Return whether this is a request that opens a file, of which only the answer tells what it did."""
+    """Return whether this is a request to open a file: only the answer tells what became of it."""
     return payload[_OPCODE] in OPENING
 
 

@@ -1,4 +1,4 @@
-"""A file that is read: what is wanted of it, and how it reads when it has the session. Layer: session."""
+"""Reads one file, turn by turn: which bytes are wanted, and how a turn fetches them. Layer: session."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class FileStream(SessionUser):
         self._sink.on_queued()
 
     def on_removed(self) -> None:
-        """The file lost its name: no more of it can be read, and nothing of the next file of that name."""
+        """Stop reading: the file lost its name, and the next file of that name is another one."""
         self._removed = True
         self._fail(FileChanged(f"{self.path!r} was removed or replaced"))
 
@@ -112,7 +112,7 @@ class FileStream(SessionUser):
             self._sink.on_suspect(reason)
 
     def _fail(self, error: MavftpfsError) -> None:
-        """What is wanted cannot be had now."""
+        """Raise an error in the reads that wait, and forget what they want."""
         self.drop()
         self._lost = 0  # the next read has as many turns
         self.waiting_since = None
@@ -206,7 +206,7 @@ class FileStream(SessionUser):
             raise transfer.error
 
     def _on_batch(self, now: float) -> None:
-        """A batch of replies was processed: pass data on, once."""
+        """Tell the sink, once for each batch of replies, how many bytes came."""
         transfer = self._transfer
         if transfer is None:
             return

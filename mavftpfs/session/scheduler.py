@@ -69,7 +69,7 @@ _OTHERS = "another client of the vehicle may have a file open, which is not ende
 
 
 class Future:
-    """The end of something that one task does and others wait for."""
+    """Lets tasks wait for the end of another task's work."""
 
     def __init__(self) -> None:
         self._event = trio.Event()
@@ -94,7 +94,7 @@ class Future:
 
 
 class SessionUser:
-    """A reader, an upload or a single request: what orders it among those that wait.
+    """A reader, an upload or a single request, with what orders it among those that wait.
 
     Attributes:
         path: of the file it uses.
@@ -424,10 +424,10 @@ class Scheduler:
         self.assert_no_turn()
         excluded, server = _Excluded(paths, below), self.server
         self._excluded.append(excluded)
+        server.wake()
         try:
             with trio.move_on_after(self._op_deadline) as scope:
                 while any(map(excluded.covers, self._used_paths())):
-                    server.wake()
                     await server.changed.park()
             if scope.cancelled_caught:
                 raise RequestTimeout("our own session on these paths could not be closed")
@@ -446,8 +446,11 @@ class Scheduler:
         return used
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
-        """A file or directory was renamed. Users of it, and of what lies in it, go on under the new path. A
-        file that had the new name cannot be read any more."""
+        """Note that a file or directory was renamed.
+
+        Users of it, and of what lies in it, go on under the new path. A file that had the new name cannot be
+        read any more.
+        """
         for user in list(self.users):  # a user may be closed by that
             if user.path == new:
                 user.on_removed()
@@ -455,7 +458,7 @@ class Scheduler:
                 user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
-        """The file of this name was removed or replaced: its readers get no more of it."""
+        """Note that the file of this name was removed or replaced: its readers get no more of it."""
         for user in list(self.users):  # a user may be closed by that
             if user.path == path:
                 user.on_removed()

@@ -74,7 +74,7 @@ Asked = TypeVar("Asked", bound=Operation)
 
 @dataclass(frozen=True, slots=True)
 class OpenSession:
-    """The server's session, open on a file.
+    """A file that the server has open for this connection.
 
     size: in bytes, as the open ACK said; None where it said nothing. opened_at: when that ACK came. writing:
     opened by OpenFileWO or CreateFile. seq: of that ACK. resent: its request was sent more than once.
@@ -91,10 +91,11 @@ class OpenSession:
 
 @dataclass
 class _Tried:
-    """What was tried so far, since `began`, against refusals of one request because the session is taken.
+    """Remedies that were tried, since `began`, while one request is refused because the session is taken.
 
-    opens: the request opens a file. resent: some try of it was sent more than once. closed: what an open of
-    ours may have left was closed. silences: in seconds, those that are left.
+    opens: the request opens a file. resent: the request was sent more than once. listed: a listing cleared
+    PX4's sticky errno. closed: a file that an open of ours may have left was closed. silences: those that are
+    left, in seconds. reset: ResetSessions was sent.
     """
 
     began: float

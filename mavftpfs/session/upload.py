@@ -90,7 +90,7 @@ class Upload(SessionUser):
     # --- the owner's side
 
     def wake(self) -> None:
-        """The source has more."""
+        """Note that the source has more."""
         self._changed.unpark_all()
         if self._transfer is not None:
             self._transfer.wake()
@@ -210,7 +210,7 @@ class Upload(SessionUser):
             self._on_failure(error)
 
     def _on_failure(self, error: MavftpfsError) -> None:
-        """The turn failed: what is not proven is sent again. A lost session is no failure, unless it is lost
+        """Send again what is not proven, because a turn failed. A lost session is an error only if it is lost
         again and again without getting further.
 
         Raises:
@@ -331,7 +331,7 @@ class Upload(SessionUser):
         return stop
 
     def _on_batch(self, now: float) -> None:
-        """A batch of replies was processed."""
+        """Wake the turn's task when a batch of replies left the transfer nothing to do."""
         transfer = self._transfer
         if transfer is not None and (transfer.idle or transfer.done):
             self._server.wake()

@@ -1,4 +1,4 @@
-"""What is known of the vehicle and of the others on the link. Layer: session; pure (told messages and `now`).
+"""The vehicle and its neighbours on the link, as their messages show them. Layer: session; pure.
 
 Everything here is learned by listening. Link health (promise 4) is heartbeats plus one fact from the
 session: that a request timed out since the last heartbeat.
@@ -107,7 +107,7 @@ class Identity:
         return self._known is None or self.heard_at is None or now - self.heard_at <= ABSENCE
 
     def heard(self, now: float) -> None:
-        """Something came from the vehicle's address."""
+        """Note that something came from the vehicle's address."""
         before, self.heard_at = self.heard_at, now
         if before is not None and now - before > ABSENCE:
             self.left_at, self._back_at = before, now
@@ -116,8 +116,8 @@ class Identity:
             self._doubted_from = now
 
     def reopened(self, now: float) -> None:
-        """The link was, or it answers from another network address: it may have been away for less than that,
-        or be another one."""
+        """Note that the link was reopened, or that the vehicle answers from another network address: it may
+        have been away, or be another vehicle."""
         if self.heard_at is not None:
             self.left_at, self._back_at = self.heard_at, now
         self.doubt()
@@ -132,14 +132,14 @@ class Identity:
         return self.heard_at is not None and self.heard_at > when
 
     def doubt(self) -> None:
-        """It may be another one since now: it restarted, or was silent."""
+        """Doubt that this is still the same vehicle, because it restarted or was silent."""
         if self._known is not None and self.standing is not Standing.DOUBTED:
             self._strange |= self.standing is Standing.STRANGER
             self.standing, self._doubted_from = Standing.DOUBTED, None
         self._on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
-        """It told its id; return whether that is the same as ever."""
+        """Take the id that the vehicle told; return whether it is the same as ever."""
         if self._known is not None and is_another(self._known, version):
             self._is_stranger()
             return False
@@ -182,7 +182,7 @@ def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
 
 @dataclass(slots=True)
 class Vehicle:
-    """The target and its neighbourhood.
+    """Records what the target and its neighbours on the link tell.
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
@@ -297,7 +297,7 @@ class Vehicle:
         return self._boot_ms is None or self.identity.away_since(self.boot_heard_at, now)
 
     def note_timeout(self) -> None:
-        """A request to the vehicle went unanswered to its deadline."""
+        """Note that a request to the vehicle went unanswered to its deadline."""
         self._timed_out = True
 
     def on_message(self, message: Message, now: float) -> None:
@@ -357,7 +357,8 @@ class Vehicle:
             self.on_heartbeat()
 
     def _on_trusted(self, was_stranger: bool) -> None:
-        """It is ours again. Whether it restarted while another one told its boot time is not known."""
+        """Trust the vehicle again. It counts as restarted if another one answered meanwhile, whose boot times
+        tell nothing."""
         if was_stranger:
             self._boot_ms = None
             self.reboots += 1

@@ -210,6 +210,26 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> N
         await connection.store.remove(b"/d/f")
 
 
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_two_changes_wait_for_the_same_open_file(profile: str) -> None:
+    """They once woke each other without an end."""
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        reader, _ = await begin_to_read(connection, path(profile, "f"), 1000)
+        began = trio.current_time()
+
+        async def change() -> None:
+            async with connection.scheduler.excluded(path(profile, "f")):
+                await trio.sleep(0.1)
+
+        with trio.fail_after(1.0):
+            async with trio.open_nursery() as changes:
+                for _ in range(2):
+                    changes.start_soon(change)
+        assert trio.current_time() > began
+        reader.close()
+
+
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
 async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(profile: str) -> None:
