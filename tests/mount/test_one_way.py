@@ -12,6 +12,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -128,6 +129,7 @@ def said(words: Sequence[str], places: dict[str, str]) -> tuple[int, str, str]:
     with contextlib.chdir(places["OUT"]), redirect_stdout(streams[0]), redirect_stderr(streams[1]):
         code = main.main(filled)
     texts = [stream.buffer.getvalue().decode(errors="replace") for stream in streams]
+    texts[1] = re.sub("mavftpfs: waiting for a heartbeat on .*\n", "", texts[1])
     texts = [re.sub(r"(?m)^( *\d+) (\S+ \d\d:\d\d|-) +", r"\1 ", text) for text in texts]
     for name in ("SRC", "OUT", "IN"):
         texts = [text.replace(places[name], name) for text in texts]
@@ -161,6 +163,59 @@ def test_every_command_says_the_same_with_and_without_a_mount(field: Field, prof
     assert trees[2] == trees[3]
     kernel = mounts[0].status()["kernel"]
     assert (kernel["inodes"], kernel["open_files"]) == (1, 0)  # no command went through it
+
+
+ON_A_BAD_LINK: list[list[str]] = [
+    *(["ls", "-R", "SRC", "/"], ["cat", "SRC", "/d/a"], ["crc", "SRC", "/f", "/nothing"]),
+    *(
+        ["get", "-r", "SRC", "/d", "--to", "OUT/"],
+        ["sync", "SRC", "OUT/logs"],
+        ["put", "SRC", "IN/big", "/p"],
+    ),
+    *(["mkdir", "SRC", "/m"], ["mv", "SRC", "/p", "/m/"], ["rm", "-r", "SRC", "/m"], ["ls", "SRC", "/m"]),
+]
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+def test_nor_does_a_bad_link_make_a_difference(field: Field, profile: str) -> None:
+    given = field.local("given")
+    (given / "big").write_bytes(NEW)
+    bad, outcomes = ("--loss", "0.03", "--dup", "0.02", "--delay", "0.01"), []
+    for mounted in (False, True):
+        source = field.sim(fill(field.local("card")), profile, bad).source
+        if mounted:
+            field.mount(source)
+        places = {"SRC": source, "OUT": str(field.local("out")), "IN": str(given)}
+        outcomes.append([said(words, places) for words in ON_A_BAD_LINK])
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.parametrize("words", [["get", "SRC", "/large", "--to", "OUT/x"], ["put", "SRC", "IN/big", "/f"]])
+def test_nor_does_a_vehicle_that_is_switched_off_in_the_middle(field: Field, words: list[str]) -> None:
+    given, outcomes = field.local("given"), []
+    (given / "big").write_bytes(content("large", 1_000_000))
+    for mounted in (False, True):
+        card = fill(field.local("card"))
+        (card / "large").write_bytes(content("large", 1_000_000))
+        vehicle = field.sim(card, options=("--rate", "50000"))
+        vehicle.left_alone = True
+        options = "op_deadline=2,connect_timeout=3"
+        if mounted:
+            mount = field.mount(vehicle.source, *options.split(","))
+            mount.allowed_log = ("is lost",)
+        places = {"SRC": vehicle.source, "OUT": str(field.local("out")), "IN": str(given)}
+        off = threading.Timer(3.0, vehicle.pause)
+        off.start()
+        outcomes.append(said([*words, "-o", options], places))
+        off.join()
+        vehicle.resume()
+        if mounted:
+            wait_until("nothing is held", lambda: mount.status()["held"]["files"] == 0)  # noqa: B023
+        assert (card / "f").read_bytes() == content("f", 80_001)
+    shown = [(code, out, re.sub(r"[0-9.]+ (k|M)?B", "SIZE", err)) for code, out, err in outcomes]
+    assert shown[0] == shown[1]
+    assert shown[0][0] != 0
+    assert len(shown[0][2].splitlines()) == 1
 
 
 # -- seen at once by programs on the mount, and the reverse -------------------------------------------
