@@ -76,7 +76,7 @@ def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
 
 @dataclass(slots=True)
 class _Connected:
-    """What the event loop's thread has of a vehicle. opened: the open files. is_meant: the vehicle is known
+    """The vehicle in the event loop's thread. opened: the open files. is_meant: the vehicle is known
     to be the one that the program changes."""
 
     session: Session

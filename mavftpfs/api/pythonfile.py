@@ -119,7 +119,7 @@ class RawFile(_Ending, io.RawIOBase):
         return self._mode.writes
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True: every file can seek."""
         return True
 
     def readinto(self, buffer: Any, /) -> int:

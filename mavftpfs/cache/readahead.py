@@ -15,7 +15,7 @@ MAX_WINDOW = 8 * 1024 * 1024
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What to ask for besides the read itself: [start, stop), empty if start == stop.
+    """The bytes to ask for besides the read itself: [start, stop), empty if start == stop.
 
     seeked: the reader went elsewhere, so earlier readahead is of no use any more.
     """

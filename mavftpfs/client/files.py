@@ -285,7 +285,7 @@ async def is_directory(files: Files, path: bytes) -> bool:
 
 
 Found = list[tuple[bytes, Stat]]
-"""What is below a directory: (path from there, attributes)."""
+"""Everything below a directory: (path from there, attributes)."""
 Unlisted = list[tuple[bytes, errors.MavftpfsError]]
 """Directories that cannot be listed, and why."""
 

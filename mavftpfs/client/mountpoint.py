@@ -40,7 +40,7 @@ _BUSY_PAUSE = 0.1
 
 
 class DeadMount(MountFailed):
-    """What is mounted there has lost its program."""
+    """The mount there has lost its program."""
 
 
 def canonical(path: str) -> str:
@@ -138,7 +138,7 @@ def why_not_mounted(path: str, said: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """What the kernel's table says of a mount.
+    """An entry of the kernel's table of mounts.
 
     number: no other mount has it as long as this one is used. uid: of the user that mounted it, None if that
     is not told. root: the directory of the file system that is seen there, for a bind mount of a part of it.

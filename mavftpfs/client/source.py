@@ -1,4 +1,4 @@
-"""What SOURCE and the options stand for: a link, or a mount. Layer: client."""
+"""The meaning of SOURCE and the options: a link, or a mount. Layer: client."""
 
 from __future__ import annotations
 

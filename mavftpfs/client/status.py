@@ -1,4 +1,4 @@
-"""What a mount tells of itself. Layer: client; pure.
+"""The facts that a mount tells of itself. Layer: client; pure.
 
 A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys
 are those of `status --json`, which docs/json.md describes. client.mounts asks mounts for it.

@@ -1,4 +1,4 @@
-"""What holds for every handler of pyfuse3: only FUSEError leaves it, and it ends in time. Layer: mount.
+"""The guard of every handler of pyfuse3: only FUSEError leaves it, and it ends in time. Layer: mount.
 
 Any other error would end pyfuse3's main loop, and with it the mount. A caller that waits in the kernel cannot
 be killed. trio.Cancelled passes.

@@ -1,4 +1,4 @@
-"""What the kernel calls by number: inodes and handles. Layer: mount; pure.
+"""The kernel's numbers: inodes and handles. Layer: mount; pure.
 
 Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
@@ -276,7 +276,7 @@ MAX_KEPT = 100_000
 
 @dataclass(slots=True)
 class UserAttributes:
-    """What programs set on one path, so that `cp -p`, `rsync -a`, `tar` and `touch` see what they set.
+    """The attributes that programs set on one path, so that `cp -p`, `rsync -a`, `tar` and `touch` see them.
 
     None = not set. mode: permission bits; times in nanoseconds since 1970 UTC. mtime_ns: of a directory; the
     tree knows those of files, and when these change. changed_ns: when a directory's entries, or its times,
@@ -305,7 +305,7 @@ class UserAttributes:
 
 
 class UserAttributeTable:
-    """What was set on a bounded number of paths; the least recently changed are forgotten first.
+    """The attributes set on a bounded number of paths; the table forgets the least recently changed first.
 
     Kept by path for the life of the mount: the kernel forgets inodes at will. A directory has the time that
     was set, until entries are made, removed or renamed in it. From then on it has the time of the last such

@@ -42,7 +42,7 @@ LAST_REPLIES = 3.0
 
 
 class State(Enum):
-    """What a mount is doing."""
+    """The states of a mount."""
 
     STARTING = "starting"
     """The mount waits for the vehicle; the kernel has no mount yet."""
@@ -65,7 +65,7 @@ NEXT = {
 
 @dataclass(frozen=True, slots=True)
 class MountRequest:
-    """What to mount where. mountpoint: absolute; control: the control socket's path, None = without."""
+    """A mount to make. mountpoint: absolute; control: the control socket's path, None = without."""
 
     source: str
     spec: LinkSpec

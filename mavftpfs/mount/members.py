@@ -22,7 +22,7 @@ MOST = 64
 
 
 class MemberState(Enum):
-    """What a vehicle's own mount is doing."""
+    """The state of a vehicle's own mount."""
 
     HEARD = "heard"
     STARTING = "starting"

@@ -126,7 +126,7 @@ class OpenRequest(Simple):
 
 
 class Page(NamedTuple):
-    """What one page holds.
+    """The content of one page.
 
     strings: number of its non-empty strings, by which the next page's offset grows (servers.md 14.28).
     unshown: how many of them name something that cannot be shown.

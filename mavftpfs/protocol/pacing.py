@@ -40,7 +40,7 @@ _ALARMING_LOSS = 0.2
 """A share of losses that is by so much larger than the usual one begins all again."""
 
 _SMOOTHING = 0.3
-"""What one trial counts for in the usual share of losses."""
+"""The weight of one trial in the usual share of losses."""
 
 _SHORT = 0.7
 """Share of what should be answered below which the link is slower than it was, or the way longer."""

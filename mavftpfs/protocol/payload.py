@@ -88,7 +88,7 @@ class Payload(NamedTuple):
 
 
 Fields: TypeAlias = tuple[int, int, int, int, int, int, int, bytes]
-"""What a Payload has, as a plain tuple; `data` is the whole field of 239 bytes, and `size` is not checked."""
+"""The fields of a Payload as a plain tuple; `data` is the whole field of 239 bytes, `size` is not checked."""
 
 
 def split_run(wires: Sequence[bytes]) -> list[Fields]:

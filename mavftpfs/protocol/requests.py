@@ -147,7 +147,7 @@ def nak_of(request: Request, reply: Payload, *, retransmitted: bool = False) -> 
 
 
 class Port(Protocol):
-    """What an operation may know of the engine it runs in."""
+    """The part of the engine that an operation may know."""
 
     session: int
     traits: Traits

@@ -15,12 +15,12 @@ from mavftpfs.shared.model import DirEntry, EntryKind
 
 
 class Outcome(Enum):
-    """What listings tell about a change that was asked for."""
+    """The verdict of listings on a change that was asked for."""
 
     HAPPENED = "happened"
-    """It was carried out."""
+    """The server carried it out."""
     DID_NOT = "did not"
-    """It was not."""
+    """The server did not."""
     CONFLICT = "conflict"
     """They fit neither. Something else has a name, or both names of a rename are there or gone."""
     UNKNOWN = "unknown"
@@ -28,7 +28,7 @@ class Outcome(Enum):
 
 
 class After(Enum):
-    """What a name has after a change."""
+    """The state of a name after a change."""
 
     PRESENT = "present"
     ABSENT = "absent"
@@ -37,7 +37,7 @@ class After(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """What a listing shows. complete: it came to its end, so all other names are absent."""
+    """The entries of a listing. complete: it came to its end, so all other names are absent."""
 
     entries: dict[bytes, DirEntry]
     complete: bool

@@ -1,4 +1,4 @@
-"""What programs do to a library: interrupt it, fork, forget to close, let garbage be collected anywhere."""
+"""Hazards for a library: programs interrupt it, fork, forget to close, collect garbage anywhere."""
 
 from __future__ import annotations
 

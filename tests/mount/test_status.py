@@ -1,4 +1,4 @@
-"""What a mount tells of itself, as a person and a script ask for it: `status`, and the log."""
+"""The facts that a mount tells people and scripts about itself: `status`, and the log."""
 
 from __future__ import annotations
 

@@ -459,7 +459,7 @@ def test_what_was_held_for_another_vehicle_of_the_same_system_id_waits_for_that_
 
 
 def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
-    """What a killed mount held of a file that was being written, and of one that was changed in part."""
+    """A killed mount held bytes of a file that was being written, and of one that was changed in part."""
     card = field.local("card")
     directory = keep(
         state,

@@ -39,7 +39,7 @@ PATIENCE = 60.0
 
 
 class Mount:
-    """What serves a tree at a socket."""
+    """A server of a tree at a socket."""
 
     def __init__(self, path: Path, tree: FakeTree) -> None:
         self.path = path

@@ -23,7 +23,7 @@ OFFSETS = st.integers(0, END)
 
 
 class Model:
-    """What `Wants` is to know of each byte: whether a request is out for it, and whether a program waits."""
+    """The expected state of each byte in `Wants`: whether a request is out, and whether a program waits."""
 
     def __init__(self) -> None:
         self.wanted: dict[int, tuple[bool, bool]] = {}  # (out, demand)

@@ -77,7 +77,7 @@ US = Address(254, 191)
 
 
 class Diary(dict[Address, Heartbeat]):
-    """What a vehicle heard last of whom, and when it heard us."""
+    """The last heartbeats that a vehicle heard, and when it heard the client."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -198,7 +198,7 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
 
 
 async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has the right key, and does not take the time from us."""
+    """The vehicle has the right key, and does not adopt the client's time."""
     vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
     monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
     link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))

@@ -32,9 +32,9 @@ LINKS = {
         rate=5760.0, queue=2048, duplex=Duplex.HALF, delay=0.02, loss=0.05, duplicate=0.02, corrupt=0.01
     ),
 }
-"""What is held back arrives within a round trip (`hold`): a RENAME or REMOVE that arrives again after its
-answer is carried out again by servers that replay no answers, on whatever has the name by then. `STRAYING` is
-such a link, for calls that move no name."""
+"""The links hold frames back for a round trip at most (`hold`): if a RENAME or REMOVE arrives again after
+its answer, a server that replays no answers executes it again, on whatever has the name by then. `STRAYING`
+is such a link, for calls that move no name."""
 
 STRAYING = LinkSettings(delay=0.02, loss=0.05, duplicate=0.02, reorder=0.05, hold=0.2)
 """Held back for five round trips."""

@@ -70,7 +70,7 @@ async def test_replies_may_be_shorter_than_asked(profile: str, mode: ReadMode) -
 
 
 async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
-    """What goes out in a pause, as if it were over already, only overflows the buffer of a server so near."""
+    """Requests that go out during a pause only overflow the buffer of a server so near."""
     data = content(1_000_000)
     async with rig("px4-nuttx", {b"/big": data}, link=LinkSettings(delay=0.001)) as here:
         assert await read_file(here.connection, here.root + b"/big") == data

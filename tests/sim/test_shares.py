@@ -21,7 +21,7 @@ from tests.support.transfers import MemorySource, begin_to_read, content
 LONG = 60.0
 SHORT = 10.0
 START = 0.06
-"""What the start of a short run may cost of its share."""
+"""The part of its share that a short run may lose at its start."""
 
 SHORT_QUEUE = 4096
 BOTH = pytest.mark.parametrize("direction", ["read", "write"])
@@ -208,7 +208,7 @@ def test_nor_does_that_flood_a_short_queue(direction: Direction) -> None:
 def test_telemetry_gets_through_beside_a_copy(
     profile: str, rate: float, rtt: float, loss: float, direction: Direction
 ) -> None:
-    """It shares a short queue with the answers, which must not fill it for long."""
+    """Telemetry shares a short queue with the answers, which must not fill it for long."""
     case = Case(profile, rate, rtt, loss, direction)
     seconds, telemetry = (LONG, 400.0) if rate == 5760.0 else (SHORT, 4000.0)
     result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=telemetry)

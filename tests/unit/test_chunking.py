@@ -1,4 +1,4 @@
-"""What proves that only short chunks pass, and what does not; the rest is in tests/sim/test_chunk_auto.py."""
+"""The proof that only short chunks pass; the rest is in tests/sim/test_chunk_auto.py."""
 
 from __future__ import annotations
 

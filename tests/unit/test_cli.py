@@ -179,7 +179,7 @@ UNITS_OF_0_2 = [
     ("sync", SOURCE, "/home/me/drone-logs", "--watch"),
     ("sync", SOURCE, "/home/me/drone-logs", "--watch", "--by-sysid", "--exec", "upload-log"),
 ]
-"""What ExecStart of the units ran, as they were and as their own examples changed them."""
+"""The commands in ExecStart of older units, as they were and as their own examples changed them."""
 
 
 @pytest.mark.parametrize("words", UNITS_OF_0_2)

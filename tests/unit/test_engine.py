@@ -146,7 +146,7 @@ def test_a_short_queue_is_forgotten_with_its_server() -> None:
 @pytest.mark.holds("fault replay", "rule 14.4")
 @pytest.mark.parametrize("opcode", [Opcode.CREATE_DIRECTORY, Opcode.LIST_DIRECTORY])
 def test_after_a_stale_replay_a_new_seq_is_tried_once_an_answer_is_due(opcode: int) -> None:
-    """What changes the server might be done once for each new seq."""
+    """A server might execute a request that changes it once for each new seq."""
     engine = make()
     op = Simple(opcode, b"/d")
     engine.start(op, 0.0)
@@ -371,7 +371,7 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
 def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does(
     others: int, patient: bool
 ) -> None:
-    """What waits in its buffer would be executed twice."""
+    """The server would execute a request that waits in its buffer twice."""
     engine = make(limit=1 + others)
     reading(engine)
     first = sent(engine, 0.0)

@@ -115,7 +115,7 @@ def test_runs_are_believed_as_single_replies_are(make: Make, seed: int) -> None:
 
 
 def test_a_run_is_told_to_the_transfer_at_once() -> None:
-    """What makes runs cheap: the sink gets chunks in a row as one."""
+    """Runs are cheap because the sink gets chunks in a row as one."""
 
     class Counting(MemorySink):
         calls = 0

@@ -1,4 +1,4 @@
-"""What a listing tells about a change of names."""
+"""The verdict of a listing on a change of names."""
 
 from __future__ import annotations
 

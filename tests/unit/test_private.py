@@ -1,4 +1,4 @@
-"""What a mount leaves on the local disk: nobody else may read it, and no symbolic link leads it elsewhere."""
+"""Files of a mount on the local disk: no other user may read them, and no symbolic link leads elsewhere."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def test_an_over_long_reply_is_clipped() -> None:
 @pytest.mark.holds("fault growing file")
 @pytest.mark.parametrize("eof", [False, True])
 def test_where_the_file_ends_early_it_is_to_be_opened_again(eof: bool) -> None:
-    """It became shorter, perhaps: its new size tells. Of other files that says nothing."""
+    """The file may have become shorter, which its new size tells. EOF says nothing about other files."""
     reader = Reader(traits=Traits(ack_carries_own_session=True))
     reader.transfer.want(0, 1000, True)
     request = reader.sent()[0]

@@ -120,7 +120,7 @@ def written(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[Spoo
 
 
 def rescued(directory: SpoolDirectory, tmp_path: Path) -> dict[str, bytes]:
-    """What the next mount offers, without the descriptions."""
+    """Return the files that the next mount offers, without the descriptions."""
     directory.close()  # as the kernel does for a killed process
     again = SpoolDirectory(tmp_path / "spool")
     found = again.rescue(tmp_path / "recovered")
@@ -168,7 +168,7 @@ def test_what_could_not_be_written_down_is_tried_again(
 
 
 def test_more_than_was_written_down_says_so(tmp_path: Path) -> None:
-    """What a failed close wrote down is not the whole truth once more was written."""
+    """The description of a failed close is outdated once the program wrote more."""
     directory, content = written(tmp_path)
     content.persist({"path": "/card/log.bin", "size": 6})
     content.put(6, b"!")
