@@ -142,7 +142,8 @@ class Mounted:
 
     number: no other mount has it as long as this one is used. uid: of the user that mounted it, None if that
     is not told. root: the directory of the file system that is seen there, for a bind mount of a part of it.
-    others: all places where the same file system is mounted."""
+    others: all places where the same file system is mounted.
+    """
 
     number: str
     type: str

@@ -3,7 +3,8 @@
 The extended attribute of a mount's root names its control socket. Users that may not read the attribute
 (root, for users' mounts) look for the socket by the name of the mountpoint. Then the mount is asked by its
 socket. Of a mount that does not answer, or does not serve this user, only what the attribute tells is known,
-with `state` and `problem`."""
+with `state` and `problem`.
+"""
 
 from __future__ import annotations
 
@@ -305,10 +306,13 @@ def network_namespace() -> str:
 
 
 def has_link(status: Status, spec: LinkSpec) -> bool:
-    """Return whether the mount with this status has that link. A port belongs to a network namespace."""
+    """Return whether the mount with this status is of one vehicle and has that link. A port belongs to a
+    network namespace."""
     with suppress(MavftpfsError, KeyError):  # it cannot be asked, or is of an older version
-        return status["network_namespace"] == network_namespace() and same_link(
-            parse_source(status["source"]), spec
+        return (
+            "members" not in status
+            and status["network_namespace"] == network_namespace()
+            and same_link(parse_source(status["source"]), spec)
         )
     return False
 

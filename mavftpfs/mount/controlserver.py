@@ -3,7 +3,8 @@
 Each client sends one line and gets one line, and that ends it; a line that asks for `files` is followed by
 the messages of client.wire, which mount.fileserver answers. The mount needs file descriptors for itself. So
 only MAX_CLIENTS clients are taken at once, and one that asks nothing is ended. Those that use files do not
-count as such, so `status` and `umount` are answered however many there are."""
+count as such, so `status` and `umount` are answered however many there are.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Serves a mount's files to commands and programs by connections of its control socket. Layer: mount.
 
 client.wire has the protocol. A connection has at most one open file and one request at a time, so a client
-that stops reading holds at most a block of memory, and disturbs no other."""
+that stops reading holds at most a block of memory, and disturbs no other.
+"""
 
 from __future__ import annotations
 

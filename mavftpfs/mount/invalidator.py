@@ -86,12 +86,17 @@ class Invalidator:
         """Make the kernel ask for attributes again; return when it has forgotten them."""
         await self._tell(ino, attr_only=True)
 
-    async def forget_name(self, path: bytes) -> None:
-        """Make the kernel look a name up again; return when it has forgotten it."""
-        directory, name = split(path)
-        parent = self._inodes.known(directory)
-        if parent is not None:
-            await self._in_thread([partial(self._notify_name, parent, name)])
+    async def forget_name(self, *paths: bytes) -> None:
+        """Make the kernel look names up again; return when it has forgotten them."""
+        known = [(self._inodes.known(split(path)[0]), split(path)[1]) for path in paths]
+        await self._in_thread(
+            [partial(self._notify_name, parent, name) for parent, name in known if parent is not None]
+        )
+
+    async def forget_file(self, path: bytes) -> None:
+        """Make the kernel drop all that it knows of a path, its name too; return when it has dropped it."""
+        await self.forget_pages(path)
+        await self.forget_name(path)
 
     async def forget_beliefs(self) -> None:
         """Make the kernel ask again for all that it would answer by itself; return when it has forgotten

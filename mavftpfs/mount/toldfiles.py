@@ -4,7 +4,8 @@ They change the mount's tree with no kernel in between. So the kernel is told: n
 kernel believes for a while that a name is absent; pages and attributes, because it keeps those of the old
 content. The kernel is told after the change, when no lock is held, and an answer waits TELLING_TIME for that
 at most: the kernel itself waits for look-ups and reads that are under way. Programs that watch by inotify
-hear nothing."""
+hear nothing.
+"""
 
 from __future__ import annotations
 
@@ -99,8 +100,7 @@ class ToldFiles:
             _require_on_card(new)
         await self._tree.rename(old, new)
         self._operations.note_renamed(old, new)
-        await _told(self._invalidator.forget_name, old)
-        await _told(self._invalidator.forget_name, new)
+        await _told(self._invalidator.forget_name, old, new)
 
     async def refresh(self) -> None:
         """See Files."""
@@ -180,13 +180,12 @@ class ToldFile:
     async def _tell(self) -> None:
         """Return when programs that open the file, or look at it, see what it is now."""
         if self._file.writable:
-            await _told(self._invalidator.forget_pages, self._path)
-            await _told(self._invalidator.forget_name, self._path)
+            await _told(self._invalidator.forget_file, self._path)
 
 
-async def _told(tell: Callable[..., Awaitable[None]], *args: bytes) -> None:
+async def _told(tell: Callable[..., Awaitable[None]], *paths: bytes) -> None:
     with trio.move_on_after(TELLING_TIME, shield=True):  # what was opened meanwhile is not lost by a cancel
-        await tell(*args)
+        await tell(*paths)
 
 
 def _require_on_card(path: bytes) -> None:

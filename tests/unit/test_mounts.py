@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.client.mounts import vehicle_below
+from mavftpfs.client.mounts import has_link, network_namespace, vehicle_below
+from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
 from mavftpfs.shared.options import Options
 
@@ -17,6 +18,14 @@ THREE = {"name": "3", "state": "failed", "problem": "no MAVLink FTP"}
 
 def below(members: list[dict[str, Any]], subtree: bytes = b"/", **options: Any) -> str:
     return vehicle_below({"mountpoint": "/mnt", "members": members}, subtree, Options(**options))
+
+
+def test_a_mount_of_all_vehicles_is_none_that_has_the_link() -> None:
+    told = {"source": "udpin:0.0.0.0:14550", "network_namespace": network_namespace()}
+    spec = parse_source("udpin:127.0.0.1:14550")
+    assert has_link({**told, "vehicle": {}}, spec)
+    assert not has_link({**told, "members": []}, spec)
+    assert not has_link({**told, "vehicle": {}, "network_namespace": "4:7"}, spec)
 
 
 def test_a_vehicle_is_named_or_the_only_one() -> None:
