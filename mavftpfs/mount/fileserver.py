@@ -54,6 +54,8 @@ class FileServer:
 
     async def serve(self, stream: trio.SocketStream, process: int) -> None:
         """Answer a client until it goes away. process: its number."""
+        if self._closed:  # since it was granted
+            return
         connection = _Connection(stream, process, self._files, self._status)
         with trio.CancelScope() as scope:
             self._serving[scope] = connection
