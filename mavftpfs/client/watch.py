@@ -257,11 +257,14 @@ class Keeping:
         self.local = local
         self._say = say
         self._hand_on = hand_on
-        self._new = trio.Event()
+        self._to_hand_on, self._handed_over = trio.open_memory_channel[Downloaded](inf)
         with local_disk(local):
             local.mkdir(parents=True, exist_ok=True)
             self.manifest = Manifest(local)
             self.manifest.begin()
+        for log in self.manifest.logs():  # the command failed, or an earlier run ended first
+            if log.proven and not log.handed_on:
+                self._to_hand_on.send_nowait(log)
 
     def require_room(self, needed: int) -> None:
         """Check that the directory is there, and has room for so many bytes.
@@ -291,21 +294,16 @@ class Keeping:
         Raises:
             OSError: the local disk refuses it.
         """
-        self.manifest.note(replace(log, handed_on=self._hand_on is None or not log.proven))
-        self._new.set()
+        log = replace(log, handed_on=self._hand_on is None or not log.proven)
+        self.manifest.note(log)
+        if not log.handed_on:
+            self._to_hand_on.send_nowait(log)
 
     async def hand_on_all(self) -> None:
-        """Run the command for the logs that are here, one after the other, also for those of earlier runs for
-        which it failed; return only when there is no command."""
-        tried: set[Downloaded] = set()
-        while self._hand_on is not None:
-            due = [log for log in self.manifest.logs() if log.proven and not log.handed_on]
-            log = next((log for log in due if log not in tried), None)
-            if log is None:
-                self._new = trio.Event()
-                await self._new.wait()
-                continue
-            tried.add(log)
+        """Run the command for the logs that are here, one after the other; return only when there is none."""
+        if self._hand_on is None:
+            return
+        async for log in self._handed_over:
             if is_file(self.local / log.file):  # a user may have moved it away
                 await self._hand_on_one(log, self._hand_on)
 

@@ -17,9 +17,9 @@ import trio
 from mavftpfs.client.contact import Heard, MountContact
 from mavftpfs.client.files import Session
 from mavftpfs.client.logs import Wish
-from mavftpfs.client.manifest import NAME, Manifest
+from mavftpfs.client.manifest import NAME, Downloaded, Manifest
 from mavftpfs.client.selection import EVERYTHING, Selection
-from mavftpfs.client.watch import Watch
+from mavftpfs.client.watch import Keeping, Watch
 from mavftpfs.link.messages import Address
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.options import Options
@@ -380,6 +380,29 @@ async def test_what_could_not_be_handed_on_is_tried_at_the_next_start(day: Day) 
         async with day.watched():
             await trio.sleep(100.0)
     assert day.handed == ["1.ulg"] * 2
+
+
+async def test_watches_that_share_a_directory_hand_on_their_own_logs(tmp_path: Path) -> None:
+    handed = list[tuple[int, str]]()
+
+    def keeping(number: int) -> Keeping:
+        async def hand_on(file: Path) -> str:
+            await trio.sleep(1.0)
+            handed.append((number, file.name))
+            return ""
+
+        return Keeping(tmp_path, lambda line: None, hand_on)
+
+    watches = [keeping(1), keeping(2)]
+    async with trio.open_nursery() as nursery:
+        for number, watch in enumerate(watches, 1):
+            nursery.start_soon(watch.hand_on_all)
+            (tmp_path / f"{number}.ulg").write_bytes(b"log")
+            watch.look()
+            watch.note(Downloaded(f"/log/{number}.ulg", f"{number}.ulg", 3, None, vehicle=str(number)))
+        await trio.sleep(10.0)
+        nursery.cancel_scope.cancel()
+    assert sorted(handed) == [(1, "1.ulg"), (2, "2.ulg")]
 
 
 # -- the local disk -------------------------------------------------------------------------------
