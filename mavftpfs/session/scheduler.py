@@ -325,6 +325,7 @@ class Scheduler:
         """Give a turn back, and wait until it is next again; raises what `turn` does."""
         self._set_holder(None)
         await self._wait(turn.user)
+        turn.granted_at = self.clock()
         self._set_holder(turn)
         self.server.vehicle.require(self.clock(), writing=turn.user.writing)
 
@@ -486,7 +487,9 @@ class Scheduler:
                 await trio.lowlevel.checkpoint()
                 if self._queue and self.clock() < self.others_until:
                     await self.server.learn_several_sessions()
-                wait = self._closes_in(self.clock())
+                now, wait = self.clock(), self._closes_in(self.clock())
+                if now < self.others_until:  # then another user may be next
+                    wait = min(wait, self.others_until - now)
                 if wait > 0.0:
                     await self.server.sleep(wait)
                 else:
