@@ -36,7 +36,8 @@ MAX_LINE = 1 << 20
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 SYSTEM = Path("/run/mavftpfs")
-FOREIGN = "another user's mount: only that user and root may use it by commands"
+FOREIGN = "belongs to another user; only that user and root may use it by commands"
+"""Why a mount refuses; its files may be for all."""
 BOUND = Path("/proc/net/unix")
 """The kernel's table of sockets that are bound."""
 _SUFFIX = ".sock"

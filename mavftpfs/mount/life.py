@@ -220,9 +220,10 @@ class Life(ABC):
         return {"id": self._id}
 
     async def _umount(self, request: Reply) -> Reply:
-        if request["uid"] not in (0, os.getuid()):
+        ours, place = os.getuid(), self.request.mountpoint
+        if request["uid"] not in (0, ours):
             raise MountFailed(
-                f"another user mounted {self.request.mountpoint}, and only uid {os.getuid()} or root may"
+                f"cannot unmount {place}: another user mounted it, and only uid {ours} or root may"
             )
         await self.unmount(lazy=bool(request.get("lazy")))
         await self._ended.wait()

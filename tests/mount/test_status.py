@@ -144,8 +144,8 @@ def test_another_user_is_told_in_a_line(
     state.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
     for words, code, why in (
-        (("umount", mount.path), ExitCode.MOUNT_FAILED, "another user's mount"),
-        (("ls", mount.path), ExitCode.NO_VEHICLE, f"the mount on {mount.path}: another user's mount"),
+        (("umount", mount.path), ExitCode.MOUNT_FAILED, "belongs to another user"),
+        (("ls", mount.path), ExitCode.NO_VEHICLE, f"the mount on {mount.path}: belongs to another user"),
         (("recover",), ExitCode.USAGE, "Permission denied"),
     ):
         refused = by_nobody(mount, *words, code=code)
