@@ -510,8 +510,8 @@ class Drone:
         """
         where = None if place is None else remote(place)
         selection = selection_of(newest=newest, since=since, include=include, exclude=exclude)
-        wish = logs.Wish(Path(local), where, selection)
-        outcome = await self._download(verify, lambda downloads: logs.sync(downloads, wish))
+        request = logs.SyncRequest(Path(local), where, selection)
+        outcome = await self._download(verify, lambda downloads: logs.sync(downloads, request))
         return [fetched.wanted.local for fetched in outcome.fetched]
 
     async def _download(

@@ -45,13 +45,13 @@ async def set_values(session: Session, values: Mapping[str, Number]) -> None:
             names them.
     """
     lines = client.assignments([f"{name}={_text(name, value)}" for name, value in values.items()])
-    wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
-    if wish.unknown:
-        raise UsageError(f"no parameter is called {', '.join(line.name for line in wish.unknown)}")
-    if not wish.changes:
+    plan = client.plan_changes(lines, await client.read_parameters(session), "", meant=True)
+    if plan.unknown:
+        raise UsageError(f"no parameter is called {', '.join(line.name for line in plan.unknown)}")
+    if not plan.changes:
         return
     try:
-        await client.set_values(session, wish.changes, Progress())
+        await client.set_values(session, plan.changes, Progress())
     except NotTaken as exc:
         raise NotTaken("; ".join(await client.last_error(session)) or str(exc)) from exc
 

@@ -21,7 +21,7 @@ from mavftpfs.cli.commands import say
 from mavftpfs.cli.drawing import shown
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session, Target, open_mount, vehicles_below
-from mavftpfs.client.parameters import Change, Difference, Wish
+from mavftpfs.client.parameters import Change, ChangePlan, Difference
 from mavftpfs.client.progress import Progress
 from mavftpfs.parameters.text import Line
 from mavftpfs.parameters.values import Kind, Parameter, text_of
@@ -262,21 +262,21 @@ class _Setting:
 
     async def run(self, session: Session) -> int:
         """Set the values that differ; in two steps if some parameters may only appear when others are set."""
-        wish = await self._compare(session)
-        first = client.enabling(wish.changes) if wish.unknown else []
-        if wish.unknown and not first:
-            self._require_known(wish)
-        await self._ask(wish)
+        plan = await self._compare(session)
+        first = client.enabling(plan.changes) if plan.unknown else []
+        if plan.unknown and not first:
+            self._require_known(plan)
+        await self._ask(plan)
         if first:
             await self._set(session, first)
-            wish = await self._compare(session)
-            self._require_known(wish)
-        await self._set(session, wish.changes)
-        for note in wish.notes:
+            plan = await self._compare(session)
+            self._require_known(plan)
+        await self._set(session, plan.changes)
+        for note in plan.notes:
             say(note)
         return ExitCode.OK
 
-    async def _compare(self, session: Session) -> Wish:
+    async def _compare(self, session: Session) -> ChangePlan:
         self.bar.plan(0, 0)
         with shown(self.bar, idle="reading the parameters"):
             current = await client.read_parameters(session)
@@ -287,36 +287,36 @@ class _Setting:
             raise InvalidText(f"{_of_others(others)}; --skip-unknown leaves them out")
         if others and not self.done:
             say(f"left out: {_of_others(others)}")
-        return client.wish(lines, current, self.name, meant=self.meant)
+        return client.plan_changes(lines, current, self.name, meant=self.meant)
 
-    def _require_known(self, wish: Wish) -> None:
+    def _require_known(self, plan: ChangePlan) -> None:
         """Name the parameters that the vehicle does not have.
 
         Raises:
             InvalidText: there are some, and the user did not allow to leave them out.
         """
-        names = ", ".join(line.name for line in wish.unknown)
-        if wish.unknown and not self.args.skip_unknown:
+        names = ", ".join(line.name for line in plan.unknown)
+        if plan.unknown and not self.args.skip_unknown:
             hint = "; --skip-unknown leaves them out" if self.name else ""
             raise InvalidText(f"the vehicle has no {names}{hint}")
-        if wish.unknown:
+        if plan.unknown:
             say(f"left out, because the vehicle does not have them: {names}")
 
-    async def _ask(self, wish: Wish) -> None:
+    async def _ask(self, plan: ChangePlan) -> None:
         """Print the changes before more than one parameter is set, and ask on a terminal.
 
         Raises:
             UsageError: the user said no.
         """
-        count = len(wish.changes) + len(wish.unknown)
-        if len(wish.changes) < 1 or count < 2 or self.args.yes or self.args.json:
+        count = len(plan.changes) + len(plan.unknown)
+        if len(plan.changes) < 1 or count < 2 or self.args.yes or self.args.json:
             return
         self.announced = True
-        for change in wish.changes:
+        for change in plan.changes:
             print(change, file=sys.stderr)
         if not sys.stdin.isatty():
             return
-        print(f"Set {len(wish.changes)} parameters? [y/N] ", end="", file=sys.stderr, flush=True)
+        print(f"Set {len(plan.changes)} parameters? [y/N] ", end="", file=sys.stderr, flush=True)
         answer = await trio.to_thread.run_sync(sys.stdin.readline, abandon_on_cancel=True)
         if answer.strip().lower() not in ("y", "yes"):
             raise UsageError("nothing was set")

@@ -174,16 +174,16 @@ def sync(args: Args) -> int:
         (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since, datetime.now(), "--since")
     selection = Selection(args.newest, since, tuple(args.include), tuple(args.exclude))
-    wish = logs.Wish(Path(args.local), place, selection, args.dry_run)
+    request = logs.SyncRequest(Path(args.local), place, selection, args.dry_run)
     if args.watch:
-        return watching.watch(args, wish, lambda work: run(args, work, component))
+        return watching.watch(args, request, lambda work: run(args, work, component))
     if args.command is not None:
         raise UsageError("--exec goes with --watch")
     outcome = download.Outcome()
     error: MavftpfsError | None = None
 
     async def work(downloads: download.Downloads) -> None:
-        await (logs.check if args.check else logs.sync)(downloads, wish)
+        await (logs.check if args.check else logs.sync)(downloads, request)
 
     try:
         _download(args, outcome, work, component)

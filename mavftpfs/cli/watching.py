@@ -18,7 +18,7 @@ import trio
 
 from mavftpfs.cli.drawing import shown
 from mavftpfs.client.files import Target
-from mavftpfs.client.logs import Wish
+from mavftpfs.client.logs import SyncRequest
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.watch import Watch
 from mavftpfs.shared.errors import ExitCode
@@ -35,7 +35,7 @@ _KILL_AFTER = 5.0
 Work = Callable[[Target], Coroutine[Any, Any, None]]
 
 
-def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> int:
+def watch(args: argparse.Namespace, request: SyncRequest, run: Callable[[Work], None]) -> int:
     """Download logs until SIGINT or SIGTERM; run: runs the work on SOURCE.
 
     Raises:
@@ -45,7 +45,7 @@ def watch(args: argparse.Namespace, wish: Wish, run: Callable[[Work], None]) -> 
     bar = Progress()
 
     async def work(target: Target) -> None:
-        await Watch(wish, say, hand_on, bar, args.verify).run(target)
+        await Watch(request, say, hand_on, bar, args.verify).run(target)
 
     try:
         with shown(bar, idle=""):

@@ -24,7 +24,7 @@ the standard's alias, which shows one of the others again and so comes last."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class SyncRequest:
     """Which logs to download. place: the directory on the vehicle, None to find it."""
 
     local: Path
@@ -77,7 +77,7 @@ def path_of(session: Session, log: Wanted) -> str:
     return os.fsdecode(session.on_vehicle(log.remote))
 
 
-async def sync(downloads: Downloads, wish: Wish, record: Record | None = None) -> None:
+async def sync(downloads: Downloads, request: SyncRequest, record: Record | None = None) -> None:
     """Download the logs that are not here, and verify those that are here as far as the record wants it.
 
     record: None for that of plain `sync`.
@@ -87,17 +87,17 @@ async def sync(downloads: Downloads, wish: Wish, record: Record | None = None) -
         the local disk is full. RequestTimeout: for MAX_TIMEOUTS files. Other failures are reported.
     """
     session, outcome = downloads.fetcher.session, downloads.outcome
-    logs = await _listed(downloads, wish)
-    if wish.dry_run:
+    logs = await _listed(downloads, request)
+    if request.dry_run:
         wanted = [log for log in logs if not log.here]
     else:
-        with local_disk(wish.local):
-            wish.local.mkdir(parents=True, exist_ok=True)
-            record = record or Unproven(wish.local, downloads.fetcher.verify)
+        with local_disk(request.local):
+            request.local.mkdir(parents=True, exist_ok=True)
+            record = record or Unproven(request.local, downloads.fetcher.verify)
         wanted = await record.missing(session, logs)
     missing = set(wanted)
     outcome.here = [log for log in logs if log.here and log not in missing]
-    warning = wish.selection.warning(wanted)
+    warning = request.selection.warning(wanted)
     if warning:
         downloads.reports.says(warning)
     if record is None:
@@ -105,13 +105,13 @@ async def sync(downloads: Downloads, wish: Wish, record: Record | None = None) -
         return
 
     def note(fetched: Fetched) -> None:
-        with local_disk(wish.local):
+        with local_disk(request.local):
             record.note(session, fetched)
 
     await downloads.fetch_all(wanted, note=note)
 
 
-async def check(downloads: Downloads, wish: Wish) -> None:
+async def check(downloads: Downloads, request: SyncRequest) -> None:
     """Compare the logs that are here with the vehicle's, and download nothing.
 
     Raises:
@@ -119,7 +119,7 @@ async def check(downloads: Downloads, wish: Wish) -> None:
     """
     session, outcome, progress = downloads.fetcher.session, downloads.outcome, downloads.fetcher.progress
     outcome.checked = True
-    for log in await _listed(downloads, wish):
+    for log in await _listed(downloads, request):
         (outcome.here if log.local.is_file() else outcome.wanted).append(log)
     progress.plan(len(outcome.here), sum(log.size for log in outcome.here))
     for log in outcome.here:
@@ -134,27 +134,27 @@ async def check(downloads: Downloads, wish: Wish) -> None:
     outcome.finished = True
 
 
-async def _listed(downloads: Downloads, wish: Wish) -> list[Wanted]:
+async def _listed(downloads: Downloads, request: SyncRequest) -> list[Wanted]:
     """List the logs; return those that the user selected, the newest first.
 
     Raises:
         NotFound: there is no directory of logs. NotADirectory, UsageError: a file is where a directory is
         needed. Otherwise as `walk`.
     """
-    session, selection = downloads.fetcher.session, wish.selection
-    if wish.local.exists() and not wish.local.is_dir():
-        raise UsageError(f"{wish.local} is a file; the logs go into a directory")
+    session, selection = downloads.fetcher.session, request.selection
+    if request.local.exists() and not request.local.is_dir():
+        raise UsageError(f"{request.local} is a file; the logs go into a directory")
     await session.files.refresh()  # a mount may have listed the logs before the last flight
-    if wish.place is None:
+    if request.place is None:
         place, found, unlisted = await find_logs(session)
     else:
-        place = wish.place
+        place = request.place
         if (await session.files.stat(place)).kind is EntryKind.FILE:
             raise NotADirectory(f"{name_text(place)} is a file; get it with `mavftpfs get`")
         found, unlisted = await walk(session.files, place)
     downloads.outcome.place = session.on_vehicle(place)
     logs = [
-        wanted_file(join(place, below), wish.local / os.fsdecode(below), below, stat, keep_old=True)
+        wanted_file(join(place, below), request.local / os.fsdecode(below), below, stat, keep_old=True)
         for below, stat in found
         if stat.kind is EntryKind.FILE and below != NAME.encode()  # a manifest that was copied to the card
     ]

@@ -144,7 +144,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class ChangePlan:
     """The changes to make. unknown: lines of names that the vehicle lacks (yet). notes: for people."""
 
     changes: list[Change] = field(default_factory=list)
@@ -215,7 +215,9 @@ def invalid(name: str, problems: Sequence[Problem]) -> InvalidText:
     return InvalidText("\n".join(place + one.reason for place, one in zip(where, problems, strict=True)))
 
 
-def wish(lines: Sequence[Line], current: Sequence[Parameter], name: str, *, meant: bool) -> Wish:
+def plan_changes(
+    lines: Sequence[Line], current: Sequence[Parameter], name: str, *, meant: bool
+) -> ChangePlan:
     """Compare lines with the vehicle's parameters. meant: the user wrote each line by itself (see make_plan).
 
     Raises:
@@ -227,7 +229,7 @@ def wish(lines: Sequence[Line], current: Sequence[Parameter], name: str, *, mean
     if plan.problems:
         raise invalid(name, plan.problems)
     changes = [Change(values[one.name], one) for one in plan.wanted]
-    return Wish(changes, [line for line in lines if line.name not in values], plan.notes)
+    return ChangePlan(changes, [line for line in lines if line.name not in values], plan.notes)
 
 
 def enabling(changes: Sequence[Change]) -> list[Change]:

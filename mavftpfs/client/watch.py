@@ -21,7 +21,7 @@ from mavftpfs.client.contact import Contact, Heard, LinkContact, MountContact
 from mavftpfs.client.download import Downloads, Outcome, Reports, named
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
-from mavftpfs.client.logs import Wish, path_of, sync
+from mavftpfs.client.logs import SyncRequest, path_of, sync
 from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import is_no_log
@@ -61,13 +61,13 @@ class Watch:
 
     def __init__(
         self,
-        wish: Wish,
+        request: SyncRequest,
         say: Callable[[str], None],
         hand_on: HandOn | None = None,
         progress: Progress | None = None,
         verify: Verify = "auto",
     ) -> None:
-        self._wish = wish
+        self._request = request
         self._verify: Verify = verify
         self._print = say
         self._said_at = trio.current_time()
@@ -76,7 +76,7 @@ class Watch:
         self._policies: dict[int, Policy] = {}
         self._sync: VehicleSync | None = None
         self._turn = 0
-        self.keeping = Keeping(wish.local, self._say, hand_on)
+        self.keeping = Keeping(request.local, self._say, hand_on)
 
     def _say(self, line: str) -> None:
         self._said_at = trio.current_time()
@@ -189,7 +189,7 @@ class Watch:
     def _new_sync(self, system: int) -> VehicleSync:
         policy = self._policies[system]
         told = self._complaints, self._say, self._progress
-        return VehicleSync(system, policy, self._wish, self._verify, self.keeping, *told)
+        return VehicleSync(system, policy, self._request, self._verify, self.keeping, *told)
 
     # --- what is heard
 
@@ -326,7 +326,7 @@ class VehicleSync(Reports):
 
     system: int
     policy: Policy
-    wish: Wish
+    request: SyncRequest
     verify: Verify
     keeping: Keeping
     complaints: Complaints
@@ -366,7 +366,7 @@ class VehicleSync(Reports):
         outcome = Outcome()
         downloads = Downloads(Fetcher(session, self.progress, self.verify), outcome, self)
         try:
-            await sync(downloads, replace(self.wish, local=local), self)
+            await sync(downloads, replace(self.request, local=local), self)
         finally:
             self.progress.end(0)
             self.progress.plan(0, 0)

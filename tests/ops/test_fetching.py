@@ -22,7 +22,7 @@ from mavftpfs.client.fetch import (
     part_of,
 )
 from mavftpfs.client.files import Files, Session
-from mavftpfs.client.logs import Wish, check, sync
+from mavftpfs.client.logs import SyncRequest, check, sync
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import Selection
 from mavftpfs.shared.errors import (
@@ -459,7 +459,7 @@ async def synced(
     fetcher = fetcher_of(tree, root, verify)
     downloads = Downloads(fetcher, outcome, Noted(told, said))
     try:
-        await sync(downloads, Wish(local, selection=Selection(newest), dry_run=dry_run))
+        await sync(downloads, SyncRequest(local, selection=Selection(newest), dry_run=dry_run))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said
@@ -546,7 +546,7 @@ async def test_all_that_is_here_is_proven_if_that_is_wished_for(tmp_path: Path) 
 async def checked(tree: FakeTree, local: Path) -> Outcome:
     outcome = Outcome()
     fetcher = fetcher_of(tree, verify="none")
-    await check(Downloads(fetcher, outcome), Wish(local))
+    await check(Downloads(fetcher, outcome), SyncRequest(local))
     return outcome
 
 
@@ -574,4 +574,4 @@ async def test_a_file_where_a_directory_is_needed_is_said(tmp_path: Path, what: 
     downloads = Downloads(fetcher_of(tree), Outcome())
     place, local = (b"/log/1", tmp_path) if what == "--from" else (None, tmp_path / "file")
     with pytest.raises((UsageError, NotADirectory), match="is a file"):
-        await sync(downloads, Wish(local, place))
+        await sync(downloads, SyncRequest(local, place))

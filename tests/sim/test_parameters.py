@@ -593,7 +593,7 @@ async def test_300_values_over_57600_baud() -> None:
         await trio.sleep(20)
         began, bar, seen, states = trio.current_time(), Progress(trio.current_time), set[int](), set[str]()
         lines = [Line(i, f"GAIN_{i:03}", i + 0.5) for i in range(300)]
-        wish = client.wish(lines, await client.read_parameters(session), "", meant=True)
+        wish = client.plan_changes(lines, await client.read_parameters(session), "", meant=True)
         assert len(wish.changes) == 300
 
         async def look() -> None:

@@ -16,7 +16,7 @@ import trio
 
 from mavftpfs.client.contact import Heard, MountContact
 from mavftpfs.client.files import Session
-from mavftpfs.client.logs import Wish
+from mavftpfs.client.logs import SyncRequest
 from mavftpfs.client.manifest import NAME, Downloaded, Manifest
 from mavftpfs.client.selection import EVERYTHING, Selection
 from mavftpfs.client.watch import Keeping, Watch
@@ -90,7 +90,7 @@ class Day:
     async def watched(self) -> AsyncIterator[None]:
         """Run the watch during the body; a second time stands for another process."""
         hand_on = self._hand_on
-        watch = Watch(Wish(self.local, selection=self.selection), self.said.append, hand_on)
+        watch = Watch(SyncRequest(self.local, selection=self.selection), self.said.append, hand_on)
         async with trio.open_nursery() as nursery:
             nursery.start_soon(watch.keeping.hand_on_all)
             nursery.start_soon(watch.run_on, self.rig.link, SPEC, Options())
@@ -512,7 +512,7 @@ class ArmsWhileEntered:
 @pytest.mark.holds("promise 9")
 async def test_a_vehicle_that_is_armed_while_its_files_are_opened_is_not_asked(tmp_path: Path) -> None:
     said: list[str] = []
-    watch, contact = Watch(Wish(tmp_path), said.append), ArmsWhileEntered()
+    watch, contact = Watch(SyncRequest(tmp_path), said.append), ArmsWhileEntered()
     with trio.move_on_after(9.0):
         while True:
             await watch.serve(contact)
@@ -523,7 +523,7 @@ async def test_a_line_an_hour_tells_that_the_watch_is_alive(tmp_path: Path) -> N
     said: list[str] = []
     contact = ArmsWhileEntered()
     contact._news = [Heard(1, armed=True)]
-    watch = Watch(Wish(tmp_path), said.append)
+    watch = Watch(SyncRequest(tmp_path), said.append)
     with trio.move_on_after(3 * 3600.0):
         await watch.serve(contact)
     assert said == [
