@@ -1,6 +1,6 @@
 """A vehicle's files for programs and notebooks: `mavftpfs.connect`. Layer: api.
 
-The calls are synchronous. Their work is async, and is done in the event loop's thread (`api.portal`).
+The calls are synchronous. The event loop's thread (`api.portal`) does their work.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ __all__ = ["Drone", "Entry", "NotDelivered", "UsageError", "connect"]
 
 log = logging.getLogger("mavftpfs.api")
 logging.getLogger("mavftpfs.cache").addHandler(logging.NullHandler())
-"""The caches' warnings are raised as errors, too: a program without logging sees them once."""
+"""A program without logging sees each problem once, because the calls raise the caches' warnings as
+errors."""
 
 ArgsT = ParamSpec("ArgsT")
 ResultT = TypeVar("ResultT")
@@ -55,15 +56,15 @@ ResultT = TypeVar("ResultT")
 
 
 def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
-    """Return a vehicle's files; close it at the end, or use it in a `with` statement.
+    """Return a vehicle's files; close the result at the end, or use it in a `with` statement.
 
-    source: as for `mavftpfs`: a link (`udpin:0.0.0.0:14550`, `/dev/ttyACM0`), or where it is mounted. A mount
-    of that vehicle that is up is used, unless `use_mount` is False. options: those of a mount, by name:
-    `target_system=2, signing_key="key", ro=True`. One that is gone is a DeprecationWarning.
+    source: a link as for the command (`udpin:0.0.0.0:14550`, `/dev/ttyACM0`), or the directory of a mount. If
+    that vehicle is already mounted, the calls use its mount, unless `use_mount` is False. options: those of a
+    mount, by name: `target_system=2, signing_key="key", ro=True`. A removed option is a DeprecationWarning.
 
     Raises:
-        TimeoutError: no vehicle, or none that answers, within `connect_timeout`. OSError: the link cannot be
-        opened. UsageError (a ValueError): source or an option is wrong; the text names it.
+        TimeoutError: no vehicle answers within `connect_timeout`. OSError: the link cannot be opened.
+        UsageError (a ValueError): source or an option is wrong; the text names it.
     """
     with translated():
         target = target_of(source, options_of(options))
@@ -76,15 +77,16 @@ def connect(source: str, *, use_mount: bool = True, **options: object) -> Drone:
 
 @dataclass(slots=True)
 class _Connected:
-    """The vehicle in the event loop's thread. opened: the open files. is_meant: the vehicle is known
-    to be the one that the program changes."""
+    """A vehicle in the event loop's thread. opened: the open files. is_meant: the vehicle is known to be the
+    one that the program changes."""
 
     session: Session
     opened: set[Opened] = field(default_factory=set)
     is_meant: bool = False
 
     async def require_one_vehicle(self) -> None:
-        """Check before the first change that no other vehicle may be meant. One that comes later is not.
+        """Check before the first change that the program can mean only one vehicle. Vehicles that appear
+        later are not checked.
 
         Raises:
             UsageError: several vehicles are on the link, and `target_system` does not name one.
@@ -94,16 +96,16 @@ class _Connected:
             self.is_meant = True
 
     async def close_files(self) -> None:
-        """Close the open files, take back what was written to them, and log it."""
+        """Close the open files, discard their changes, and log each file."""
         for opened in list(self.opened):
             if opened.writable:
-                log.error("%s was not closed: what was written to it is withdrawn", opened.name)
+                log.error("%s was not closed: its changes are discarded", opened.name)
             await opened.abandon()
 
 
 @asynccontextmanager
 async def _connected(target: Target, *, use_mount: bool) -> AsyncIterator[_Connected]:
-    """Connect for the length of the body; return after the vehicle's session is closed."""
+    """Connect for the length of the body; return after the vehicle's session has been closed."""
     with translated(), open_sinks(target.options, debug=False, tell=log.info) as sinks:
         target = replace(target, sinks=sinks)
         up = target.session(writing=True, list_root=True, use_mount=use_mount)
@@ -119,7 +121,7 @@ async def _connected(target: Target, *, use_mount: bool) -> AsyncIterator[_Conne
 def in_loop(
     method: Callable[Concatenate[Drone, ArgsT], Awaitable[ResultT]],
 ) -> Callable[Concatenate[Drone, ArgsT], ResultT]:
-    """Make an async method one that waits for its result, and raises the errors that programs get."""
+    """Turn an async method into one that waits for its result and raises the errors of programs."""
 
     @wraps(method)
     def call(self: Drone, /, *args: ArgsT.args, **kwargs: ArgsT.kwargs) -> ResultT:
@@ -135,7 +137,8 @@ def in_loop(
 def changing(
     method: Callable[Concatenate[Drone, ArgsT], Awaitable[ResultT]],
 ) -> Callable[Concatenate[Drone, ArgsT], ResultT]:
-    """As in_loop, for a method that changes something on the vehicle, which must be the one that is meant."""
+    """As in_loop, for a method that changes the vehicle: check first that the program can mean only this
+    one."""
 
     @wraps(method)
     async def checked(self: Drone, /, *args: ArgsT.args, **kwargs: ArgsT.kwargs) -> ResultT:
@@ -149,14 +152,14 @@ def changing(
 
 
 class Drone:
-    """A vehicle's files. Made by `connect`; every call may be made by several threads at once.
+    """A vehicle's files. Made by `connect`; several threads may make calls at once.
 
     Paths are text, bytes or path-like; relative ones begin at the root. Errors are OSErrors of the right kind
     (FileNotFoundError, PermissionError, TimeoutError ...), whose text is a sentence for people. After a fork
     every call raises RuntimeError, and after `close` ValueError.
 
     Attributes:
-        source: as it was given. mountpoint: of the mount whose files these are; None for a connection of its
+        source: as it was given. mountpoint: of the mount that serves the files; None for a connection of its
             own.
     """
 
@@ -170,17 +173,17 @@ class Drone:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing can be called any more."""
+        """Whether every further call raises ValueError."""
         return self._loop.closed
 
     @property
     def has_open_files(self) -> bool:
-        """Whether a file of it is open."""
+        """Whether the program has a file of this vehicle open."""
         return bool(self._connected.opened)
 
     def close(self) -> None:
-        """Close the vehicle's session. Files that were written and are still open are withdrawn, and named in
-        the log."""
+        """Close the vehicle's session. Discard the changes of files that are still open, and log these
+        files."""
         self._loop.close()
 
     def __enter__(self) -> Drone:
@@ -190,11 +193,11 @@ class Drone:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the drone."""
         self.close()
 
     def __del__(self) -> None:
-        """Have it closed, and do not wait."""
+        """Have the connection closed, and return at once."""
         loop = getattr(self, "_loop", None)
         if loop is not None and not loop.closed:
             loop.stop()
@@ -204,10 +207,10 @@ class Drone:
         return f"<Drone {self.source}>"
 
     async def _existing(self, path: PathLike) -> bytes:
-        """Return a path as the client has it. If it ends in a slash, it is checked that it is no file.
+        """Return a path as the client takes it. If the path ends in a slash, check that it is a directory.
 
         Raises:
-            NotADirectory, NotFound: it ends in a slash.
+            NotADirectory, NotFound: the path ends in a slash, and is a file or nothing.
         """
         wanted = remote(path)
         if names_directory(path) and (await self._files.stat(wanted)).kind is EntryKind.FILE:
@@ -218,7 +221,7 @@ class Drone:
 
     @in_loop
     async def stat(self, path: PathLike) -> Entry:
-        """Return what a path is.
+        """Return the entry of a path.
 
         Raises:
             FileNotFoundError, NotADirectoryError.
@@ -228,7 +231,7 @@ class Drone:
 
     @in_loop
     async def scandir(self, path: PathLike = "/") -> Iterator[Entry]:
-        """Yield what is in a directory. An incomplete listing is an error.
+        """Yield the entries of a directory. An incomplete listing is an error.
 
         Raises:
             FileNotFoundError, NotADirectoryError.
@@ -242,7 +245,7 @@ class Drone:
 
     @in_loop
     async def walk(self, path: PathLike = "/") -> Iterator[Entry]:
-        """Yield all that is below a directory, parents first.
+        """Yield everything below a directory, parents first.
 
         Raises:
             As scandir, of any directory below, too.
@@ -254,15 +257,15 @@ class Drone:
         return iter([entry(join(top, below), stat) for below, stat in found])
 
     def exists(self, path: PathLike) -> bool:
-        """Return whether there is something of that name."""
+        """Return whether the path exists."""
         return self._kind(path) is not None
 
     def is_dir(self, path: PathLike) -> bool:
-        """Return whether there is a directory of that name."""
+        """Return whether the path is a directory."""
         return self._kind(path) is EntryKind.DIRECTORY
 
     def is_file(self, path: PathLike) -> bool:
-        """Return whether there is a file of that name."""
+        """Return whether the path is a file."""
         return self._kind(path) is EntryKind.FILE
 
     @in_loop
@@ -279,12 +282,12 @@ class Drone:
 
     @in_loop
     async def status(self) -> dict[str, Any]:
-        """Return what `mavftpfs status --json` tells of vehicle, link and transfers."""
+        """Return the facts of `mavftpfs status --json` about vehicle, link and transfers."""
         return dict(await self._session.status())
 
     @in_loop
     async def refresh(self) -> None:
-        """Forget what is remembered of the vehicle, so that it is asked again; others may have changed it."""
+        """Drop the cached listings and data, because others may have changed the vehicle's files."""
         await self._files.refresh()
 
     # --- parameters
@@ -343,7 +346,8 @@ class Drone:
 
     @changing
     async def rename(self, old: PathLike, new: PathLike) -> None:
-        """Rename, over a file that is there. Where the card cannot rename it is copied, then removed."""
+        """Rename, replacing an existing file. Where the card cannot rename, the file is copied and then
+        removed."""
         source, target = await self._existing(old), remote(new)
         if names_directory(new) and (await self._files.stat(source)).kind is EntryKind.FILE:
             raise NotADirectory(f"{source!r} is not a directory")
@@ -351,7 +355,7 @@ class Drone:
 
     @changing
     async def copy(self, old: PathLike, new: PathLike) -> None:
-        """Copy a file, by way of this computer."""
+        """Copy a file through this computer."""
         source = await self._existing(old)
         if names_directory(new):
             raise IsADirectory(f"{remote(new)!r} is a directory")
@@ -359,7 +363,7 @@ class Drone:
 
     @changing
     async def truncate(self, path: PathLike, size: int) -> None:
-        """Cut a file, or extend it by zeros."""
+        """Cut a file, or extend it with zeros."""
         if size < 0:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         await self._files.truncate(await self._existing(path), size)
@@ -377,7 +381,7 @@ class Drone:
     ) -> IO[Any]:
         """Open a file as the builtin does; text is UTF-8 unless `encoding` says otherwise.
 
-        What was written is on the card, checked, when `close` returns.
+        When `close` returns, the written bytes are on the card and verified.
 
         Raises:
             FileNotFoundError, FileExistsError, IsADirectoryError ... ValueError: of the mode.
@@ -398,7 +402,7 @@ class Drone:
         return python_file(opened[0], self._loop, how, owner=self)
 
     async def _open(self, path: PathLike, mode: str) -> Opened:
-        """Open a file without any buffer; mode: r, w, a or x, perhaps with +."""
+        """Open a file without a buffer; mode: r, w, a or x, perhaps with +."""
         if mode != "r":
             await self._connected.require_one_vehicle()
         wanted, files = remote(path), self._files
@@ -432,10 +436,10 @@ class Drone:
 
     @in_loop
     async def write_bytes(self, path: PathLike, data: bytes) -> None:
-        """Make a file or replace its content; back when it is on the card, checked.
+        """Make a file or replace its content; return when the content is on the card, verified.
 
         Raises:
-            NotDelivered: it is not; see there.
+            NotDelivered: the card does not have it; `on_vehicle` says more.
         """
         view = memoryview(data).cast("B")
         opened = await self._open(path, "w")
@@ -445,7 +449,7 @@ class Drone:
             await opened.close()
 
     def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
-        """Return a file's content as text, each end of a line as `\\n`."""
+        """Return a file's content as text, with every line ending as `\\n`."""
         return io.TextIOWrapper(io.BytesIO(self.read_bytes(path)), encoding).read()
 
     def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:
@@ -465,13 +469,13 @@ class Drone:
         exclude: Patterns = (),
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Fetch a file, or with `recursive` a directory, proven; return the local files.
+        """Download a file, or with `recursive` a directory, and verify it; return the local files.
 
-        A file goes into `local` if that is a directory, else it gets that name. A directory goes into
-        `local`. include, exclude: a pattern or several, as of `mavftpfs get`.
+        If `local` is a directory, the file or directory goes into it. Otherwise `local` is the file's new
+        name. include, exclude: a pattern or several, as of `mavftpfs get`.
 
         Raises:
-            OSError: something did not come; the text says how much did. UsageError: an argument is wrong.
+            OSError: a file did not arrive; the text says how much did. UsageError: an argument is wrong.
         """
         selection = selection_of(include=include, exclude=exclude)
 
@@ -499,14 +503,14 @@ class Drone:
         exclude: Patterns = (),
         verify: Verify = "auto",
     ) -> list[Path]:
-        """Bring the vehicle's logs as `mavftpfs sync` does, and return those that are new here.
+        """Download the vehicle's logs as `mavftpfs sync` does, and return those that are new here.
 
-        place: their directory on the vehicle; None to find it. newest: at most so many; since: not older: a
-        date as of `--since` (`"2h"`, `"2026-05-01"`), a datetime, or seconds since 1970 UTC. include,
-        exclude: a pattern or several.
+        place: their directory on the vehicle; None to find it. newest: the largest number of logs. since: the
+        oldest time: a date as of `--since` (`"2h"`, `"2026-05-01"`), a datetime, or seconds since 1970 UTC.
+        include, exclude: a pattern or several.
 
         Raises:
-            OSError: a log did not come; the text says how many did. UsageError: an argument is wrong.
+            OSError: a log did not arrive; the text says how many did. UsageError: an argument is wrong.
         """
         where = None if place is None else remote(place)
         selection = selection_of(newest=newest, since=since, include=include, exclude=exclude)
@@ -530,12 +534,12 @@ class Drone:
     async def put(
         self, local: str | os.PathLike[str], path: PathLike, *, recursive: bool = False
     ) -> list[str]:
-        """Put a file, or with `recursive` a directory, on the vehicle; return the paths that are there.
+        """Upload a file, or with `recursive` a directory; return the vehicle's new paths.
 
         `path` is an existing directory, or the new name.
 
         Raises:
-            FileNotFoundError, IsADirectoryError: of `local`. NotDelivered: a file is not there; see there.
+            FileNotFoundError, IsADirectoryError: of `local`. NotDelivered: the vehicle does not have a file.
         """
         told: list[str] = []
         if stat.S_ISDIR(os.stat(local).st_mode) and not recursive:

@@ -15,7 +15,8 @@ PathLike = str | bytes | os.PathLike[str]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A file or directory. size: bytes; mtime: seconds since 1970 UTC, None if the vehicle does not tell."""
+    """A file or directory. size: bytes; mtime: seconds since 1970 UTC, None if the vehicle reports no
+    times."""
 
     name: str
     path: str
@@ -24,19 +25,19 @@ class Entry:
     kind: EntryKind
 
     def is_dir(self) -> bool:
-        """Return whether it is a directory."""
+        """Return whether the entry is a directory."""
         return self.kind is EntryKind.DIRECTORY
 
     def is_file(self) -> bool:
-        """Return whether it is a file."""
+        """Return whether the entry is a file."""
         return self.kind is EntryKind.FILE
 
 
 def remote(path: PathLike) -> bytes:
-    """Return a path as the client has it.
+    """Return a path as the client takes it.
 
     Raises:
-        LocalProtocolError: it holds `..` or NUL.
+        LocalProtocolError: the path contains `..` or NUL.
     """
     return normalise(b"/" + os.fsencode(path))
 

@@ -1,4 +1,4 @@
-"""Errors for programs: OSErrors of the right kind, with the sentence that people get. Layer: api."""
+"""Errors for programs: OSErrors of the right kind, with the command line's sentences. Layer: api."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ __all__ = ["NotDelivered", "UsageError", "os_error", "translated"]
 
 
 class NotDelivered(OSError):
-    """A file that was written is not on the vehicle, or that is not proven.
+    """The vehicle does not have a written file, or may not have it.
 
-    It is also of the kind of its reason: a TimeoutError, a PermissionError.
+    The error is also of the kind of its reason: a TimeoutError, a PermissionError.
 
     Attributes:
-        on_vehicle: what is there now. True: the file as it was written. False: what was there before, or
-            nothing; what was written is withdrawn, and nothing of it is sent later. None: that is not known.
+        on_vehicle: what is there now. True: the file as it was written. False: the old file, or none; the
+            changes are discarded, and nothing of them is sent later. None: unknown.
     """
 
     on_vehicle: bool | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle it, as pools of processes do with errors."""
+        """Pickle the error, as pools of processes do."""
         return _not_delivered, (self.errno, self.strerror, self.on_vehicle)
 
 
 def os_error(error: MavftpfsError, text: str = "") -> Exception:
-    """Return the error that a program gets in place of one of ours; with its text, unless another is given.
+    """Return the error that a program gets in place of a MavftpfsError; text: replaces its own text.
 
-    A UsageError stays one, which is a ValueError, unless the operating system is behind it.
+    A UsageError, which is a ValueError, stays unless the operating system caused it.
     """
     number, text = _number(error), readable(text or str(error))
     if isinstance(error, errors.NotDelivered):
@@ -47,7 +47,7 @@ def os_error(error: MavftpfsError, text: str = "") -> Exception:
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Turn errors of ours in the body into those that programs get."""
+    """Turn each MavftpfsError of the body into the error that programs get."""
     try:
         yield
     except MavftpfsError as exc:
@@ -58,20 +58,20 @@ def translated() -> Iterator[None]:
 
 
 def note_or_raise(undelivered: NotDelivered, error: BaseException | None) -> None:
-    """Note on the error of a `with` statement's body that its file was not delivered. Raise that instead, if
-    the body had no error, or one of a file."""
+    """Add a note about the undelivered file to the error of a `with` statement's body. Raise `undelivered`
+    itself if the body raised no error, or one about a file."""
     if error is None or isinstance(error, OSError):
         raise undelivered
     error.add_note(str(undelivered))
 
 
 def whereabouts(there: bool | None) -> str:
-    """Return the words about a file that was not delivered; see NotDelivered.on_vehicle."""
+    """Return the words for NotDelivered.on_vehicle."""
     if there is None:
-        return "it is not known what the vehicle has now: look before you use it"
+        return "the vehicle may have the old file, the new one, or a part: look before you use it"
     if there:
-        return "it is on the vehicle, whole"
-    return "withdrawn: the vehicle has what it had, and nothing of it is sent later"
+        return "the vehicle has the whole file"
+    return "discarded: the vehicle keeps what it had, and nothing is sent later"
 
 
 def _number(error: MavftpfsError) -> int:
@@ -89,7 +89,7 @@ def _number(error: MavftpfsError) -> int:
 
 
 def _not_delivered(number: int, text: str, there: bool | None) -> NotDelivered:
-    """Return a NotDelivered that is of the kind of an errno, too."""
+    """Return a NotDelivered that is also of an errno's kind."""
     kinds = (NotDelivered, type(OSError(number, text)))
     error: NotDelivered = type("NotDelivered", kinds, {"__module__": NotDelivered.__module__})(number, text)
     error.on_vehicle = there

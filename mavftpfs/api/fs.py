@@ -1,7 +1,7 @@
 """A vehicle's files for fsspec: `fsspec.filesystem("mftp", source=SOURCE)`. Layer: api.
 
-fsspec keeps instances for good, one for each thread. So they share a connection for each vehicle, which is
-made by the first call, and closed when it was idle for a while.
+fsspec keeps instances for good, one for each thread. So all instances share one connection to each vehicle.
+The first call makes the connection, and idle connections are closed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ IDLE = 60.0
 
 
 class _Connection:
-    """A connection that several file systems use, while any of them does."""
+    """A connection that several file systems share."""
 
     def __init__(self, source: str, idle: float, options: dict[str, Any]) -> None:
         self._connect = partial(connect, source, **options)
@@ -37,7 +37,7 @@ class _Connection:
 
     @contextmanager
     def used(self) -> Iterator[Drone]:
-        """Give the drone to the body, connected."""
+        """Give the body the connected drone."""
         with self._lock:
             if self._drone is None or self._drone.closed:
                 self._drone = self._connect()
@@ -61,12 +61,13 @@ class _Connection:
         self._timer.start()
 
     def _call_off(self) -> None:
-        """End the thread that waits to close it: else each call, and each closed connection, leaves one."""
+        """Stop the thread that waits to close the connection. Otherwise each call, and each closed
+        connection, would leave a thread."""
         if self._timer is not None:
             self._timer.cancel()
 
     def close(self) -> None:
-        """Close it, unless it is used."""
+        """Close the connection, unless a call uses it."""
         with self._lock:
             if self._drone is None or self._users:
                 return
@@ -92,10 +93,10 @@ def _connection(source: str, idle: float, options: dict[str, Any]) -> _Connectio
 class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
     """The file system of a vehicle.
 
-    Arguments: source, use_mount and options are those of `mavftpfs.connect`. auto_mkdir: a file that is
-    written gets the directories that its path needs. idle: seconds after which an unused connection is
-    closed. Listings and data are cached by the connection, as by a mount; what others change is seen after
-    `invalidate_cache`, or after dir_timeout (20 s).
+    Arguments: source, use_mount and options are those of `mavftpfs.connect`. auto_mkdir: writing a file also
+    makes its missing directories. idle: seconds after which an unused connection is closed. The connection
+    caches listings and data, as a mount does; changes by others become visible after `invalidate_cache`, or
+    after dir_timeout (20 s).
 
     Paths may be `mftp://` URLs: `mftp://[comp=ID:]path`.
     """
@@ -147,22 +148,22 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
         return [_info(entry) if detail else entry.path for entry in found]
 
     def info(self, path: str, **kwargs: Any) -> dict[str, Any]:
-        """Return what a path is."""
+        """Return the facts of a path."""
         with self._connection.used() as drone:
             return _info(drone.stat(self._strip_protocol(path)))
 
     def exists(self, path: str, **kwargs: Any) -> bool:
-        """Return whether there is something of that name; raise an error that does not tell."""
+        """Return whether the path exists; raise every error that leaves the answer open."""
         with self._connection.used() as drone:
             return drone.exists(self._strip_protocol(path))
 
     def isdir(self, path: str) -> bool:
-        """Return whether there is a directory of that name."""
+        """Return whether the path is a directory."""
         with self._connection.used() as drone:
             return drone.is_dir(self._strip_protocol(path))
 
     def isfile(self, path: str) -> bool:
-        """Return whether there is a file of that name."""
+        """Return whether the path is a file."""
         with self._connection.used() as drone:
             return drone.is_file(self._strip_protocol(path))
 
@@ -174,19 +175,19 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
         on_error: Any = None,
         **kwargs: Any,
     ) -> Any:
-        """As fsspec's; but a directory that cannot be listed is an error, not an empty one."""
+        """As fsspec's, except that a directory that cannot be listed is an error."""
         return super().walk(path, maxdepth, topdown, on_error=on_error or _unless_missing, **kwargs)
 
     def modified(self, path: str) -> datetime:
-        """Return when a file was changed.
+        """Return the time of a file's last change.
 
         Raises:
-            OSError: the vehicle does not tell.
+            OSError: the vehicle reports no times.
         """
         with self._connection.used() as drone:
             mtime = drone.stat(self._strip_protocol(path)).mtime
         if mtime is None:
-            raise OSError(f"{path}: the vehicle does not tell when it was changed")
+            raise OSError(f"{path}: the vehicle does not report when it was changed")
         return datetime.fromtimestamp(mtime, UTC)
 
     def checksum(self, path: str) -> int:
@@ -199,7 +200,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
         self._connection.close()
 
     def invalidate_cache(self, path: str | None = None) -> None:
-        """Forget what is remembered of the vehicle, so that it is asked again."""
+        """Drop the cached listings and data."""
         super().invalidate_cache(path)
         if self._connection.open:
             with self._connection.used() as drone:
@@ -233,7 +234,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
     def mv(
         self, path1: str, path2: str, recursive: bool = False, maxdepth: int | None = None, **kwargs: Any
     ) -> None:
-        """Rename on the vehicle; into a directory if `path2` is one."""
+        """Rename on the vehicle, or move into `path2` if that is a directory."""
         old, new = self._strip_protocol(path1), self._strip_protocol(path2)
         with self._connection.used() as drone:
             if drone.is_dir(new):
@@ -242,7 +243,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
                 drone.rename(old, new)
 
     def cp_file(self, path1: str, path2: str, **kwargs: Any) -> None:
-        """Copy a file, by way of this computer; a directory is only made."""
+        """Copy a file through this computer; of a directory only make a new one."""
         old, new = self._strip_protocol(path1), self._strip_protocol(path2)
         with self._connection.used() as drone:
             if drone.is_dir(old):
@@ -265,7 +266,7 @@ class DroneFileSystem(AbstractFileSystem):  # type: ignore[misc]
     ) -> Any:
         if not autocommit and "r" not in mode:
             raise NotImplementedError(
-                "a vehicle has no transactions: each file is in its place, whole, when it is closed; "
+                "a vehicle has no transactions: close() puts each whole file in place; "
                 "write without fs.transaction"
             )
         size = block_size if isinstance(block_size, int) and block_size > 1 else READ_BUFFER
@@ -285,7 +286,7 @@ _FSSPEC_OPTIONS = {
     *("use_listings_cache", "listings_expiry_time", "max_paths", "skip_instance_cache"),
     *("asynchronous", "loop", "batch_size", "add_docs", "add_aliases"),
 }
-"""Options of every file system of fsspec's, which are not of a connection."""
+"""Options of every fsspec file system, which a connection does not take."""
 
 
 def _info(entry: Entry) -> dict[str, Any]:

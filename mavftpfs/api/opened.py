@@ -13,7 +13,7 @@ from mavftpfs.shared.errors import MavftpfsError
 log = logging.getLogger("mavftpfs.api")
 
 PIECE = 1 << 20
-"""Bytes of one read while a file is read to its end."""
+"""Bytes of each read while a file is read to its end."""
 
 
 class Opened:
@@ -21,11 +21,11 @@ class Opened:
     loop.
 
     Attributes:
-        name: for people. writable: whether it may be changed by this.
+        name: for people. writable: whether a program may change the file through this object.
     """
 
     def __init__(self, name: str, file: File, *, writable: bool, forget: Callable[[Opened], None]) -> None:
-        """`forget(self)` is called when it is closed."""
+        """Keep an open file; `close` calls `forget(self)`."""
         self.name = name
         self.writable = writable
         self._file = file
@@ -37,26 +37,26 @@ class Opened:
 
     @property
     def closed(self) -> bool:
-        """Whether it is closed, and any error of that was raised."""
+        """Whether `close` has returned, or raised its error."""
         return self._closed
 
     @property
     def there(self) -> bool | None:
-        """After a close that failed, as NotDelivered.on_vehicle."""
+        """NotDelivered.on_vehicle after a failed close."""
         return self._writing.there
 
     @property
     def size(self) -> int:
-        """Bytes, as programs see it now."""
+        """The size in bytes that programs see now."""
         return self._file.size
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
-        """Return `size` bytes at `offset`, fewer only at the end."""
+        """Return `size` bytes at `offset`, or fewer at the end of the file."""
         with translated():
             return await self._file.read(offset, size)
 
     async def read_to_end(self, offset: int) -> bytes:
-        """Return all from `offset` on."""
+        """Return everything from `offset` on."""
         parts = []
         while data := await self.read(offset, PIECE):
             parts.append(data)
@@ -64,13 +64,13 @@ class Opened:
         return b"".join(parts)
 
     async def write(self, offset: int | None, data: bytes | memoryview) -> int:
-        """Take all of `data`, at the end if no offset is given; return the offset behind it."""
+        """Write all of `data`, at the end if there is no offset; return the offset behind it."""
         with self._changing():
             offset = self._file.size if offset is None else offset
             return offset + await self._file.write(offset, data)
 
     async def truncate(self, size: int) -> None:
-        """Cut or extend it."""
+        """Cut the file, or extend it with zeros."""
         with self._changing():
             await self._file.truncate(size)
 
@@ -85,11 +85,11 @@ class Opened:
                 raise
 
     def fail(self, error: BaseException) -> None:
-        """Have `close` withdraw what was written: a part of a file must not pass for the whole."""
+        """Have `close` discard the changes, because a part of a file must not pass for the whole."""
         self._failure = self._failure or error
 
     async def close(self) -> None:
-        """Deliver what was written; or have nothing of it on the card, and raise NotDelivered.
+        """Put the changes on the card; or leave the card as it was, and raise NotDelivered.
 
         Raises:
             NotDelivered.
@@ -105,11 +105,11 @@ class Opened:
             elif isinstance(self._failure, MavftpfsError):
                 await self._writing.fail(self._failure)
             else:
-                await self._writing.fail(MavftpfsError(f"{self.name}: writing it was interrupted"))
+                await self._writing.fail(MavftpfsError(f"{self.name}: the write was interrupted"))
 
     async def abandon(self) -> None:
-        """Close it, and withdraw what was written; log it if that cannot be done. Twice is harmless. Raises
-        no MavftpfsError."""
+        """Close the file and discard its changes; log a failure to do so. Calling this twice is harmless.
+        Never raises MavftpfsError."""
         if self._closed:
             return
         self._end()

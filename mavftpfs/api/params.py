@@ -24,24 +24,24 @@ async def get_values(session: Session) -> dict[str, Number]:
 
 
 def _number(one: Parameter) -> Number:
-    """Return a value; for a 32-bit float its shortest decimal: 0.1, not 0.10000000149."""
+    """Return a value; a 32-bit float as its shortest decimal: 0.1, not 0.10000000149."""
     text = client.value_text(one)
     return float(text) if one.kind is Kind.FLOAT else int(text)
 
 
 def _text(name: str, value: Number) -> str:
-    """Return a number as text, also one of numpy's."""
+    """Return a number as text; also takes numpy's numbers."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise UsageError(f"{name} is a number, not {value!r}")
     return repr(int(value) if isinstance(value, Integral) else float(value))
 
 
 async def set_values(session: Session, values: Mapping[str, Number]) -> None:
-    """Set parameters; each is read back. Values that the vehicle has already are not sent.
+    """Set parameters, and read each one back. Values that the vehicle already has are not sent.
 
     Raises:
-        UsageError: a name that the vehicle does not have, or a value that is no number: nothing is set.
-        InvalidText: a value does not fit: nothing is set. NotTaken: the vehicle did not take some; the text
+        UsageError: the vehicle does not have a name, or a value is not a number; nothing is set.
+        InvalidText: a value does not fit; nothing is set. NotTaken: the vehicle did not accept some; the text
             names them.
     """
     lines = client.assignments([f"{name}={_text(name, value)}" for name, value in values.items()])
@@ -57,8 +57,8 @@ async def set_values(session: Session, values: Mapping[str, Number]) -> None:
 
 
 class Params(Mapping[str, Number]):
-    """The parameters of a Drone, as they were at the first look. `drone.params` is a new one each time, which
-    asks the vehicle again. Setting one, or several by `update`, returns when the new values were read back.
+    """The parameters of a Drone, read at the first use. Each `drone.params` is a new object, which reads them
+    again. Setting one, or several by `update`, returns when the new values have been read back.
     """
 
     def __init__(
@@ -86,15 +86,15 @@ class Params(Mapping[str, Number]):
         return iter(self._all())
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of parameters."""
         return len(self._all())
 
     def update(self, values: Mapping[str, Number]) -> None:
-        """Set several at once.
+        """Set several parameters at once.
 
         Raises:
             UsageError (a ValueError), OSError of EINVAL: a name or value is invalid, and nothing is set.
-            OSError: the vehicle did not take some, and the text names them; EROFS: it is armed.
+            OSError: the vehicle did not accept some, and the text names them; EROFS: it is armed.
         """
         self._seen = None
         self._write(values)

@@ -1,8 +1,8 @@
-"""An event loop in a thread of its own, and calls into it from any other. Layer: api.
+"""An event loop in a thread of its own, and calls to it from other threads. Layer: api.
 
-A call that waits can be interrupted: Ctrl-C cancels it, and it ends in order. A finalizer may not wait, so it
-posts. The thread is a daemon. When the interpreter ends, all that is open is closed, for EXIT_PATIENCE at
-most.
+Ctrl-C cancels a call that waits, and the call cleans up before it returns. A finalizer may not wait, so it
+posts. The thread is a daemon. At the interpreter's end `_close_all` closes everything that is open, within
+EXIT_PATIENCE.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ T = TypeVar("T")
 ResultT = TypeVar("ResultT")
 
 EXIT_PATIENCE = 10.0
-"""Seconds that the end of the interpreter waits for the sessions to be closed."""
+"""Seconds that the end of the interpreter waits for sessions to close."""
 
 
 class Closed(ValueError):
-    """The event loop has ended, or was told to."""
+    """The event loop has ended, or has been told to end."""
 
 
 class _Call(Generic[ResultT]):
-    """A call, from a thread into the loop. scope: cancels it."""
+    """A call from a thread into the loop. scope: cancels the call."""
 
     def __init__(self, function: Callable[..., Awaitable[ResultT]], args: tuple[Any, ...]) -> None:
         self._function = function
@@ -39,24 +39,24 @@ class _Call(Generic[ResultT]):
         self.outcome: Future[ResultT] = Future()
 
     async def run(self) -> None:
-        """Run in the loop. Raises nothing but Cancelled."""
+        """Run in the loop. Never raises, except Cancelled."""
         try:
             with self.scope:
                 try:
                     self.outcome.set_result(await self._function(*self._args))
-                except Exception as exc:  # raised again in the thread that waits
+                except Exception as exc:  # `wait` raises the error again in its own thread
                     self.outcome.set_exception(exc)
         finally:
             self.end()
 
     def end(self) -> None:
-        """Have nobody wait for it any more; it may have a result, or an error."""
+        """Release the thread that waits; harmless if the call has a result or an error."""
         if self.outcome.cancel():
-            self.outcome.set_running_or_notify_cancel()  # else `wait` goes on
+            self.outcome.set_running_or_notify_cancel()  # otherwise `wait` would wait on
 
 
 class LoopThread(Generic[T]):
-    """Runs an async context in a thread of its own, and calls from other threads in it.
+    """An async context in a thread of its own, and the calls of other threads in that context.
 
     | | from | waits for |
     |---|---|---|
@@ -64,16 +64,16 @@ class LoopThread(Generic[T]):
     | `post`, `stop` | any thread, at any time: for finalizers | nothing |
     | `close` | any thread | the end of the loop; in the loop's own thread nothing |
 
-    In another process than its own, after a fork, `call` raises and the others do nothing. `stop` ends the
-    calls that are under way, and leaves the context. What the context does at its exit is not cut off. The
-    loop and the thread end with it.
+    After a fork, in the child process, `call` raises and the others do nothing. `stop` cancels the running
+    calls and leaves the context. The context's own exit always runs to its end; then the loop and the thread
+    end.
 
     Attributes:
-        value: what the context gave.
+        value: the result of entering the context.
     """
 
     def __init__(self, context: Callable[[], AbstractAsyncContextManager[T]], name: str) -> None:
-        """Start, and wait until the context is entered; raises what that raises. name: for people."""
+        """Start the thread, and wait until the context is entered; raise its error. name: for people."""
         self._context = context
         self._name = name
         self._pid = os.getpid()
@@ -95,17 +95,17 @@ class LoopThread(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether nothing can be called any more."""
+        """Whether every further call raises."""
         return self._stopping or self._ended.done()
 
     # --- from any thread
 
     def call(self, function: Callable[..., Awaitable[ResultT]], *args: Any) -> ResultT:
-        """Have an async function run in the loop; return its result. Ctrl-C ends the call in order; a second
-        one does not wait for that.
+        """Run an async function in the loop; return its result. Ctrl-C cancels the call and waits for its
+        cleanup; a second Ctrl-C does not wait.
 
         Raises:
-            RuntimeError: after a fork, or from the loop's own thread. Closed. Else what the function raises.
+            RuntimeError: after a fork, or from the loop's own thread. Closed. Also the function's own errors.
         """
         if os.getpid() != self._pid:
             raise RuntimeError(
@@ -125,23 +125,23 @@ class LoopThread(Generic[T]):
             self._wait(call)
             raise
         if not call.outcome.done() or call.outcome.cancelled():
-            self.close()  # it tells why when it has ended
+            self.close()  # which knows the reason once the thread has ended
             raise self._reason()
         return call.outcome.result()
 
     def post(self, function: Callable[..., Awaitable[None]], *args: Any) -> None:
-        """Have a function run, and do not wait; after the loop has ended, do nothing."""
+        """Run a function in the loop, without waiting for it; after the loop's end do nothing."""
         if os.getpid() == self._pid:
             self._soon(self._spawn, _Call(function, args))
 
     def close(self, *, patience: float | None = None) -> None:
-        """Leave the context, and wait until it is left. patience: seconds to wait at most."""
+        """Leave the context, and wait until the thread has ended. patience: seconds to wait at most."""
         self.stop()
         if os.getpid() == self._pid and threading.current_thread() is not self._thread:
             wait([self._ended], timeout=patience)
 
     def stop(self) -> None:
-        """Have the context left, and do not wait for that. For finalizers."""
+        """Have the context left, without waiting. For finalizers."""
         if os.getpid() == self._pid:
             self._stopping = True
             _running.discard(self)
@@ -150,8 +150,8 @@ class LoopThread(Generic[T]):
     # --- inside
 
     def _soon(self, function: Callable[..., object], *args: Any) -> None:
-        """Have a function called in the loop, unless that has not begun, or has ended. What trio takes it
-        carries out before it ends."""
+        """Call a function in the loop, unless the loop has not begun, or has ended. trio runs all accepted
+        functions before it ends."""
         if self._token is not None:
             with suppress(trio.RunFinishedError):
                 self._token.run_sync_soon(function, *args)
@@ -161,7 +161,7 @@ class LoopThread(Generic[T]):
         wait([call.outcome, self._ended], return_when=FIRST_COMPLETED)
 
     def _reason(self) -> BaseException:
-        """Return why nothing can be called."""
+        """Return the reason why calls are impossible."""
         return self._error or Closed(f"the connection to {self._name} is closed")
 
     # --- in the loop's thread
@@ -169,7 +169,7 @@ class LoopThread(Generic[T]):
     def _run(self) -> None:
         try:
             trio.run(self._main)
-        except BaseException as exc:  # raised again in the threads that wait
+        except BaseException as exc:  # the threads that wait raise it again
             self._error = _first(exc)
         if not self._entered.done():
             self._entered.set_exception(self._reason())
@@ -193,7 +193,7 @@ class LoopThread(Generic[T]):
             call.end()
 
     def _stop(self) -> None:
-        """Cancel: the calls and the body of the context; or, before it is entered, that."""
+        """Cancel the calls and the body of the context, or the entering of the context."""
         self._scope.cancel()
 
 
@@ -208,7 +208,7 @@ _running: set[LoopThread[Any]] = set()
 
 
 def _close_all() -> None:
-    """Close, as the interpreter ends, all connections that are open, with their vehicles' sessions."""
+    """Close all open connections and their vehicles' sessions, as the interpreter ends."""
     loops = list(_running)
     for loop in loops:
         loop.stop()

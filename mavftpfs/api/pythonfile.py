@@ -1,8 +1,8 @@
 """Python's files over an open file of a vehicle. Layer: api.
 
-`RawFile` has no buffer; Python's own buffers and text lie over it. Garbage is collected in any thread, also
-in the event loop's, so a finalizer must not wait. A file that is collected without having been closed
-delivers nothing: the raw file posts that it is to be abandoned, and says what is lost.
+`RawFile` has no buffer; Python's own buffers and text files use it. Python may collect garbage in any thread,
+also in the event loop's, so a finalizer must not wait. Collecting a file that was never closed delivers
+nothing: the raw file posts that its changes are discarded, and warns.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ log = logging.getLogger("mavftpfs.api")
 
 READ_BUFFER = 128 * 1024
 WRITE_BUFFER = 128 * 1024
-"""Bytes that are asked for, or handed on, at once."""
+"""Bytes of each request to the event loop."""
 
 FIRST_READ = 4 * 1024
-"""Bytes that a buffer asks for at first, and after a seek; twice as many each time, while a program reads on.
-A radio carries 5 kB in a second, and a program may want only the head of a file."""
+"""Bytes of a buffer's first read, and of the first one after a seek; each further read doubles them. A radio
+carries 5 kB in a second, and a program may want only the head of a file."""
 
 
 class Mode:
     """The arguments of open(), checked before anything is opened.
 
     Attributes:
-        plain: r, w, a or x, and perhaps +. text: whether it is opened as text.
+        plain: r, w, a or x, and perhaps +. text: whether the file is opened as text.
     """
 
     def __init__(
@@ -45,7 +45,8 @@ class Mode:
         errors: str | None = None,
         newline: str | None = None,
     ) -> None:
-        """Raises: ValueError, LookupError: they are invalid, or contradict one another."""
+        """Check the arguments. Raises ValueError or LookupError if they are invalid, or contradict one
+        another."""
         letters = set(mode)
         kinds = letters & set("rwax")
         known = len(letters) == len(mode) and letters <= set("rwaxbt+")
@@ -65,20 +66,20 @@ class Mode:
 
     @property
     def reads(self) -> bool:
-        """Whether it may be read."""
+        """Whether the file may be read."""
         return self.plain[0] == "r" or "+" in self.plain
 
     @property
     def writes(self) -> bool:
-        """Whether it may be written."""
+        """Whether the file may be written."""
         return self.plain != "r"
 
 
 class _Ending:
-    """How a `with` statement of a written file ends."""
+    """The end of a `with` statement around a file."""
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: Any) -> None:
-        """Close. If the body was interrupted, that error stays, with a note of what became of the file."""
+        """Close the file. If the body raised an error, keep that, with a note about the file."""
         try:
             self.close()  # type: ignore[attr-defined]
         except NotDelivered as exc:
@@ -93,7 +94,7 @@ class RawFile(_Ending, io.RawIOBase):
     """
 
     def __init__(self, opened: Opened, loop: LoopThread[Any], mode: Mode, owner: object = None) -> None:
-        """`owner` lives as long as this file."""
+        """Wrap an open file; `owner` lives as long as this one."""
         super().__init__()
         self._owner = owner
         self.name = opened.name
@@ -111,23 +112,24 @@ class RawFile(_Ending, io.RawIOBase):
         return self._opened.size
 
     def readable(self) -> bool:
-        """Whether it may be read."""
+        """Return whether the file may be read."""
         return self._mode.reads
 
     def writable(self) -> bool:
-        """Whether it may be written."""
+        """Return whether the file may be written."""
         return self._mode.writes
 
     def seekable(self) -> bool:
-        """Return True: every file can seek."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Fill the buffer as far as the file goes, or less of a large one; returns the bytes."""
+        """Fill the buffer up to the end of the file, or a part of a large buffer; return the number of
+        bytes."""
         self._require(self._mode.reads, "readable")
         view = memoryview(buffer).cast("B")
         size = len(view)
-        if self._mode.buffering != 0 and size <= READ_BUFFER:  # a program that wants more says how much
+        if self._mode.buffering != 0 and size <= READ_BUFFER:  # a program that wants more asks for more
             further = self._at == self._read_to
             self._ahead = min(2 * self._ahead, READ_BUFFER) if further else FIRST_READ
             size = min(size, self._ahead)
@@ -138,26 +140,26 @@ class RawFile(_Ending, io.RawIOBase):
         return len(data)
 
     def readall(self) -> bytes:
-        """Return all that follows."""
+        """Return everything from the position on."""
         self._require(self._mode.reads, "readable")
         data = self._loop.call(self._opened.read_to_end, self._at)
         self._at += len(data)
         return data
 
     def write(self, data: Any, /) -> int:
-        """Take all of it; see Opened.write."""
+        """Write all of `data`; see Opened.write."""
         taken = bytes(memoryview(data))  # a copy: the program may interrupt the call, and change the buffer
         self._require(self._mode.writes, "writable")
         at = None if self._mode.plain[0] == "a" else self._at
         try:
             self._at = self._loop.call(self._opened.write, at, taken)
-        except BaseException as exc:  # it may be written already, and Python's buffer will write it again
+        except BaseException as exc:  # if bytes were written, Python's buffer writes them again
             self._opened.fail(exc)
             raise
         return len(taken)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Set and return the position."""
+        """Set the position, and return it."""
         self._require(True, "")
         starts = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._opened.size}
         if whence not in starts:
@@ -173,7 +175,7 @@ class RawFile(_Ending, io.RawIOBase):
         return self._at
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Cut or extend it to `size`, or to the position; returns the size."""
+        """Cut or extend the file to `size`, or to the position; return the size."""
         self._require(self._mode.writes, "writable")
         size = self._at if size is None else size
         if size < 0:
@@ -182,10 +184,10 @@ class RawFile(_Ending, io.RawIOBase):
         return size
 
     def close(self) -> None:
-        """Return when what was written is on the card, checked.
+        """Close the file; return when its content is on the card, verified.
 
         Raises:
-            NotDelivered: it is not; `on_vehicle` says what is there.
+            NotDelivered: the card does not have it; `on_vehicle` says what is there.
         """
         if self.closed:
             return
@@ -201,13 +203,13 @@ class RawFile(_Ending, io.RawIOBase):
             raise
 
     def __del__(self) -> None:
-        """Post the rest of the work, and do not wait."""
+        """Post the rest of the work, without waiting."""
         if self.closed or getattr(self, "_pid", None) != os.getpid():
             return
         super().close()
         if self._opened.closed:
             return
-        lost = ": what was written to it is withdrawn" if self._mode.writes else ""
+        lost = ": its changes are discarded" if self._mode.writes else ""
         self._loop.post(self._opened.abandon)
         if lost:
             log.error("%s was not closed%s", self.name, lost)
@@ -222,7 +224,7 @@ class RawFile(_Ending, io.RawIOBase):
 
 class _Buffer(_Ending):
     def __del__(self) -> None:
-        """As RawFile's, which follows: Python's would deliver, and wait."""
+        """Do as RawFile's, which follows, because Python's would deliver, and wait."""
 
 
 class _Reader(_Buffer, io.BufferedReader): ...
@@ -238,7 +240,7 @@ class _Text(_Buffer, io.TextIOWrapper): ...
 
 
 def python_file(opened: Opened, loop: LoopThread[Any], mode: Mode, *, owner: object = None) -> IO[Any]:
-    """Return what the builtin open() would; `owner` lives as long as it."""
+    """Return the file that the builtin open() would; `owner` lives as long as the file."""
     raw: Any = RawFile(opened, loop, mode, owner)
     if mode.buffering == 0:
         return raw  # type: ignore[no-any-return]

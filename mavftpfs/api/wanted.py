@@ -1,4 +1,4 @@
-"""Which files a program wants, checked before anything is sent. Layer: api."""
+"""The files that a program chooses, checked before anything is sent. Layer: api."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def selection_of(
     include: Patterns = (),
     exclude: Patterns = (),
 ) -> Selection:
-    """Return what the arguments of a call choose.
+    """Return the selection that the arguments of a call describe.
 
     Raises:
-        UsageError: an argument is none of what it may be; the text names it.
+        UsageError: an argument is invalid; the text names it.
     """
     if newest is not None and (not isinstance(newest, int) or isinstance(newest, bool) or newest < 1):
-        raise UsageError(f"newest={newest!r} is no number of logs")
+        raise UsageError(f"newest={newest!r} is not a number of logs: give an int above 0")
     return Selection(newest, _seconds(since), _patterns("include", include), _patterns("exclude", exclude))
 
 
 def verify_of(verify: str) -> Verify:
-    """Return how files are to be proven.
+    """Return the way to verify files.
 
     Raises:
         UsageError: there is no such way.

@@ -474,7 +474,7 @@ def test_a_mount_that_takes_a_part_of_a_write_has_not_taken_it(field: Field) -> 
     card = field.local("card")
     mount = field.mount(field.sim(card).source)
     resource.prlimit(mount.alive().popen.pid, resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-    with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="withdrawn") as caught:
+    with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="discarded") as caught:
         drone.write_bytes("/f", bytes(3 << 20))
     assert caught.value.errno == errno.ENOSPC
     assert list(card.iterdir()) == []

@@ -153,7 +153,7 @@ def test_calls_of_its_own(fs: DroneFileSystem) -> None:
     assert not fs.exists("/n")
     with pytest.raises(FileNotFoundError):
         fs.cat_file("/n/text")
-    with pytest.raises(OSError, match="does not tell"):
+    with pytest.raises(OSError, match="does not report"):
         fs.modified("/d/f")
     assert pickle.loads(pickle.dumps(fs)).isfile("/d/f")
 

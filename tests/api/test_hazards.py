@@ -90,7 +90,7 @@ def test_what_was_not_delivered_is_said_and_never_comes(
             file.write(NEW)
         with silent(sim):
             for end in (lambda: drone.put(tmp_path / "local", "/put"), *(file.close for file in files)):
-                with pytest.raises(mavftpfs.NotDelivered, match="withdrawn") as caught:
+                with pytest.raises(mavftpfs.NotDelivered, match="discarded") as caught:
                     end()
                 assert isinstance(caught.value, TimeoutError)
                 assert caught.value.on_vehicle is False
@@ -150,9 +150,9 @@ def test_a_reader_of_the_mount_sees_all_that_was_withdrawn_or_nothing_of_it(
         file = drone.open("/f", "wb", buffering=0)
         file.write(NEW)
         assert asked("open") == f"{len(NEW)}"
-        with pytest.warns(ResourceWarning, match="withdrawn"):
+        with pytest.warns(ResourceWarning, match="discarded"):
             del file
-        wait_until("it is withdrawn", lambda: drone.stat("/f").size == len(OLD))
+        wait_until("its changes are discarded", lambda: drone.stat("/f").size == len(OLD))
         assert asked("") == f"{len(NEW)}"
         assert asked("open") == f"{len(NEW)} {len(OLD)}"
     assert on_card(sim) == {"f": OLD}
@@ -167,7 +167,7 @@ f = drone.open("/f", "wb", buffering=0)
 f.write(b"half")
 os.spawnlp(os.P_WAIT, "true", "true")
 """
-    assert "what was written to it is withdrawn" in program(sim, code).stderr
+    assert "its changes are discarded" in program(sim, code).stderr
     assert on_card(sim) == {"f": OLD}
 
 
@@ -222,7 +222,7 @@ def test_ctrl_c_while_a_file_is_written_withdraws_it(sim: SimVehicle) -> None:
 
         with silent(sim), pytest.raises(KeyboardInterrupt) as caught, ctrl_c():
             write_half()
-        assert "withdrawn" in caught.value.__notes__[0]
+        assert "discarded" in caught.value.__notes__[0]
         settle(drone)
         assert drone.read_bytes("/f") == OLD
 
@@ -251,7 +251,7 @@ def test_ctrl_c_just_after_a_write_does_not_append_twice(
         with pytest.raises(KeyboardInterrupt):
             file.flush()
         monkeypatch.undo()
-        with pytest.raises(mavftpfs.NotDelivered, match="withdrawn"):
+        with pytest.raises(mavftpfs.NotDelivered, match="discarded"):
             file.close()
     assert on_card(sim) == {"f": OLD}
 
@@ -281,7 +281,7 @@ def test_an_open_file_may_be_collected_in_the_connection_s_own_thread(sim: SimVe
         assert [str(one.message).partition(":")[0] for one in told if one.category is ResourceWarning] == [
             "/f was not closed"
         ]
-        wait_until("it is withdrawn", lambda: drone.read_bytes("/f") == OLD)
+        wait_until("its changes are discarded", lambda: drone.read_bytes("/f") == OLD)
     assert on_card(sim) == {"f": OLD}
 
 
@@ -318,7 +318,7 @@ def program(sim: SimVehicle, code: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("end", ["", "sys.exit(3)", "raise SystemError('bug')"])
 def test_a_program_that_closes_nothing_ends_and_says_what_is_lost(sim: SimVehicle, end: str) -> None:
     done = program(sim, f"f = drone.open('/f', 'w'); f.write('half'); g = drone.open('/f')\n{end}")
-    assert done.stderr.count("/f was not closed: what was written to it is withdrawn") == 1
+    assert done.stderr.count("/f was not closed: its changes are discarded") == 1
     assert done.returncode == (3 if "3" in end else 1 if "bug" in end else 0)
     assert on_card(sim) == {"f": OLD}
 
@@ -390,7 +390,7 @@ def test_an_error_of_the_program_is_not_replaced_by_that_of_its_file(sim: SimVeh
 
     with mavftpfs.connect(sim.source, **QUICK) as drone, silent(sim), pytest.raises(KeyError) as caught:
         write_half(drone)
-    assert "withdrawn" in caught.value.__notes__[0]
+    assert "discarded" in caught.value.__notes__[0]
 
 
 @pytest.mark.mount
