@@ -276,7 +276,7 @@ class _Printed(download.Reports):
 
 def _say_what_is_not_proven(outcome: download.Outcome) -> None:
     for lacking, count in outcome.lacking.items():
-        say(f"not proven: {lacking} ({count_files(count)})")
+        say(f"not verified: {lacking} ({count_files(count)})")
 
 
 def _download(
@@ -309,7 +309,7 @@ def _sync_summary(outcome: download.Outcome) -> str:
     verified = [outcome.verified[log.remote] for log in outcome.here if log.remote in outcome.verified]
     proven = sum(not one.lacking for one in verified)
     line = f"{new} new ({readable_size(size)}), {len(outcome.here)} here already"
-    line += f" ({proven} proven now)" if proven else ""
+    line += f" ({proven} verified now)" if proven else ""
     line += f", from {_name(outcome.place)}"
     missing = sum(wanted.remote in outcome.failed for wanted in outcome.wanted)
     if missing:
@@ -336,7 +336,7 @@ def _print_comparison(outcome: download.Outcome) -> None:
     unproven = sum(outcome.lacking.values())
     same = len(outcome.verified) - len(differing) - unproven
     parts = [f"{same} the same", f"{len(differing)} differ"]
-    parts += [f"{unproven} not proven"] if unproven else []
+    parts += [f"{unproven} not verified"] if unproven else []
     print(f"{', '.join(parts)}, {len(outcome.wanted)} not here, from {_name(outcome.place)}")
 
 

@@ -404,7 +404,7 @@ class Fetcher:
             return found
         if not found.later:
             raise DataUnproven(f"{name} was resumed, and there is no checksum: {found.lacking}")
-        raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not proven: {found.lacking}")
+        raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not verified: {found.lacking}")
 
     async def _require_size(self, remote: bytes, name: str, size: int) -> None:
         """Ask for the size again, because no checksum shows that the file is whole.

@@ -436,7 +436,7 @@ class VehicleSync(Reports):
             self._tell(f"{name} is here, verified by {verified.how}{fetched.kept_words}")
         else:
             self.policy.failed(trio.current_time())
-            self._tell(f"{name} is here, not proven: {verified.lacking}")
+            self._tell(f"{name} is here, not verified: {verified.lacking}")
 
     def failed(self, name: str, error: MavftpfsError) -> None:
         """See Reports."""
