@@ -395,7 +395,7 @@ class Deliverer:
         await attempt.upload.finish()
         if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        await self._context.store.let_rest(attempt.path)
+        await self._context.store.wait_out(attempt.path)
         crc32 = await self._compare_and_look(node, draft, attempt)
         with self._context.store.finishing():
             node.attempt = None
@@ -426,7 +426,7 @@ class Deliverer:
         begun_at = context.clock()
         if in_place:
             await self._require_untouched(node, draft)
-            await context.store.let_rest(path)
+            await context.store.wait_out(path)
         else:
             path = context.own.need(node.path, Kind.NEW)
         try:

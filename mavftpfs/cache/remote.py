@@ -215,7 +215,8 @@ class VehicleStore(RemoteStore, Protocol):
 
     def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Make a file by CreateFile and write it, in a task of its own. Sends nothing before the source has
-        something, or `finish` is called. The caller had the name rest (`let_rest`), unless it is new.
+        something, or `finish` is called. Unless the name is new, the caller waited for the end of its
+        quarantine (`wait_out`).
 
         `path` is a reserved name, or, on cards that cannot rename, the file's own: it is free, or has the
         file that is to be replaced. An upload that was interrupted goes on by OpenFileWO where that was seen
@@ -223,9 +224,10 @@ class VehicleStore(RemoteStore, Protocol):
         """
         ...
 
-    async def let_rest(self, path: bytes) -> None:
-        """Wait until no late copy of a request can harm the next file of this name. Returns at once, unless
-        copies were seen to come late, or we repeated such a request (session.doubt: LateCopies)."""
+    async def wait_out(self, path: bytes) -> None:
+        """Wait until no late duplicate of a request can harm the next file of this name. Returns at once,
+        unless duplicates were seen to come late, or this session repeated such a request
+        (session.quarantine)."""
         ...
 
     def finishing(self) -> AbstractContextManager[None]:
@@ -246,8 +248,8 @@ class VehicleStore(RemoteStore, Protocol):
         ...
 
     async def remove(self, path: bytes, *, at_once: bool = False) -> None:
-        """Remove what is known to be a file. at_once: without `let_rest`, because the name is not used again.
-        A late copy of CreateFile could only leave an empty file there."""
+        """Remove what is known to be a file. at_once: without `wait_out`, because the name is not used again.
+        A late duplicate of CreateFile could only leave an empty file there."""
         ...
 
     async def make_directory(self, path: bytes) -> None:

@@ -22,7 +22,6 @@ import trio
 from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import Operation
-from mavftpfs.session.doubt import LASTS, LateCopies
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import (
     LEFT_OPEN,
@@ -32,6 +31,7 @@ from mavftpfs.session.others import (
     asks_to_open,
     took_session,
 )
+from mavftpfs.session.quarantine import LASTS, Quarantine
 from mavftpfs.shared.errors import (
     FtpNak,
     MavftpfsError,
@@ -121,7 +121,7 @@ class ServerSession:
         file_since: when the last open went out, and once its ACK came, when that was. What went out before
         concerns an earlier file.
         epoch: when what was read lately last came into doubt; each time is later than the one before.
-        late_copies: which names rest.
+        quarantine: of names that were changed.
         others: other clients of this server.
         on_reads_distrusted: called with the reason whenever the epoch is raised.
         changed: where tasks park until something changed: turns, what is open, what is wanted.
@@ -147,7 +147,7 @@ class ServerSession:
         self.maybe_open: set[tuple[int, bytes]] = set()
         self.file_since = -inf
         self.epoch = self._distrusted_at = -inf
-        self.late_copies = LateCopies()
+        self.quarantine = Quarantine()
         self.others = OtherClients(rng)
         self.on_reads_distrusted: Callable[[str], None] = lambda why: None
         self._asked_sessions_at = -inf
@@ -193,7 +193,7 @@ class ServerSession:
         that the server executed that open once more, and MAVSDK's then has its file in the place of the
         present one.
         """
-        self.late_copies.saw(lateness, self.clock())
+        self.quarantine.saw(lateness, self.clock())
         self.distrust("an answer came that no request of ours explains", reads=self._is_older_open(reply))
 
     def on_late(self, reply: Payload, sent_at: float) -> None:
@@ -201,7 +201,7 @@ class ServerSession:
 
         sent_at: when the request went out first. An open of an earlier file may have put that in the place of
         the present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later
-        one. After changes of names the names rest, see LateCopies.
+        one. Names that were changed are in quarantine.
         """
         if sent_at >= self.file_since:
             return  # the open that is closed next, or a WriteFile to the last file
@@ -271,11 +271,11 @@ class ServerSession:
                 pass
         finally:
             if opcode == Opcode.CREATE_FILE:
-                late, now = self.late_copies, self.clock()
-                late.on_changed(path, now)
                 # Where nothing can be renamed a file is not compared once more under its final name.
-                if self.engine.traits.rename_works is False and (self.session is None or self.session.resent):
-                    late.on_maybe_under_way(path, now - tried.began, now)
+                repeated = self.session is None or self.session.resent
+                counts = repeated and self.engine.traits.rename_works is False
+                now = self.clock()
+                self.quarantine.on_changed(path, now, now - tried.began if counts else 0.0)
         if self.session is None:
             raise _lost()
         return self.session

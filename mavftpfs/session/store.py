@@ -3,8 +3,8 @@
 Did that change happen? A request whose answer was lost is sent again, and may be carried out twice. The
 second time it is refused, or hits the name's next file (docs/servers.md 14.4). So after such a refusal, and
 after a silence, a listing tells whether the change happened. While ACKs are distrusted
-(`ServerSession.distrust`) the network may also have doubled a request that we sent once. Where copies of
-requests came late, names rest between two changes (LateCopies). Only `let_rest` waits for that.
+(`ServerSession.distrust`) the network may also have doubled a request that was sent once. A name that was
+changed may be in quarantine before it is changed again (`session.quarantine`); only `wait_out` waits for it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.protocol.writing import Pieces, WriteTransfer
-from mavftpfs.session.doubt import MOST_REST
 from mavftpfs.session.happened import After, Names, Outcome, together
+from mavftpfs.session.quarantine import MOST
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler, SessionUser
 from mavftpfs.session.serversession import OpenSession
@@ -112,12 +112,10 @@ class Store:
         self._vehicle = scheduler.server.vehicle
         self._clock = scheduler.clock
         self._op_deadline = scheduler.server.op_deadline
-        self._longest_change = (
-            inf if scheduler.server.patient else self._op_deadline + MOST_REST + VERIFY_LIMIT
-        )
+        self._longest_change = inf if scheduler.server.patient else self._op_deadline + MOST + VERIFY_LIMIT
         self._sent = 0
         self._under_way = 0
-        self._late_copies = scheduler.server.late_copies
+        self._quarantine = scheduler.server.quarantine
         self._finishing: set[trio.CancelScope] = set()
         self._hurry_until = inf
 
@@ -276,12 +274,12 @@ class Store:
         """Write an `@` file (see VehicleStore)."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.let_rest(path)
+        await self.wait_out(path)
         try:
             async with self._opened(path, Opcode.CREATE_FILE) as session:
                 await self._write_in_order(session, Pieces(pieces, progress))
         finally:
-            self._late_copies.on_changed(path, self._clock())
+            self._quarantine.on_changed(path, self._clock())
 
     async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
         server, driver = self._server, self._server.driver
@@ -312,32 +310,32 @@ class Store:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
-        await self.let_rest(path)
+        await self.wait_out(path)
         async with self._opened(path, Opcode.CREATE_FILE):
             pass
 
-    async def let_rest(self, path: bytes) -> None:
+    async def wait_out(self, path: bytes) -> None:
         """See VehicleStore."""
-        await trio.sleep(self._late_copies.rest(path, self._clock()))
+        await trio.sleep(self._quarantine.left(path, self._clock()))
 
     async def remove(self, path: bytes, *, at_once: bool = False) -> None:
         """Remove what is known to be a file."""
         request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
         async with self._changing(path, at_once=at_once):
-            await self._perform(path, request, {path: After.ABSENT})
+            await self._perform(request, {path: After.ABSENT})
             self._scheduler.on_removed(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
         request = partial(Simple, Opcode.REMOVE_DIRECTORY, wire_path(path))
         async with self._changing(path, below=True):
-            await self._perform(path, request, {path: After.ABSENT})
+            await self._perform(request, {path: After.ABSENT})
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
         request = partial(Simple, Opcode.CREATE_DIRECTORY, wire_path(path))
         async with self._changing(path):
-            await self._perform(path, request, {path: After.DIRECTORY})
+            await self._perform(request, {path: After.DIRECTORY})
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; readers of the old path go on under the new one. completes: in flight, too."""
@@ -348,10 +346,8 @@ class Store:
             # NuttX before October 2022 removes the file under the new name also when there is none under the
             # old one: done twice, nothing is left (servers.md 9).
             request = partial(Simple, Opcode.RENAME, data, exclusive=is_on_nuttx(new))
-            await self._perform(old, request, {old: After.ABSENT, new: After.PRESENT})
+            await self._perform(request, {old: After.ABSENT, new: After.PRESENT})
             self._scheduler.on_renamed(old, new)
-        if old.lower() != new.lower():
-            self._late_copies.on_placed(new)
 
     @contextmanager
     def finishing(self, *, until: float = inf) -> Iterator[None]:
@@ -378,7 +374,7 @@ class Store:
         """Check that writing is allowed now, and keep our own session off the paths. The body sends the
         request: once begun, it is finished.
 
-        below: also off all that lies below the first. in_flight: armed or not. at_once: no name rests before.
+        below: also off all that lies below the first. in_flight: armed or not. at_once: also in quarantine.
 
         Raises:
             RequestTimeout: the body did not begin in time.
@@ -388,40 +384,41 @@ class Store:
         with trio.CancelScope(deadline=until) as scope:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
-                    await self.let_rest(path)
+                    await self.wait_out(path)
                 # closing our session may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
                 with self.finishing(until=until):
-                    try:
-                        yield
-                    finally:
-                        for path in paths:
-                            self._late_copies.on_changed(path, self._clock())
+                    yield
                     return
         if scope.cancelled_caught:
             raise RequestTimeout("the vehicle did not get round to it in time")
 
     # --- did that change happen?
 
-    async def _perform(self, path: bytes, make: Callable[[], Simple], after: Mapping[bytes, After]) -> None:
-        """Run a request; look what became of it if its answer may not be that to its first execution. path:
-        the name that a late duplicate of it would harm. after: what each name has then."""
+    async def _perform(self, make: Callable[[], Simple], after: Mapping[bytes, After]) -> None:
+        """Run a request; look what became of it if its answer may not be that to its first execution. after:
+        what each name has then."""
         error: FtpNak | RequestTimeout
         for last in (False, True):
             self._under_way += 1
             self._sent += 1
-            began, may_come_late = self._clock(), True  # no answer came yet
+            began, repeated = self._clock(), True  # no answer came yet
             try:
-                may_come_late = (await self._server.ask(make, changes=True)).retransmitted
+                repeated = (await self._server.ask(make, changes=True)).retransmitted
                 return
             except FtpNak as nak:
-                error, may_come_late = nak, nak.retransmitted
+                error, repeated = nak, nak.retransmitted
             except RequestTimeout as timeout:
                 error = timeout
             finally:
                 self._under_way -= 1
-                if may_come_late:
-                    self._late_copies.on_maybe_under_way(path, self._clock() - began, self._clock())
+                now = self._clock()
+                for (
+                    path,
+                    then,
+                ) in after.items():  # a late RENAME finds nothing that it could give the new name
+                    counts = repeated and then is not After.PRESENT
+                    self._quarantine.on_changed(path, now, now - began if counts else 0.0)
             if isinstance(error, RequestTimeout):
                 outcome = await self._after_silence(after)
                 if outcome is Outcome.HAPPENED:

@@ -19,7 +19,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.doubt import LASTS, LEAST_REST, MOST_REST, UNKNOWN_LATENESS, LateCopies
+from mavftpfs.session.quarantine import LASTS, LEAST_IF_REPEATED, MOST, UNKNOWN_LATENESS, Quarantine
 from mavftpfs.shared.errors import MavftpfsError, NotVerified, RequestTimeout, SessionLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -50,44 +50,41 @@ async def test_distrust_lasts_for_ten_minutes() -> None:
         assert not store.in_doubt(at)
 
 
-def test_a_name_rests_where_copies_come_late() -> None:
-    late = LateCopies()
-    late.on_changed(b"/d/a", 0.0)
-    assert late.rest(b"/d/a", 0.0) == 0.0
-    late.saw(0.02, 0.0)
-    assert late.rest(b"/d/A", 0.0) == 0.04
-    assert late.rest(b"/d/other", 0.0) == 0.0
-    for seconds, expected in ((None, 2 * UNKNOWN_LATENESS), (4.0, 8.0), (2.0, 8.0), (40.0, MOST_REST)):
-        late.saw(seconds, 0.0)
-        assert late.rest(b"/d/a", 0.0) == expected
-    assert late.rest(b"/d/a", 9.0) == MOST_REST - 9.0
-    late.on_placed(b"/d/a")
-    assert late.rest(b"/d/a", 0.0) == 0.0
-    late.on_changed(b"/d/a", LASTS)
-    assert late.rest(b"/d/a", LASTS) == MOST_REST
-    assert late.rest(b"/d/a", LASTS + 0.1) == 0.0, "none was late for ten minutes"
+def test_a_name_is_in_quarantine_where_duplicates_come_late() -> None:
+    names = Quarantine()
+    names.on_changed(b"/d/a", 0.0)
+    assert names.left(b"/d/a", 0.0) == 0.0
+    names.saw(0.02, 0.0)
+    assert names.left(b"/d/A", 0.0) == 0.04
+    assert names.left(b"/d/other", 0.0) == 0.0
+    for seconds, expected in ((None, 2 * UNKNOWN_LATENESS), (4.0, 8.0), (2.0, 8.0), (40.0, MOST)):
+        names.saw(seconds, 0.0)
+        assert names.left(b"/d/a", 0.0) == expected
+    assert names.left(b"/d/a", 9.0) == MOST - 9.0
+    names.on_changed(b"/d/a", LASTS)
+    assert names.left(b"/d/a", LASTS) == MOST
+    assert names.left(b"/d/a", LASTS + 0.1) == 0.0, "none was late for ten minutes"
 
 
-def test_a_name_rests_for_ten_minutes_after_any_copy() -> None:
-    late = LateCopies()
-    late.saw(5.0, 0.0)
-    late.saw(3.0, 500.0)
-    late.on_changed(b"/d/a", 601.0)
-    assert late.rest(b"/d/a", 601.0) >= 6.0
-    late.saw(1.0, 500.0 + LASTS + 0.1)
-    late.on_changed(b"/d/a", 500.0 + LASTS + 0.1)
-    assert late.rest(b"/d/a", 500.0 + LASTS + 0.1) == 2.0, "those before are forgotten"
+def test_the_largest_lateness_of_ten_minutes_counts() -> None:
+    names = Quarantine()
+    names.saw(5.0, 0.0)
+    names.saw(3.0, 500.0)
+    names.on_changed(b"/d/a", 601.0)
+    assert names.left(b"/d/a", 601.0) >= 6.0
+    names.saw(1.0, 500.0 + LASTS + 0.1)
+    names.on_changed(b"/d/a", 500.0 + LASTS + 0.1)
+    assert names.left(b"/d/a", 500.0 + LASTS + 0.1) == 2.0, "those before are forgotten"
 
 
-def test_a_name_whose_request_was_repeated_rests_on_any_link() -> None:
-    late = LateCopies()
-    for seconds, expected in ((0.1, LEAST_REST), (2.0, 4.0), (30.0, MOST_REST)):
-        late.on_maybe_under_way(b"/d/a", seconds, 0.0)
-        late.on_changed(b"/d/a", 0.0)
-        assert late.rest(b"/d/A", 0.0) == expected
-    assert late.rest(b"/d/other", 0.0) == 0.0
-    late.on_placed(b"/d/a")
-    assert late.rest(b"/d/a", 0.0) == 0.0
+def test_a_name_whose_request_was_repeated_is_in_quarantine_on_any_link() -> None:
+    names = Quarantine()
+    for took, expected in ((0.1, LEAST_IF_REPEATED), (2.0, 4.0), (30.0, MOST)):
+        names.on_changed(b"/d/a", 0.0, took)
+        assert names.left(b"/d/A", 0.0) == expected
+    names.on_changed(b"/d/a", 4.0)
+    assert names.left(b"/d/a", 4.0) == MOST - 4.0, "a later change does not cut it short"
+    assert names.left(b"/d/other", 0.0) == 0.0
 
 
 async def seconds_of_changes(duplicate: float) -> float:
@@ -108,10 +105,10 @@ async def test_doubled_packets_do_not_make_changing_a_file_slow() -> None:
 
 
 def test_few_names_are_remembered() -> None:
-    late = LateCopies()
+    names = Quarantine()
     for number in range(1000):
-        late.on_changed(b"/%d" % number, float(number))
-    assert len(late._names) == MOST_REST + 1
+        names.on_changed(b"/%d" % number, float(number))
+    assert len(names._changed) == MOST + 1
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
@@ -139,7 +136,7 @@ async def test_an_answer_that_comes_twice_raises_it() -> None:
         await trio.sleep(0.1)
         assert connection.store.in_doubt()
         assert connection.store.in_doubt(began)
-        assert 6 < connection.scheduler.server.late_copies.rest(b"/d/one", trio.current_time()) < 8
+        assert 6 < connection.scheduler.server.quarantine.left(b"/d/one", trio.current_time()) < 8
 
 
 @pytest.mark.holds("rule 14.12")
@@ -180,25 +177,6 @@ async def test_a_session_that_vanished_raises_it() -> None:
         assert connection.store.in_doubt()
         assert sink.suspicions
         reader.close()
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str) -> None:
-    """A late copy finds nothing under the old name. rsync renames each new file so: a second each."""
-    if profile == "littlefs":
-        return
-    here = Rig(profile, {b"/d/old": content(500, 1)}, CLEAN)
-    old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
-    async with here.connected() as connection:
-        connection.scheduler.server.distrust("as if a copy had been late", reads=True)
-        connection.scheduler.server.late_copies.saw(1.0, trio.current_time())
-        copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
-        began = trio.current_time()
-        await connection.store.rename(old, new)
-        await connection.store.rename(new, final)
-        assert trio.current_time() - began < LEAST_REST
-        assert copy.late is not None
-        assert here.card.data(final) == content(500, 1)
 
 
 async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) -> None:
@@ -365,7 +343,7 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
             here.connection.scheduler.server.distrust("a copy was late", reads=True)
-            here.connection.scheduler.server.late_copies.saw(0.5, trio.current_time())
+            here.connection.scheduler.server.quarantine.saw(0.5, trio.current_time())
         Latecomer(here, what, after=after, nth=nth, first=first)
         wanted = content(500, 1)
         for number in (2, 3):
@@ -395,7 +373,7 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: 
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
             here.connection.scheduler.server.distrust("a copy was late", reads=True)
-            here.connection.scheduler.server.late_copies.saw(0.1, trio.current_time())
+            here.connection.scheduler.server.quarantine.saw(0.1, trio.current_time())
         renames: list[bytes] = []
 
         def is_first(wire: bytes) -> bool:
@@ -418,7 +396,7 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
         tree = here.mount()
         await write_file(tree, b"/d/k", b"x")
         here.connection.scheduler.server.distrust("a copy was late", reads=True)
-        here.connection.scheduler.server.late_copies.saw(0.1, trio.current_time())
+        here.connection.scheduler.server.quarantine.saw(0.1, trio.current_time())
         await tree.list(b"/d")
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME, first=True)
         await tree.rename(b"/d/g", b"/d/f")
@@ -770,4 +748,4 @@ async def test_doubt_costs_a_new_file_one_comparison(profile: str) -> None:
             return trio.current_time() - began
 
     comparison = 0.02 + READY
-    assert await forty(0.02) <= await forty(0.0) + 40 * comparison + 3 * LEAST_REST / 10
+    assert await forty(0.02) <= await forty(0.0) + 40 * comparison + 0.3

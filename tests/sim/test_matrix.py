@@ -99,13 +99,6 @@ DOUBLING = LinkSettings(delay=0.01, duplicate=0.01)
 FAR = LinkSettings(delay=0.02)
 """A link on which calls that run beside each other meet: an answer takes its time."""
 
-_STALE = "a refused removal interrupts the end of a replacement, and the file is STALE"
-KNOWN: dict[tuple[str, str, str], str] = {
-    ("px4-nuttx", "change", "fail_to_remove_too"): _STALE,
-    ("px4-nuttx", "append", "fail_to_remove_too"): _STALE,
-}
-"""Cells that fail on today's code at one of their requests, with the reason."""
-
 
 # --- one meeting
 
@@ -260,9 +253,8 @@ def can(profile: str, operation: Call, event: Event) -> bool:
 DAILY = [profile for profile in sorted(PROFILES) if profile not in ALIKE]
 
 
-def cells(profiles: Iterable[str], *, in_turn: bool = False, known: bool = False) -> list[Any]:
-    """Return what can be done on each server, with each event. in_turn: some events on one server only.
-    known: cells that fail today are to fail."""
+def cells(profiles: Iterable[str], *, in_turn: bool = False) -> list[Any]:
+    """Return what can be done on each server, with each event. in_turn: some events on one server only."""
     found = []
     for operation, event in product(OPERATIONS, (*EVENTS, *IN_TURN)):
         able = [profile for profile in profiles if can(profile, operation, event)]
@@ -270,9 +262,7 @@ def cells(profiles: Iterable[str], *, in_turn: bool = False, known: bool = False
             able = [able[crc32(f"{operation.__name__} {event.__name__}".encode()) % len(able)]]
         for profile in able:
             key = (profile, operation.__name__, event.__name__)
-            fails = known and key in KNOWN
-            marks = pytest.mark.xfail(strict=True, reason=KNOWN[key]) if fails else ()
-            found.append(pytest.param(profile, operation, event, id="-".join(key), marks=marks))
+            found.append(pytest.param(profile, operation, event, id="-".join(key)))
     return found
 
 
@@ -284,7 +274,7 @@ async def test_all_or_nothing_and_no_lie(profile: str, operation: Call, event: E
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("profile", "operation", "event"), cells(sorted(PROFILES), known=True))
+@pytest.mark.parametrize(("profile", "operation", "event"), cells(sorted(PROFILES)))
 async def test_at_every_request(profile: str, operation: Call, event: Event, tmp_path: Path) -> None:
     requests: list[int] = []
     for count in counted(1):

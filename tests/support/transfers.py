@@ -166,7 +166,7 @@ async def start(connection: Connection, profile: str, source: MemorySource, name
 async def put(connection: Connection, target: bytes, data: bytes) -> None:
     """Upload a whole file."""
     source = MemorySource(data)
-    await connection.store.let_rest(target)
+    await connection.store.wait_out(target)
     upload = connection.store.open_upload(target, source)
     await upload.finish()
     assert source.all_proven
