@@ -584,6 +584,27 @@ async def test_also_one_that_it_took_right_behind_our_open() -> None:
     assert here.data(b"/d/its") == b""
 
 
+@pytest.mark.holds("promise 6")
+async def test_a_client_whose_file_our_open_ended_is_not_waited_for() -> None:
+    """Both opened a file when a third one had closed its own. The first one notices, and closes nothing."""
+    here = Rig("px4-2026", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    handle, came = here.server.handle, trio.Event()
+
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        if wire[3] == Opcode.OPEN_FILE_RO and source != STATION and not came.is_set():
+            came.set()
+            here.another_asks(Opcode.OPEN_FILE_RO, b"/d/theirs")
+        handle(wire, source, now)
+
+    here.server.handle = on_request  # type: ignore[method-assign]
+    async with here.connected() as connection:
+        began = trio.current_time()
+        for _ in range(2):
+            assert await read_file(connection, b"/d/f") == DATA
+        assert came.is_set()
+        assert trio.current_time() - began < LEFT_OPEN
+
+
 @pytest.mark.holds("fault duplicate")
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
 async def test_the_answer_to_an_open_that_was_cancelled_is_no_reason_for_doubt(profile: str) -> None:
