@@ -155,7 +155,7 @@ class _Connection:
                     return None
                 self._requests.feed(data)
         except RemoteProtocolError as error:
-            log.info("process %d sent what is no request: %s", self.process, error)
+            log.debug("process %d sent what is no request: %s", self.process, error)
         except (trio.BrokenResourceError, trio.ClosedResourceError):
             pass
         return None
