@@ -99,7 +99,7 @@ def _facts(head: bytes) -> Facts:
 
 def encoded(facts: Facts, data: bytes | memoryview = b"") -> bytes:
     """Return a message as bytes."""
-    head = json.dumps(facts).encode()
+    head = json.dumps(facts, default=str).encode()
     return b"".join((_LENGTHS.pack(len(head), len(data)), head, data))
 
 

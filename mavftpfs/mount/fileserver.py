@@ -124,6 +124,8 @@ class _Connection:
                     await (file.take_back() if self._writes else file.release())
             except MavftpfsError as error:
                 log.info("a file of process %d, which is gone: %s", self.process, error)
+            except Exception:
+                log.exception("bug in closing a file of process %d", self.process)
 
     async def _answered(self, request: Message) -> Message | None:
         """Answer a request; return the next one, None if there is none. The next one cancels this one."""
@@ -174,13 +176,12 @@ class _Connection:
             if call is None:
                 raise LocalProtocolError("this mount does not know that call")
             facts, data = await call(request)
+            return Message(facts if self.file is None else {**facts, "size": self.file.size}, data)
         except MavftpfsError as error:
             return wire.told_error(error)
         except Exception as error:
             log.exception("bug in a request of process %d", self.process)
             return wire.told_error(MavftpfsError(f"internal error: {error!r}"))
-        file = self.file
-        return Message(facts if file is None else {**facts, "size": file.size}, data)
 
     # -- calls by path
 

@@ -71,6 +71,7 @@ class FakeFile:
 
     async def take_back(self) -> bool | None:
         self.closed = True
+        await self.tree.pause("take_back", self.path)
         self.tree.taken_back.append(self.path)
         if self.made:
             del self.tree.files[self.path]

@@ -291,6 +291,23 @@ async def test_garbage_disturbs_nobody(tmp_path: Path, name: str, caplog: pytest
     assert "Traceback" not in caplog.text
 
 
+async def test_a_bug_in_a_call_ends_neither_the_connection_nor_the_mount(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tree = FakeTree({b"/f": DATA}, failing={"rename": AssertionError("a bug")})
+    async with serving(tmp_path, tree) as mount:
+        files = mount.client()
+        with pytest.raises(MavftpfsError, match="internal error: AssertionError"):
+            await files.rename(b"/f", b"/g")
+        await files.stat(b"/f")
+        await opened(files)
+        tree.failing["take_back"] = AssertionError("another")
+        files.close()
+        await until(lambda: "bug in closing" in caplog.text)
+        del tree.failing["take_back"]
+        await mount.serves()
+
+
 # -- interrupted calls ----------------------------------------------------------------------------
 
 
