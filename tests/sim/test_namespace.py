@@ -478,3 +478,35 @@ async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: 
     await tree.list(b"/d")
     assert torn.data(FILE) == OLD
     assert torn.litter() == []
+
+
+@pytest.mark.holds("promise 3")
+async def test_a_name_that_lost_its_file_gets_the_new_one_and_nothing_is_sent_again(torn: Rig) -> None:
+    """The rename that gives the new file the name is lost, and so is everything until the vehicle answers."""
+    tree = torn.mount()
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    fall_silent(torn)
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    assert FILE not in torn.files()
+    sent = torn.count(Opcode.WRITE_FILE)
+    speak(torn)
+    await trio.sleep(10.0)
+    assert torn.data(FILE) == NEW
+    assert tree.undelivered() == []
+    assert torn.count(Opcode.WRITE_FILE) == sent
+    assert torn.litter() == []
+    await file.release()
+
+
+@pytest.mark.parametrize("moves", [False, True])
+async def test_old_files_of_a_name_go_with_it_also_those_of_other_mounts(torn: Rig, moves: bool) -> None:
+    """Otherwise a later repair would bring the name back."""
+    tree = torn.mount()
+    left = leave(torn, Kind.OLD, b"file.txt", b"older")
+    await tree.list(b"/d")
+    await (tree.rename(FILE, b"/d/moved") if moves else tree.unlink(FILE))
+    assert left not in torn.files()
+    await trio.sleep(SAME_FOR)
+    assert FILE not in torn.files()
