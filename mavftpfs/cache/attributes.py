@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-from mavftpfs.shared.model import DirEntry, EntryKind, rename_keys
+from mavftpfs.shared.model import DirEntry, EntryKind
 
 UNKNOWN_MTIME = 315532800
 """1980-01-01 UTC: the same in every mount, so that rsync and make do not see changes that are none."""
@@ -84,27 +84,31 @@ class _Time:
 
 
 class Times:
-    """mtimes by path, the least recently set forgotten first."""
+    """mtimes that users set in one folder, by name; the least recently set are forgotten first."""
 
     def __init__(self) -> None:
         self._times: OrderedDict[bytes, _Time] = OrderedDict()
 
-    def set(self, path: bytes, nanoseconds: int) -> None:
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def set(self, name: bytes, nanoseconds: int) -> None:
         """Show this mtime from now on."""
-        self._times.pop(path, None)
-        self._times[path] = _Time(nanoseconds)
+        self._times.pop(name, None)
+        self._times[name] = _Time(nanoseconds)
         if len(self._times) > MAX_TIMES:
             self._times.popitem(last=False)
 
-    def peek(self, path: bytes) -> int | None:
-        """Return the mtime that was set, in nanoseconds, whatever a listing says; for a file with a draft."""
-        known = self._times.get(path)
+    def peek(self, name: bytes) -> int | None:
+        """Return the mtime that was set, in nanoseconds, whatever a listing says; for a file with pending
+        changes."""
+        known = self._times.get(name)
         return None if known is None else known.nanoseconds
 
-    def get(self, path: bytes, size: int, listed: int | None) -> int | None:
+    def get(self, name: bytes, size: int, listed: int | None) -> int | None:
         """Return the mtime that was set, in nanoseconds, if the listed size and mtime still show the same
         file."""
-        known = self._times.get(path)
+        known = self._times.get(name)
         if known is None:
             return None
         if known.size is None:
@@ -112,15 +116,17 @@ class Times:
         if known.listed is None:  # our own writing left it unknown until the next listing
             known.listed = listed
         if (known.size, known.listed) != (size, listed if listed is not None else known.listed):
-            del self._times[path]
+            del self._times[name]
             return None
         return known.nanoseconds
 
-    def forget(self, path: bytes) -> None:
+    def forget(self, name: bytes) -> None:
         """The file changed, or is gone."""
-        self._times.pop(path, None)
+        self._times.pop(name, None)
 
-    def rename(self, old: bytes, new: bytes) -> None:
-        """A file or directory with all below it has another path."""
-        self._times.pop(new, None)
-        rename_keys(self._times, old, new)
+    def move(self, name: bytes, target: Times, new: bytes) -> None:
+        """A file or directory has another name, perhaps in another folder."""
+        known = self._times.pop(name, None)
+        target.forget(new)
+        if known is not None:
+            target._times[new] = known

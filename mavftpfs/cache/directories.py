@@ -27,19 +27,21 @@ import logging
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
 
 import trio
 
 from mavftpfs.cache.attributes import tidy
+from mavftpfs.cache.entries import Directory as Directory
+from mavftpfs.cache.entries import Folder
+from mavftpfs.cache.entries import Sweep as Sweep
 from mavftpfs.cache.options import DIR_TIMEOUT, CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errors import (
     FtpNak,
-    ListingIncomplete,
     NotADirectory,
     NotFound,
     PathTooLong,
@@ -77,42 +79,6 @@ SWEEP_TRIES = 3
 """How often a directory is listed at most because we changed names in it meanwhile."""
 
 
-@dataclass(slots=True)
-class Directory:
-    """A remembered listing.
-
-    entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
-    after that it proves nothing. complete: the vehicle listed it to its end. end: see ListDirectory.
-    sizes: what replies to opens told since; they beat the listing. growing: when a file was last seen to be
-    larger than before, though we did not write it. seen: of temporary names, how each looks, and since when.
-    """
-
-    entries: dict[bytes, DirEntry]
-    listed_at: float
-    ended_at: float
-    fresh_until: float
-    complete: bool
-    end: int | None = None
-    sizes: dict[bytes, int] = field(default_factory=dict)
-    growing: dict[bytes, float] = field(default_factory=dict)
-    seen: dict[bytes, tuple[tuple[int, bool], float]] = field(default_factory=dict)
-
-    def size_of(self, name: bytes) -> int:
-        """Return the best known size of a listed name in bytes."""
-        return self.sizes.get(name, self.entries[name].size)
-
-    def has(self, path: bytes) -> DirEntry | None:
-        """Return the entry of a path that lies in it, None if there is none.
-
-        Raises:
-            ListingIncomplete: it shows none, and proves nothing.
-        """
-        entry = self.entries.get(split(path)[1])
-        if entry is None and not self.complete:
-            raise ListingIncomplete(f"{path!r} is not in what is known of its directory", [])
-        return entry
-
-
 @dataclass(frozen=True, slots=True)
 class Found:
     """A directory entry and the listing that shows it."""
@@ -126,25 +92,13 @@ class Found:
         return self.directory.sizes.get(self.entry.name, self.entry.size)
 
 
-@dataclass(slots=True, eq=False)
-class Sweep:
-    """A listing under way.
-
-    changes: what we changed in that directory since it began. void: its result is not to be remembered.
-    """
-
-    path: bytes
-    began: float
-    changes: dict[bytes, DirEntry | None] = field(default_factory=dict)
-    void: bool = False
-
-
 class Directories:
     """Listings of the vehicle's directories. All paths are the vehicle's, normalised. The least recently used
     ones are dropped when they have more than `max_entries` names.
 
     Attributes:
-        tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
+        root: the tree of all that is remembered. tells_times: whether any listing told an mtime. sweeps: how
+            many listings were asked for.
     """
 
     def __init__(
@@ -164,32 +118,33 @@ class Directories:
         self._store = store
         self._options = options
         self.clock = clock
-        self._known: OrderedDict[bytes, Directory] = OrderedDict()
-        self._sweeps: dict[bytes, Sweep] = {}
-        self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
+        self.root = Folder()
+        self._recent: OrderedDict[Folder, None] = OrderedDict()  # those that have a listing
+        self._sweeping: SingleFlight[Folder, Directory] = SingleFlight(nursery)
         self._on_listed, self._on_swept = on_listed, on_swept
         self.sweeps = 0
         self._forget_server()
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._recent)
 
     @property
     def entry_count(self) -> int:
         """Names remembered over all listings."""
         count = 0
-        for directory in self._known.values():
-            count += len(directory.entries)
+        for folder in self._recent:
+            count += len(folder.listing.entries) if folder.listing else 0
         return count
 
     # --- what is remembered
 
     def known(self, path: bytes) -> Directory | None:
         """Return the directory's listing, expired or not."""
-        directory = self._known.get(path)
-        if directory is not None:
-            self._known.move_to_end(path)
-        return directory
+        folder = self.root.find_folder(path)
+        if folder is None or folder.listing is None:
+            return None
+        self._recent.move_to_end(folder)
+        return folder.listing
 
     def _is_fresh(self, directory: Directory) -> bool:
         """Return whether a listing still proves something."""
@@ -202,21 +157,24 @@ class Directories:
 
     def entry(self, path: bytes) -> DirEntry | None:
         """Return what a path was last known to be."""
-        parent, name = split(path)
-        directory = self._known.get(parent)
+        directory, name = self._peek(path)
         return None if directory is None else directory.entries.get(name)
+
+    def _peek(self, path: bytes) -> tuple[Directory | None, bytes]:
+        """Return the listing of a path's directory, if there is one, and the path's name in it."""
+        parent, name = split(path)
+        folder = self.root.find_folder(parent)
+        return None if folder is None else folder.listing, name
 
     def is_growing(self, path: bytes) -> bool:
         """Return whether somebody on the vehicle seems to write the file."""
-        parent, name = split(path)
-        directory = self._known.get(parent)
+        directory, name = self._peek(path)
         return directory is not None and self.clock() - directory.growing.get(name, -inf) < STILL_GROWING
 
     def learn_size(self, path: bytes, size: int) -> None:
         """Note the size that an open reply told. It beats the listing until the next one. If it is larger,
         the file grows."""
-        parent, name = split(path)
-        directory = self._known.get(parent)
+        directory, name = self._peek(path)
         if directory is None or name not in directory.entries:
             return
         before = directory.size_of(name)
@@ -231,15 +189,11 @@ class Directories:
         parent, name = split(path)
         if entry is not None and entry.name != name:
             entry = replace(entry, name=name)
-        sweep, directory = self._sweeps.get(parent), self._known.get(parent)
-        if sweep is not None:
-            sweep.changes[name] = entry
-        if directory is None:
-            return
-        for facts in (directory.entries, directory.sizes, directory.growing):
-            facts.pop(name, None)
-        if entry is not None:
-            directory.entries[name] = entry
+        folder = self.root.find_folder(parent)
+        if folder is not None and folder.sweep is not None:
+            folder.sweep.changes[name] = entry
+        if folder is not None and folder.listing is not None:
+            folder.listing.put(name, entry)
 
     @contextmanager
     def changing(self, *paths: bytes) -> Iterator[None]:
@@ -250,10 +204,9 @@ class Directories:
             yield
         finally:
             for path in paths:
-                parent, _ = split(path)
-                directory = self._known.get(parent)
+                directory, _ = self._peek(path)
                 if directory is not None and directory.ended_at > began:
-                    self.expire(parent)
+                    self.expire(split(path)[0])
 
     def rename(self, old: bytes, new: bytes) -> None:
         """Note a rename, perhaps over another file, that the vehicle has just confirmed."""
@@ -265,26 +218,37 @@ class Directories:
 
     def expire(self, path: bytes) -> None:
         """Make a listing prove nothing from now on. It may still be served while the vehicle is lost."""
-        sweep, directory = self._sweeps.get(path), self._known.get(path)
-        if sweep is not None:
-            sweep.void = True
-        if directory is not None:
-            directory.fresh_until = min(directory.fresh_until, self.clock())
+        folder = self.root.find_folder(path)
+        if folder is not None:
+            self._expire(folder)
+
+    def _expire(self, folder: Folder) -> None:
+        if folder.sweep is not None:
+            folder.sweep.void = True
+        if folder.listing is not None:
+            folder.listing.fresh_until = min(folder.listing.fresh_until, self.clock())
 
     def forget(self, path: bytes) -> None:
         """Drop the listings of `path` and of all below it."""
-        below = path.rstrip(b"/") + b"/"
-        for known in list(self._known):
-            if known == path or known.startswith(below):
-                del self._known[known]
-        for known, sweep in self._sweeps.items():
-            if known == path or known.startswith(below):
-                sweep.void = True
+        top = self.root.find_folder(path)
+        if top is None:
+            return
+        for folder in [top, *top.walk()]:
+            if isinstance(folder, Folder):
+                if folder.sweep is not None:
+                    folder.sweep.void = True
+                self._forget_listing(folder)
+
+    def _forget_listing(self, folder: Folder) -> None:
+        folder.listing = None
+        self._recent.pop(folder, None)
+        folder.prune()
 
     def rebooted(self) -> None:
         """Expire all listings, and forget what was learnt of the server."""
-        for path in self._known.keys() | self._sweeps.keys():
-            self.expire(path)
+        for folder in [self.root, *self.root.walk()]:
+            if isinstance(folder, Folder):
+                self._expire(folder)
         self._forget_server()
 
     def _forget_server(self) -> None:
@@ -332,7 +296,8 @@ class Directories:
         """
         since = self.clock() if not_before is None else not_before
         for _ in range(SWEEP_TRIES):
-            sweep = self._sweeps.get(path)
+            folder = self.root.find_folder(path)
+            sweep = None if folder is None else folder.sweep
             if sweep is None or sweep.void or sweep.began < since:
                 known = None if not_before is None else self.known(path)
                 if known is not None and known.listed_at >= since and self._is_fresh(known):
@@ -384,7 +349,7 @@ class Directories:
             raise NotADirectory(f"{path!r} is not a directory")
         while True:
             with trio.move_on_after(LOOK if until_lost else inf):
-                directory = await self._sweeping.run(path, partial(self._sweep, path))
+                directory = await self._swept(path)
                 break
             self.require_heard()
         if self._on_swept is not None:
@@ -401,22 +366,27 @@ class Directories:
         for part in () if self._root_proven else self._options.root.split(b"/")[1:]:
             directory = self.known(path)
             if directory is None or not self._is_fresh(directory):
-                directory = await self._sweeping.run(path, partial(self._sweep, path))
+                directory = await self._swept(path)
             entry = directory.entries.get(part)
             path = join(path, part)
             if entry is not None and entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
         self._root_proven = True
 
-    async def _sweep(self, path: bytes) -> Directory:
-        """List a directory; again if we changed it meanwhile, SWEEP_TRIES times at most."""
-        tries = 0
+    async def _swept(self, path: bytes) -> Directory:
+        """List a directory, or wait for the listing of it that is under way."""
+        folder = self.root.need(path)
+        return await self._sweeping.run(folder, partial(self._sweep, folder))
+
+    async def _sweep(self, folder: Folder) -> Directory:
+        """List a directory; again if this mount changed it meanwhile, SWEEP_TRIES times at most."""
+        tries, path = 0, folder.path
         while True:
             sweep = self.begin(path)
             self.sweeps += 1
             tries += 1
             try:
-                known = self._known.get(path)
+                known = sweep.folder.listing
                 listing = await self._store.list_directory(
                     path, known_end=None if known is None else known.end
                 )
@@ -426,7 +396,7 @@ class Directories:
                     self.expire(split(path)[0])
                 raise
             finally:
-                del self._sweeps[path]
+                self.end(sweep)
             directory = self.remember(sweep, listing)
             if not sweep.void:
                 self._on_listed(path, directory)
@@ -435,17 +405,23 @@ class Directories:
 
     def begin(self, path: bytes) -> Sweep:
         """Note that a listing of `path` begins. Each directory has one at a time."""
-        sweep = self._sweeps[path] = Sweep(path, self.clock())
+        folder = self.root.need(path)
+        sweep = folder.sweep = Sweep(folder, self.clock())
         return sweep
+
+    def end(self, sweep: Sweep) -> None:
+        """Note that a listing ended."""
+        sweep.folder.sweep = None
+        sweep.folder.prune()
 
     def remember(self, sweep: Sweep, listing: Listing) -> Directory:
         """Remember a listing and return it, our own changes applied."""
-        now, old = self.clock(), self._known.get(sweep.path)
+        now, old = self.clock(), sweep.folder.listing
         if not (listing.complete or (old is not None and not old.complete)):
             count = len(listing.entries)
             log.warning(
                 "%r was not listed to its end: %d names of it are known, and reading it is an error",
-                sweep.path,
+                sweep.folder.path,
                 count,
             )
         entries = {}
@@ -467,11 +443,15 @@ class Directories:
             new.seen = old.seen
             _see_growth(old, new, sweep)
         if not sweep.void:
-            self._known[sweep.path] = new
-            self._known.move_to_end(sweep.path)
-            weight = len(self._known) + self.entry_count
-            while weight > self._options.max_entries and len(self._known) > 1:
-                weight -= 1 + len(self._known.popitem(last=False)[1].entries)
+            folder = self.root.need(sweep.folder.path)  # it may have been forgotten meanwhile
+            folder.listing = new
+            self._recent[folder] = None
+            self._recent.move_to_end(folder)
+            weight = len(self._recent) + self.entry_count
+            while weight > self._options.max_entries and len(self._recent) > 1:
+                oldest = next(iter(self._recent))
+                weight -= 1 + (len(oldest.listing.entries) if oldest.listing else 0)
+                self._forget_listing(oldest)
         return new
 
 

@@ -8,17 +8,21 @@ name and the vehicle is EXDEV, as between two disks, so programs copy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
 from fnmatch import translate
 from re import compile as compile_pattern
 
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.cache.entries import Entry, Folder
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.shared.errors import AlreadyExists, NoSpace, NotFound
-from mavftpfs.shared.model import EntryKind, rename_keys, split
+from mavftpfs.cache.source import Opening, Source
+from mavftpfs.shared.errors import AlreadyExists, NoSpace, NotADirectory, NotFound, NotSupported
+from mavftpfs.shared.model import EntryKind
 
 MAX_FILES = 10_000
+
+RequireDirectory = Callable[[bytes], Awaitable[None]]
+"""Checks that the directory of a path exists."""
 
 NAMES = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
 """What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
@@ -27,14 +31,20 @@ find out whether the disk cuts names short."""
 _PATTERN = compile_pattern("|".join(map(translate, NAMES)).encode())
 
 
-@dataclass(slots=True, eq=False)
-class LocalFile:
-    """mtime_ns: nanoseconds since 1970. handles: how many are open; named: it was not unlinked."""
+class LocalFile(Entry):
+    """A file in memory.
 
-    mtime_ns: int
-    data: bytearray = field(default_factory=bytearray)
-    handles: int = 0
-    named: bool = True
+    Attributes:
+        mtime_ns: nanoseconds since 1970. handles: how many are open.
+    """
+
+    __slots__ = ("data", "handles", "mtime_ns")
+
+    def __init__(self, folder: Folder, name: bytes, mtime_ns: int) -> None:
+        super().__init__(folder, name)
+        self.mtime_ns = mtime_ns
+        self.data = bytearray()
+        self.handles = 0
 
 
 def stays_local(path: bytes) -> bool:
@@ -42,24 +52,23 @@ def stays_local(path: bytes) -> bool:
     return any(map(_PATTERN.match, path.split(b"/")))
 
 
-class LocalFiles:
-    """All local names of a mount, by path.
+class LocalFiles(Source):
+    """All local files of a mount. They are entries of its tree, so they follow their directory.
 
     Attributes:
         used: bytes of content, also of files that are open and have no name any more.
     """
 
-    def __init__(self, limit: int, now_ns: Callable[[], int], *, used: bool) -> None:
-        """`limit`: bytes of all content. used: False if all names are the vehicle's."""
-        self._is_used = used
+    def __init__(
+        self, root: Folder, limit: int, now_ns: Callable[[], int], require_directory: RequireDirectory
+    ) -> None:
+        """`limit`: bytes of all content. require_directory(path) raises NotFound or NotADirectory."""
+        self._root = root
         self._limit = limit
         self._now_ns = now_ns
-        self._files: dict[bytes, LocalFile] = {}
+        self._require_directory = require_directory
+        self._count = 0
         self.used = 0
-
-    def owns(self, path: bytes) -> bool:
-        """Return whether a path is local, whether it exists or not."""
-        return self._is_used and stays_local(path)
 
     def find(self, path: bytes) -> LocalFile:
         """Return the file of a path.
@@ -67,64 +76,97 @@ class LocalFiles:
         Raises:
             NotFound.
         """
-        file = self._files.get(path)
-        if file is None:
+        file = self._root.find(path)
+        if not isinstance(file, LocalFile):
             raise NotFound(f"{path!r} does not exist")
         return file
 
-    def stat(self, path: bytes) -> Stat:
-        """Return attributes. Raises NotFound."""
-        file = self.find(path)
+    def below(self, path: bytes) -> list[tuple[bytes, Stat]]:
+        """Return the local files in one of the vehicle's directories."""
+        folder = self._root.find_folder(path)
+        entries = [] if folder is None else list(folder.children.values())
+        return [(entry.name, self._stat(entry)) for entry in entries if isinstance(entry, LocalFile)]
+
+    def _stat(self, file: LocalFile) -> Stat:
         return Stat(EntryKind.FILE, len(file.data), file.mtime_ns, 0.0)
 
-    def names(self, directory: bytes) -> list[bytes]:
-        """Return the local names in one of the vehicle's directories."""
-        return [name for parent, name in map(split, self._files) if parent == directory]
+    # --- what the tree asks
 
-    def open(self, path: bytes, *, write: bool, truncate: bool = False) -> LocalHandle:
+    def is_only_read(self, path: bytes) -> bool:
+        """See Source."""
+        return False
+
+    async def stat(self, path: bytes) -> Stat:
+        """Return attributes. Raises NotFound."""
+        return self._stat(self.find(path))
+
+    async def open(self, path: bytes, how: Opening) -> LocalHandle:
         """Open a file. Raises NotFound."""
         file = self.find(path)
-        if truncate:
+        if how.truncate:
             self.resize(file, 0)
-        return LocalHandle(self, file, writable=write)
+        return LocalHandle(self, file, writable=how.write)
 
-    def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
-        """Make a file, or open the one that is there. The caller has checked its directory.
+    async def crc32(self, path: bytes) -> int:
+        """No vehicle has it. Raises NotFound."""
+        raise NotFound(f"{path!r} is not on the vehicle")
+
+    async def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
+        """Make a file, or open the one that is there.
 
         Raises:
-            AlreadyExists, NoSpace.
+            AlreadyExists, NoSpace. NotFound, NotADirectory: its directory.
         """
-        if path not in self._files:
-            if len(self._files) >= MAX_FILES:
+        await self._require_directory(path)
+        folder, name = self._root.home(path)
+        file = folder.children.get(name)
+        if not isinstance(file, LocalFile):
+            if self._count >= MAX_FILES:
                 raise NoSpace(f"there may be {MAX_FILES} local files")
-            self._files[path] = LocalFile(self._now_ns())
+            self._count += 1
+            file = folder.children[name] = LocalFile(folder, name, self._now_ns())
         elif exclusive:
             raise AlreadyExists(f"{path!r} exists")
-        return self.open(path, write=True)
+        return LocalHandle(self, file, writable=True)
 
-    def unlink(self, path: bytes) -> None:
+    async def truncate(self, path: bytes, size: int) -> None:
+        """Cut or extend a file. Raises NotFound, NoSpace."""
+        self.resize(self.find(path), size)
+
+    async def set_times(self, path: bytes, mtime_ns: int) -> None:
+        """Show an mtime. Raises NotFound."""
+        self.find(path).mtime_ns = mtime_ns
+
+    async def mkdir(self, path: bytes) -> None:
+        """Refuse: see the module."""
+        raise NotSupported(f"{path!r} is a name for files that stay in memory")
+
+    async def rmdir(self, path: bytes) -> None:
+        """There are no local directories. Raises NotFound, NotADirectory."""
+        self.find(path)
+        raise NotADirectory(f"{path!r} is not a directory")
+
+    async def unlink(self, path: bytes) -> None:
         """Remove a file; handles keep it. Raises NotFound."""
-        file = self.find(path)
-        del self._files[path]
-        file.named = False
-        self.forget_unused(file)
+        self._remove(self.find(path))
 
-    def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """Rename within the local names.
 
         Raises:
-            NotFound, AlreadyExists (noreplace).
+            NotFound, AlreadyExists (noreplace). NotFound, NotADirectory: the new directory.
         """
-        file = self.find(old)
-        if noreplace and new in self._files:
-            raise AlreadyExists(f"{new!r} exists")
-        if new in self._files and self._files[new] is not file:
-            self.unlink(new)
-        self._files[new] = self._files.pop(old)
+        await self._require_directory(new)
+        file, (folder, name) = self.find(old), self._root.home(new)
+        there = folder.children.get(name)
+        if isinstance(there, LocalFile) and there is not file:
+            if noreplace:
+                raise AlreadyExists(f"{new!r} exists")
+            self._remove(there)
+            folder, name = self._root.home(new)
+        file.move(folder, name)
 
-    def follow_rename(self, old: bytes, new: bytes) -> None:
-        """One of the vehicle's directories has another name."""
-        rename_keys(self._files, old, new)
+    # --- for handles
 
     def resize(self, file: LocalFile, size: int) -> None:
         """Cut a file or extend it with zeros. Raises NoSpace."""
@@ -140,8 +182,15 @@ class LocalFiles:
 
     def forget_unused(self, file: LocalFile) -> None:
         """Stop counting the bytes of a file that has neither a name nor a handle any more."""
-        if not file.named and not file.handles:
+        if not file.has_name and not file.handles:
             self.used -= len(file.data)
+
+    def _remove(self, file: LocalFile) -> None:
+        file.lose_name()
+        self._count -= 1
+        self.forget_unused(file)
+        if file.folder is not None:
+            file.folder.prune()
 
 
 class LocalHandle(OpenFile):

@@ -17,16 +17,16 @@ from __future__ import annotations
 
 import logging
 
-from mavftpfs.cache.context import Context
-from mavftpfs.cache.names import Names
-from mavftpfs.cache.unsure import Placeable, Unsure
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.file import File
+from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, NotVerified
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 log = logging.getLogger("mavftpfs.cache")
 
 
-async def look(context: Context, names: Names, file: Placeable) -> bool:
+async def look(card: Card, file: File) -> bool:
     """Find out what has the name of an unsure file, and give a missing name its file; return whether the
     vehicle has what was placed (rules 1 and 3). Then the file is not unsure any more. The caller holds the
     file's lock.
@@ -40,29 +40,29 @@ async def look(context: Context, names: Names, file: Placeable) -> bool:
     unsure, path = file.unsure, file.path
     assert unsure is not None
     try:
-        directory = await context.directories.ask(split(path)[0])
-        there = directory.has(path) or await _give_name_back(context, names, unsure, path, directory.entries)
+        directory = await card.directories.ask(split(path)[0])
+        there = directory.has(path) or await _give_name_back(card, unsure, path, directory.entries)
     except (NotFound, NotADirectory):
         there = None
-    placed = there is not None and await _is_sent(context, file, unsure, there)
+    placed = there is not None and await _is_sent(card, file, unsure, there)
     if there is None:
-        file.base = None
-    names.settle(file)
+        file.base, file.content.base_limit = None, 0
+    card.names.settle(file)
     return placed
 
 
 async def _give_name_back(
-    context: Context, names: Names, unsure: Unsure, path: bytes, entries: dict[bytes, DirEntry]
+    card: Card, unsure: Unsure, path: bytes, entries: dict[bytes, DirEntry]
 ) -> DirEntry | None:
     """Rename what was left of a missing name to it, and return that; None if nothing was left, or if the card
     turned out to rename nothing."""
     refused: FtpNak | None = None
-    for left in (unsure.temporary, unsure.aside) if context.store.traits.rename_works is not False else ():
+    for left in (unsure.temporary, unsure.aside) if card.store.traits.rename_works is not False else ():
         entry = None if left is None else entries.get(split(left)[1])
         if left is not None and entry is not None:
             log.warning("%r was left by an interruption: renaming it to %r", left, path)
             try:
-                await names.rename(left, path, completes=True)
+                await card.names.rename(left, path, completes=True)
             except FtpNak as nak:
                 refused = nak
             else:
@@ -72,7 +72,7 @@ async def _give_name_back(
     return None
 
 
-async def _is_sent(context: Context, file: Placeable, unsure: Unsure, there: DirEntry) -> bool:
+async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry) -> bool:
     """Return whether a file on the vehicle is what was placed."""
     sent = unsure.sent
     if there.kind is not EntryKind.FILE or there.size != sent.size:
@@ -83,6 +83,6 @@ async def _is_sent(context: Context, file: Placeable, unsure: Unsure, there: Dir
     if not sent.size or crc32 is None:
         return True
     try:
-        return crc32 == await context.store.crc32(file.path, size=sent.size)
+        return crc32 == await card.store.crc32(file.path, size=sent.size)
     except FtpNak as nak:
         raise NotVerified(f"{file.path!r} is in doubt, and the vehicle told no checksum: {nak}") from nak

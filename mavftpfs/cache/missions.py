@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mavftpfs.cache.attributes import SECOND
-from mavftpfs.cache.texts import Access, Refused, Save, Saved, Shown, Texts, cause_of, problems_refused
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.texts import Refused, Save, Saved, Shown, Texts, cause_of, problems_refused
+from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.parameters.missions import (
     FENCE,
     MISSION,
@@ -37,8 +39,8 @@ class Missions(Texts[Items]):
     directory = DIRECTORY
     names = tuple(KINDS)
 
-    def __init__(self, access: Access) -> None:
-        super().__init__(access)
+    def __init__(self, card: Card, virtual: VirtualTrees) -> None:
+        super().__init__(card, virtual)
         self._shown: dict[bytes, tuple[bytes, Shown[Items]]] = {}
 
     def forget(self) -> None:

@@ -20,13 +20,16 @@ from __future__ import annotations
 import dataclasses
 import errno
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from math import inf
+from typing import Protocol
 
-from mavftpfs.cache.context import Context
-from mavftpfs.cache.reserved import Kind, is_reserved, parse
-from mavftpfs.cache.unsure import Placeable, Unsure
+from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.file import File
+from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.reserved import Kind, OwnNames, is_reserved, parse
+from mavftpfs.cache.unsure import Unsure
 from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -55,11 +58,32 @@ _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
 """Maps all bytes beyond ASCII to one."""
 
 
+class Later(Protocol):
+    """What is looked at after a while; see repair.Repair."""
+
+    def list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None: ...
+    def look_later(self) -> None: ...
+
+
 class Names:
     """Looks names up, changes them, and gives files theirs. Paths are the vehicle's, not below `@`."""
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(
+        self,
+        store: VehicleStore,
+        directories: Directories,
+        own: OwnNames,
+        files: Collection[File],
+        later: Later,
+        clock: Callable[[], float],
+    ) -> None:
+        """files: all that may be sent just now."""
+        self._store = store
+        self._directories = directories
+        self._own = own
+        self._files = files
+        self._later = later
+        self._clock = clock
 
     # --- asking
 
@@ -70,11 +94,11 @@ class Names:
             As VehicleStore.stat_size.
         """
         if self._opening_waits(path):
-            entry = await self._context.directories.ask_entry(path)
+            entry = await self._directories.ask_entry(path)
             if entry is not None:
                 return entry.size
         try:
-            return await self._context.store.stat_size(path)
+            return await self._store.stat_size(path)
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
@@ -83,9 +107,8 @@ class Names:
     def _opening_waits(self, path: bytes) -> bool:
         """Return whether to open a file would wait for the end of another one's upload. It takes the server's
         one session, and where OpenFileWO empties files no upload gives way. There a directory is listed."""
-        context = self._context
-        beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
-        return beside and bool(context.store.traits.wo_truncates)
+        beside = any(file.attempt is not None and file.attempt.path != path for file in self._files)
+        return beside and bool(self._store.traits.wo_truncates)
 
     async def is_free(self, path: bytes) -> bool:
         """Return whether a name is free, asked just now.
@@ -94,7 +117,7 @@ class Names:
             As VehicleStore.stat_size.
         """
         if self._opening_waits(path):
-            return await self._context.directories.ask_entry(path) is None
+            return await self._directories.ask_entry(path) is None
         return await self._opens_nothing(path)
 
     async def _opens_nothing(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
@@ -103,12 +126,12 @@ class Names:
         perhaps_directory: it may be another spelling of a directory, which does not open either.
         """
         try:
-            await self._context.store.stat_size(path)
+            await self._store.stat_size(path)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:
                 return True
             # Other numbers may be those of an older refusal.
-            return not perhaps_directory and await self._context.directories.ask_entry(path) is None
+            return not perhaps_directory and await self._directories.ask_entry(path) is None
         return False
 
     async def require_new(self, path: bytes) -> None:
@@ -121,7 +144,7 @@ class Names:
             AlreadyExists. Else as entry and VehicleStore.stat_size.
         """
         parent, name = split(path)
-        entries = (await self._context.directories.get(parent)).entries
+        entries = (await self._directories.get(parent)).entries
         plain, alike = _plain(name), set()
         for other, entry in entries.items():
             if _plain(other) == plain and not is_reserved(other):
@@ -139,9 +162,7 @@ class Names:
         Raises:
             DirectoryNotEmpty; FileBusy: only reserved names are in it. Else as Directories.ask.
         """
-        if self._context.nodes.below(path):
-            raise DirectoryNotEmpty(f"{path!r} is not empty")
-        names = (await self._context.directories.ask(path)).entries
+        names = (await self._directories.ask(path)).entries
         if not all(is_reserved(name) for name in names):
             raise DirectoryNotEmpty(f"{path!r} is not empty")
         if names:
@@ -152,7 +173,7 @@ class Names:
     async def remove(self, path: bytes) -> None:
         """Remove a file; no temporary name rests before, because it is used once. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.store.remove(path, at_once=is_reserved(split(path)[1]))
+            await self._store.remove(path, at_once=is_reserved(split(path)[1]))
         self._on_gone(path)
 
     async def remove_if_there(self, path: bytes) -> None:
@@ -165,29 +186,29 @@ class Names:
             self._on_gone(path)
 
     def _on_gone(self, path: bytes) -> None:
-        self._context.own.on_gone(path)
-        self._context.directories.put(path, None)
+        self._own.on_gone(path)
+        self._directories.put(path, None)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove an empty directory. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.store.remove_directory(path)
-        self._context.directories.put(path, None)
+            await self._store.remove_directory(path)
+        self._directories.put(path, None)
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.store.make_directory(path)
-        self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY))
+            await self._store.make_directory(path)
+        self._directories.put(path, DirEntry(b"", EntryKind.DIRECTORY))
 
     async def discard(self, path: bytes) -> None:
         """Remove a temporary name that is not needed any more. If that fails, `repair` removes it."""
-        self._context.own.release(path)
+        self._own.release(path)
         try:
             await self.remove_if_there(path)
         except MavftpfsError as error:
             log.info("%r stays until its directory is listed again: %s", path, error)
-            self._context.list_later(split(path)[0])
+            self._later.list_later(split(path)[0])
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
         """Rename; both paths fit a request.
@@ -198,7 +219,7 @@ class Names:
             NotSupported: the card cannot rename. AlreadyExists: the new name is taken, and not `over`. Else
             as VehicleStore.
         """
-        store = self._context.store
+        store = self._store
         if store.traits.rename_works is False:
             raise NotSupported("this server cannot rename")
         try:
@@ -213,8 +234,8 @@ class Names:
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
-        self._context.own.on_gone(old)
-        self._context.directories.rename(old, new)
+        self._own.on_gone(old)
+        self._directories.rename(old, new)
 
     async def learn_rename_works(self, near: bytes) -> None:
         """Learn with an empty file of ours whether the card can rename (`Traits.rename_works`). near: a path
@@ -230,11 +251,11 @@ class Names:
         for _ in range(2):  # a REMOVE that arrived twice may be refused, too, but hardly twice in a row
             if await self._try_rename(near):
                 return
-        self._context.store.traits.rename_works = False
+        self._store.traits.rename_works = False
 
     async def _try_rename(self, near: bytes) -> bool:
         """Make an empty file, rename and remove it; return False if it was lost on the way."""
-        context, store, own = self._context, self._context.store, self._context.own
+        store, own = self._store, self._own
         try:
             first = place = own.need(near, Kind.NEW)
             second = own.need(first, Kind.NEW)
@@ -252,11 +273,11 @@ class Names:
                 store.traits.rename_works = True
         except FtpNak as nak:
             log.debug("an empty file beside %r was refused: %s", near, nak)
-            return place != second or await context.directories.ask_entry(second) is not None
+            return place != second or await self._directories.ask_entry(second) is not None
         finally:
             own.release(first)
             own.release(second)
-            context.directories.expire(split(near)[0])  # the next listing cleans up what is left
+            self._directories.expire(split(near)[0])  # the next listing cleans up what is left
         return True
 
     async def purge(self, path: bytes) -> None:
@@ -266,17 +287,17 @@ class Names:
         Raises:
             As VehicleStore: then the name has to stay.
         """
-        context, (parent, _) = self._context, split(path)
-        directory = context.directories.known(parent)
+        parent, _ = split(path)
+        directory = self._directories.known(parent)
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
             old = reserved is not None and reserved.kind is Kind.OLD
-            if reserved is not None and old and context.own.target_of(left, reserved) == path:
+            if reserved is not None and old and self._own.target_of(left, reserved) == path:
                 await self.remove_if_there(left)
 
     # --- giving a verified file its name
 
-    async def place(self, file: Placeable, temporary: bytes, sent: Known) -> None:
+    async def place(self, file: File, temporary: bytes, sent: Known) -> None:
         """Give a file its name: rename its verified temporary file, over the file that has the name if it
         has a base. The caller holds the file's lock, and has looked at the name just before.
 
@@ -286,11 +307,11 @@ class Names:
         Raises:
             OutcomeUnknown: the file stays unsure. Else as rename and replace: the file was not placed.
         """
-        context, path = self._context, file.path
-        with context.store.finishing():
+        path = file.path
+        with self._store.finishing():
             await self._remove_asides(path)
             file.unsure = Unsure(temporary, None, sent, file.changes)
-            context.look_later()
+            self._later.look_later()
             try:
                 if file.base is None:
                     await self.rename(temporary, path)
@@ -302,17 +323,17 @@ class Names:
                 file.unsure = None
                 raise
 
-    def settle(self, file: Placeable) -> None:
+    def settle(self, file: File) -> None:
         """Note that it is known what has the name of a file. What is left of its placing is repaired."""
         unsure, file.unsure = file.unsure, None
         if unsure is not None:
-            own, now = self._context.own, self._context.clock()
+            own, now = self._own, self._clock()
             for left in filter(None, (unsure.temporary, unsure.aside)):
                 if own.needed.get(left, now) == inf:
                     own.release(left)
-                    self._context.list_later(split(left)[0])
+                    self._later.list_later(split(left)[0])
 
-    async def replace(self, source: bytes, target: bytes, file: Placeable | None = None) -> None:
+    async def replace(self, source: bytes, target: bytes, file: File | None = None) -> None:
         """Rename over a file that exists. file: the unsure file that is placed.
 
         One rename is enough where the server never leaves the name without a file. NuttX removes the old file
@@ -322,7 +343,7 @@ class Names:
             NotSupported: the server does not rename. Else as VehicleStore.rename. After an error the old file
             has its name again. After OutcomeUnknown that is not known, and `repair` looks.
         """
-        traits = self._context.store.traits
+        traits = self._store.traits
         if traits.rename_replaces is not False and not is_on_nuttx(target):
             try:
                 await self.rename(source, target, over=True)
@@ -334,19 +355,19 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        own, shown = self._context.own, self._context.directories.entry(target)
+        own, shown = self._own, self._directories.entry(target)
         aside = own.need(target, Kind.OLD)
         if file is not None and file.unsure is not None:
             file.unsure = dataclasses.replace(file.unsure, aside=aside)
-        with self._context.store.finishing():
+        with self._store.finishing():
             try:
                 moved = await self._swap(source, target, aside)
             except OutcomeUnknown:
                 if file is None:
                     if shown is not None:
-                        self._context.directories.put(target, shown)  # programs go on seeing it
+                        self._directories.put(target, shown)  # programs go on seeing it
                     own.release(aside)
-                    self._context.list_later(split(target)[0])
+                    self._later.list_later(split(target)[0])
                 raise
             except MavftpfsError:
                 own.on_gone(aside)
@@ -360,9 +381,8 @@ class Names:
         """Note that it is not known what these names are after an interrupted change: the listings and files
         there, and below, prove nothing from now on."""
         for path in paths:
-            self._context.directories.forget(path)
-            self._context.directories.expire(split(path)[0])
-            self._context.files.on_changed(path)
+            self._directories.forget(path)
+            self._directories.expire(split(path)[0])
 
     # --- inside
 
@@ -372,9 +392,9 @@ class Names:
         Raises:
             As VehicleStore.
         """
-        own = self._context.own
+        own = self._own
         for aside in [aside for aside, target in own.targets.items() if target == path]:
-            if own.is_needed(aside, self._context.clock()) and own.needed[aside] < inf:
+            if own.is_needed(aside, self._clock()) and own.needed[aside] < inf:
                 await self.remove_if_there(aside)
 
     async def _swap(self, source: bytes, target: bytes, aside: bytes) -> bool:
@@ -403,7 +423,7 @@ class Names:
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
-            if await self._context.directories.ask_entry(target) is None:
+            if await self._directories.ask_entry(target) is None:
                 return False
             if not again:
                 raise
@@ -425,18 +445,18 @@ class Names:
         """Remove the old file of a name that has a new one. In doubt it stays aside for some seconds: a late
         duplicate of the first rename may move the new file over it. That is looked at then, also if the doubt
         arises in these seconds."""
-        context, parent = self._context, split(aside)[0]
-        if context.store.in_doubt():
-            context.own.needed[aside] = context.clock() + LIES_ASIDE
+        parent = split(aside)[0]
+        if self._store.in_doubt():
+            self._own.needed[aside] = self._clock() + LIES_ASIDE
         else:
             await self.discard(aside)
-        context.list_later(parent, LIES_ASIDE, only_in_doubt=True)
+        self._later.list_later(parent, LIES_ASIDE, only_in_doubt=True)
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
         """If the outcome of the body is unknown, forget what these names were (`on_unknown`)."""
         try:
-            with self._context.directories.changing(*paths):
+            with self._directories.changing(*paths):
                 yield
         except OutcomeUnknown:
             self.on_unknown(*paths)

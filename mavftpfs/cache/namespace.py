@@ -2,7 +2,7 @@
 
 Servers check little: some remove files by rmdir, or move into directories by rename (servers.md 9). So types
 and targets are looked up in listings first. A change holds its paths alone (`pathlocks`). A rename first
-delivers the drafts of what it moves.
+delivers the pending changes of what it moves.
 
 When a file loses its name, the vehicle has it no more. Programs that have it open go on with what was written
 here; to read any other byte of it is ESTALE.
@@ -15,14 +15,16 @@ from contextlib import asynccontextmanager, nullcontext
 
 import trio
 
-from mavftpfs.cache.context import Context
-from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.names import Names
+from mavftpfs.cache import delivery, reading, uploads
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.file import Event
 from mavftpfs.cache.reserved import fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
+    DirectoryNotEmpty,
     FileBusy,
+    FileChanged,
     InvalidMove,
     IsADirectory,
     NotADirectory,
@@ -37,191 +39,211 @@ RECENT = 2.0
 list their directory before each."""
 
 
-class Namespace:
-    """Changes of names. Paths are the vehicle's, not local, not below `@`."""
+async def mkdir(card: Card, path: bytes) -> None:
+    """See Tree.mkdir."""
+    card.require_changeable()
+    require_not_ours(path)
+    require_listable(path)
+    async with card.paths.hold(path):
+        if await card.entry(path) is not None:
+            raise AlreadyExists(f"{path!r} exists")
+        await card.names.require_new(path)
+        await card.names.make_directory(path)
 
-    def __init__(self, context: Context, names: Names, deliverer: Deliverer) -> None:
-        self._context = context
-        self._names = names
-        self._deliverer = deliverer
 
-    async def mkdir(self, path: bytes) -> None:
-        """See Tree.mkdir."""
-        self._context.require_changeable()
-        require_not_ours(path)
-        require_listable(path)
-        async with self._context.paths.hold(path):
-            if await self._context.entry(path) is not None:
-                raise AlreadyExists(f"{path!r} exists")
-            await self._names.require_new(path)
-            await self._names.make_directory(path)
-
-    async def rmdir(self, path: bytes) -> None:
-        """See Tree.rmdir."""
-        self._context.require_changeable()
-        async with self._context.paths.hold(path):
-            entry = await self._context.entry(path)
-            if entry is None:
-                raise NotFound(f"{path!r} does not exist")
-            if entry.kind is not EntryKind.DIRECTORY:
-                raise NotADirectory(f"{path!r} is not a directory")
-            await self._names.require_empty(path)
-            await self._names.remove_directory(path)
-        self._context.times.forget(path)
-
-    async def unlink(self, path: bytes) -> None:
-        """See Tree.unlink."""
-        self._context.require_changeable()
-        require_not_ours(path)
-        async with self._claim(path), self._context.paths.hold(path):
-            await self._unlink(path)
-        self._context.times.forget(path)
-
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
-        """See Tree.rename."""
-        self._context.require_changeable()
-        require_not_ours(old)
-        require_not_ours(new)
-        require_listable(new)
-        if new.startswith(old + b"/"):
-            raise InvalidMove(f"{old!r} cannot become a part of itself")
-        if old != new:
-            await self._deliver_below(old)
-        claimed = nullcontext() if noreplace or old == new else self._claim(new)
-        async with claimed, self._context.paths.hold(old, new):
-            await self._rename(old, new, noreplace=noreplace)
-
-    @asynccontextmanager
-    async def _claim(self, path: bytes) -> AsyncIterator[None]:
-        """Claim the file of a path, if it is open or not delivered, for a body that takes its name away.
-
-        Raises:
-            FileBusy: see Node.claim.
-        """
-        nodes = self._context.nodes
-        node = nodes.get(path)
-        try:
-            patience = self._context.options.op_deadline
-            async with nullcontext() if node is None else node.claim(patience):
-                yield
-        finally:
-            if node is not None:
-                nodes.maybe_forget(node)
-
-    @asynccontextmanager
-    async def _moving(self, *paths: bytes) -> AsyncIterator[None]:
-        """For a body that moves the first path to the second. If its outcome is unknown, forget what these
-        names were; files of these names that are not delivered are STALE, because their names may have other
-        files."""
-        context = self._context
-        try:
-            yield
-        except OutcomeUnknown:
-            self._names.on_unknown(*paths)
-            for node in [n for path in paths for n in context.nodes.below(path)]:
-                if node.undelivered and node.draft is not None:
-                    self._names.settle(node)
-                    node.draft.lose_base(though_rewritten=True)
-                else:
-                    context.files.on_replaced(node.path)
-            raise
-
-    # --- inside: unlinking
-
-    async def _unlink(self, path: bytes) -> None:
-        context, node = self._context, self._context.nodes.get(path)
-        draft = None if node is None else node.draft
-        if node is not None:
-            await self._deliverer.look(node)
-            await self._deliverer.abandon(node)
-        entry = await context.directories.ask_entry(path, within=RECENT)
-        there = entry is not None and entry.kind is EntryKind.FILE
-        if draft is not None:  # a file of others under its name is not to be removed, if it holds something
-            ours = draft.base is not None or draft.sent_in_place
-            there &= ours or (entry is not None and not entry.size)
-        elif entry is None:
-            context.nodes.forget_broken(path)
+async def rmdir(card: Card, path: bytes) -> None:
+    """See Tree.rmdir."""
+    card.require_changeable()
+    async with card.paths.hold(path):
+        entry = await card.entry(path)
+        if entry is None:
             raise NotFound(f"{path!r} does not exist")
-        elif not there:
-            raise IsADirectory(f"{path!r} is a directory")
-        else:
-            context.require_idle(path)
-        await self._names.purge(path)
-        context.nodes.forget_broken(path)
-        if there:
-            await self._names.remove_if_there(path)
-            context.files.on_changed(path)
-        if node is not None:
-            context.nodes.unnamed(node)
+        if entry.kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{path!r} is not a directory")
+        await _require_empty(card, path)
+        await card.names.remove_directory(path)
+    card.forget_time(path)
 
-    # --- inside: renaming
 
-    async def _deliver_below(self, path: bytes) -> None:
-        """Deliver what is about to get another name. Raises FileBusy if that takes too long."""
-        with trio.move_on_after(self._context.options.op_deadline) as scope:
-            for node in self._context.nodes.below(path):
-                await self._deliverer.deliver(node)
-                self._context.nodes.maybe_forget(node)
-        if scope.cancelled_caught:
-            raise FileBusy(f"{path!r} is still being delivered")
+async def unlink(card: Card, path: bytes) -> None:
+    """See Tree.unlink."""
+    card.require_changeable()
+    require_not_ours(path)
+    async with _claim(card, path), card.paths.hold(path):
+        await _unlink(card, path)
+    card.forget_time(path)
 
-    async def _rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
-        context = self._context
-        wire_path(new)
-        listed = await context.directories.ask_entry(new, within=RECENT)
-        target = listed or await self._context.entry(new)
-        source = await self._context.entry(old)
-        if source is None:
-            raise NotFound(f"{old!r} does not exist")
-        if target is None:
-            await self._names.require_new(new)
-        elif noreplace:
-            raise AlreadyExists(f"{new!r} exists")
-        if old == new:
-            return
-        if target is not None and target.kind is EntryKind.DIRECTORY:
-            if source.kind is EntryKind.FILE:
-                raise IsADirectory(f"{new!r} is a directory")
-            await self._names.require_empty(new)
-        elif target is not None and source.kind is EntryKind.DIRECTORY:
-            raise NotADirectory(f"{new!r} is not a directory")
-        if not fits_rename(old, new):
-            raise CrossDevice(f"{old!r} and {new!r} do not fit one request together")
-        for path in (old, new):
-            if context.nodes.get(path) is None:
-                context.require_idle(path)
-        await self._move(old, new, listed)
-        if source.kind is EntryKind.DIRECTORY:
-            context.directories.forget(old)
-        context.files.on_renamed(old, new)
-        context.nodes.rename(old, new)
-        for path in (old, new):
-            context.nodes.forget_broken(path)
-        for directory in context.own.follow_rename(old, new):
-            context.list_later(directory)
-        self._context.times.rename(old, new)
 
-    async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
-        """Rename on the vehicle. listed: what it has at `new`, which is replaced."""
-        context, displaced = self._context, self._context.nodes.get(new)
-        for node in context.nodes.below(old):
-            await self._deliverer.abandon(node)
-            if node.draft is not None and node.draft.base is None:
-                raise FileBusy(f"{node.path!r} is being written, and not on the vehicle yet")
-        if displaced is not None:
-            await self._deliverer.look(displaced)
-            await self._deliverer.abandon(displaced)
-        await self._names.purge(old)
-        try:
-            async with self._moving(old, new):
-                if listed is not None and listed.kind is EntryKind.FILE:
-                    context.files.close_readers(new)
-                    await self._names.replace(old, new)
+async def rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> None:
+    """See Tree.rename."""
+    card.require_changeable()
+    require_not_ours(old)
+    require_not_ours(new)
+    require_listable(new)
+    if new.startswith(old + b"/"):
+        raise InvalidMove(f"{old!r} cannot become a part of itself")
+    if old != new:
+        await _deliver_below(card, old)
+    claimed = nullcontext() if noreplace or old == new else _claim(card, new)
+    async with claimed, card.paths.hold(old, new):
+        await _rename(card, old, new, noreplace=noreplace)
+
+
+@asynccontextmanager
+async def _claim(card: Card, path: bytes) -> AsyncIterator[None]:
+    """Claim the file of a path, if it is open or not delivered, for a body that takes its name away.
+
+    Raises:
+        FileBusy: see File.claim.
+    """
+    file = card.find(path)
+    try:
+        async with nullcontext() if file is None else file.claim(card.options.op_deadline):
+            yield
+    finally:
+        if file is not None:
+            card.maybe_forget(file)
+
+
+@asynccontextmanager
+async def _moving(card: Card, *paths: bytes) -> AsyncIterator[None]:
+    """For a body that moves the first path to the second. If its outcome is unknown, what was known of these
+    names, and of those below, is forgotten. Files of these names that are not delivered are STALE, because
+    their names may have other files."""
+    try:
+        yield
+    except OutcomeUnknown:
+        for path in paths:
+            for file in list(card.files_below(path)):
+                if file.undelivered:
+                    card.names.settle(file)
+                    file.blocks.end(FileChanged(f"it is not known what became of {path!r}"))
+                    file.on(Event.REPLACED)
                 else:
-                    if listed is not None:
-                        await self._names.remove_directory(new)
-                    await self._names.rename(old, new)
-        except NotSupported as error:
-            raise CrossDevice(str(error)) from error
-        if displaced is not None:
-            context.nodes.unnamed(displaced)
+                    reading.lose_base(card, file)
+        raise
+
+
+async def _require_empty(card: Card, path: bytes) -> None:
+    """Check by a new listing that a directory is empty, and that no program has a new file in it."""
+    if any(file in card.live for file in card.files_below(path)):
+        raise DirectoryNotEmpty(f"{path!r} is not empty")
+    await card.names.require_empty(path)
+
+
+# --- inside: unlinking
+
+
+async def _unlink(card: Card, path: bytes) -> None:
+    file = card.find(path)
+    if file is not None:
+        await delivery.look(card, file)
+        await uploads.abandon(card, file)
+    entry = await card.directories.ask_entry(path, within=RECENT)
+    there = entry is not None and entry.kind is EntryKind.FILE
+    if file is not None and file.is_local:
+        # A file of others under its name is not to be removed, if it holds something.
+        ours = file.base is not None or file.lies_in_place
+        there &= ours or (entry is not None and not entry.size)
+    elif entry is None:
+        card.forget_broken(path)
+        raise NotFound(f"{path!r} does not exist")
+    elif not there:
+        raise IsADirectory(f"{path!r} is a directory")
+    else:
+        card.require_idle(path)
+    await card.names.purge(path)
+    card.forget_broken(path)
+    if there:
+        await card.names.remove_if_there(path)
+    if file is not None:
+        card.lose_name(file)
+
+
+# --- inside: renaming
+
+
+async def _deliver_below(card: Card, path: bytes) -> None:
+    """Deliver what is about to get another name. Raises FileBusy if that takes too long."""
+    with trio.move_on_after(card.options.op_deadline) as scope:
+        for file in list(card.files_below(path)):
+            await delivery.deliver(card, file)
+            card.maybe_forget(file)
+    if scope.cancelled_caught:
+        raise FileBusy(f"{path!r} is still being delivered")
+
+
+async def _rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> None:
+    wire_path(new)
+    listed = await card.directories.ask_entry(new, within=RECENT)
+    target = listed or await card.entry(new)
+    source = await card.entry(old)
+    if source is None:
+        raise NotFound(f"{old!r} does not exist")
+    if target is None:
+        await card.names.require_new(new)
+    elif noreplace:
+        raise AlreadyExists(f"{new!r} exists")
+    if old == new:
+        return
+    if target is not None and target.kind is EntryKind.DIRECTORY:
+        if source.kind is EntryKind.FILE:
+            raise IsADirectory(f"{new!r} is a directory")
+        await _require_empty(card, new)
+    elif target is not None and source.kind is EntryKind.DIRECTORY:
+        raise NotADirectory(f"{new!r} is not a directory")
+    if not fits_rename(old, new):
+        raise CrossDevice(f"{old!r} and {new!r} do not fit one request together")
+    for path in (old, new):
+        if card.find(path) not in card.live:
+            card.require_idle(path)
+    await _move(card, old, new, listed)
+    if source.kind is EntryKind.DIRECTORY:
+        card.directories.forget(old)
+    _follow(card, old, new)
+    for path in (old, new):
+        card.forget_broken(path)
+    for directory in card.own.follow_rename(old, new):
+        card.repair.list_later(directory)
+
+
+async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> None:
+    """Rename on the vehicle. listed: what it has at `new`, which is replaced."""
+    displaced = card.find(new)
+    for file in list(card.files_below(old)):
+        await uploads.abandon(card, file)
+        if file.is_local and file.base is None:
+            raise FileBusy(f"{file.path!r} is being written, and not on the vehicle yet")
+    if displaced is not None:
+        await delivery.look(card, displaced)
+        await uploads.abandon(card, displaced)
+    await card.names.purge(old)
+    try:
+        async with _moving(card, old, new):
+            if listed is not None and listed.kind is EntryKind.FILE:
+                if displaced is not None:
+                    displaced.blocks.close_reader()
+                await card.names.replace(old, new)
+            else:
+                if listed is not None:
+                    await card.names.remove_directory(new)
+                await card.names.rename(old, new)
+    except NotSupported as error:
+        raise CrossDevice(str(error)) from error
+
+
+def _follow(card: Card, old: bytes, new: bytes) -> None:
+    """Give what this mount knows of a file or directory its new name."""
+    displaced, moved = card.find(new), card.root.find(old)
+    if displaced is not None:
+        card.lose_name(displaced)
+    (source, old_name), (target, new_name) = card.root.home(old), card.root.home(new)
+    source.times.move(old_name, target.times, new_name)
+    if moved is not None:
+        moved.move(target, new_name)
+    source.prune()
+    target.prune()
+    for file in card.files_below(new):
+        file.blocks.close_reader()  # the next read opens the file under its new name
+        if file.content.spooled is not None:
+            file.content.spooled.name = file.path

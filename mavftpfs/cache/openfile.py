@@ -10,7 +10,7 @@ class OpenFile:
 
     @property
     def size(self) -> int:
-        """Bytes. While a file is written this follows the writes; else it stays for the handle's life."""
+        """Bytes. Follows the writes of all programs; the vehicle is asked when a program opens the file."""
         raise NotImplementedError
 
     @property
@@ -24,9 +24,10 @@ class OpenFile:
         return False
 
     @property
-    def broken(self) -> bool:
-        """Whether a write of the file failed: nothing of it reaches the card, and the name is not its own."""
-        return False
+    def has_name(self) -> bool:
+        """Whether the path that was opened is still the file's: others replaced it, it was removed, or a
+        write of it failed, if not."""
+        return True
 
     @property
     def writable(self) -> bool:
@@ -49,7 +50,8 @@ class OpenFile:
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
 
-        If the handle changed the file before, an error breaks the file: see `broken`.
+        If the handle changed the file before, an error breaks the file: nothing of it reaches the card, and
+        it has no name any more.
 
         Raises:
             NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken. WriteFailed: the file is broken.

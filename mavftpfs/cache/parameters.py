@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mavftpfs.cache.attributes import SECOND
+from mavftpfs.cache.card import Card
 from mavftpfs.cache.texts import (
-    Access,
     Refused,
     Save,
     Saved,
@@ -21,7 +21,7 @@ from mavftpfs.cache.texts import (
     cause_of,
     problems_refused,
 )
-from mavftpfs.cache.virtual import PARAM_FILE
+from mavftpfs.cache.virtual import PARAM_FILE, VirtualTrees
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import Download, pack_upload, unpack
 from mavftpfs.parameters.saving import Base, Values, Verdict, judge, make_plan, pick_base, unchanged
@@ -65,8 +65,8 @@ class Parameters(Texts[Base]):
     directory = split(PARAM_FILE)[0]
     names = (ALL, CHANGED, QGC)
 
-    def __init__(self, access: Access) -> None:
-        super().__init__(access)
+    def __init__(self, card: Card, virtual: VirtualTrees) -> None:
+        super().__init__(card, virtual)
         self._snapshot: Snapshot | None = None
         self._rendered: dict[bytes, Shown[Base]] = {}
         self._defaults: dict[str, Number] | None = None

@@ -33,7 +33,10 @@ SLACK = 5.0
 class Named(Protocol):
     """A file whose name may change."""
 
-    path: bytes
+    @property
+    def path(self) -> bytes:
+        """Its present name."""
+        ...
 
 
 class PathLocks:

@@ -4,7 +4,7 @@ A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a descri
 `NNNNNN.json`:
 - `path`: its path on the vehicle; `system` and `uid`: which vehicle, `uid` null if it did not tell its id.
   Nothing more while a program writes, and no close was confirmed or refused;
-- what `describe` tells of a file that could not be delivered.
+- what `writing.describe` tells of a file that could not be delivered.
 
 The description is written before the first byte, and removed when the vehicle has all of the file, or no
 program wants it any more. So the next mount can always say what it found, whenever the process was killed:
@@ -21,13 +21,11 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.spool import remove
 from mavftpfs.shared.private import make_private_directory
-from mavftpfs.shared.readable import readable
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -168,23 +166,6 @@ def move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
     except OSError as exc:
         log.info("%s has no description: %s", target, exc)
     return target
-
-
-def describe(
-    path: bytes, draft: Draft, error: Exception | None, wall: Callable[[], float]
-) -> dict[str, object]:
-    """Return the description of a spooled file, for people and JSON; `held`: the extents whose bytes are
-    here; `broken`: it is what was written before a write failed."""
-    return {
-        "path": path.decode(errors="surrogateescape"),
-        "size": draft.size,
-        "whole": draft.whole,
-        "broken": draft.state is State.BROKEN,
-        "held": list(draft.held),
-        "size_on_vehicle": None if draft.base is None else draft.base.size,
-        "error": None if error is None else readable(str(error)),
-        "at": wall(),
-    }
 
 
 # --- inside

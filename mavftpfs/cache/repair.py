@@ -24,10 +24,10 @@ from math import inf
 
 import trio
 
-from mavftpfs.cache.context import Context
-from mavftpfs.cache.directories import Directory
+from mavftpfs.cache.directories import Directories, Directory
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.reserved import Kind, Reserved, parse
+from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.reserved import Kind, OwnNames, Reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
 from mavftpfs.shared.model import EntryKind, join, split
 
@@ -68,17 +68,31 @@ def due_in(name: Reserved, owner: bytes, *, target_there: bool, age: float) -> f
 class Repair:
     """Looks at every listing, and repairs what is due. Lists by itself what is to be looked at, and has files
     that are `unsure` looked at, as soon as the vehicle is heard.
+
+    Attributes:
+        names: changes names. look(): looks at all unsure files once; returns in how many seconds again,
+            infinite if none is left.
     """
 
+    names: Names
+    look: Callable[[], Awaitable[float]]
+
     def __init__(
-        self, context: Context, names: Names, nursery: trio.Nursery, look: Callable[[], Awaitable[float]]
+        self,
+        store: VehicleStore,
+        directories: Directories,
+        own: OwnNames,
+        nursery: trio.Nursery,
+        is_blocked: Callable[[], bool],
+        clock: Callable[[], float],
     ) -> None:
-        """look(): looks at all unsure files once; returns in how many seconds again, infinite if none is
-        left."""
-        self._context = context
-        self._names = names
+        """is_blocked(): whether nothing may be changed, because the vehicle is armed."""
+        self._store = store
+        self._directories = directories
+        self._own = own
         self._nursery = nursery
-        self._look = look
+        self._is_blocked = is_blocked
+        self._clock = clock
         self._look_at = inf
         self._due: dict[tuple[bytes, bool], float] = {}
         self._busy: set[bytes] = set()
@@ -88,7 +102,7 @@ class Repair:
     def list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None:
         """List a directory in so many seconds, or before. only_in_doubt: only if replies are suspect by
         then."""
-        key, at = (directory, only_in_doubt), self._context.clock() + seconds
+        key, at = (directory, only_in_doubt), self._clock() + seconds
         if only_in_doubt:
             self._due[key] = max(at, self._due.get(key, at))
         else:
@@ -97,12 +111,12 @@ class Repair:
 
     def look_later(self) -> None:
         """Have unsure files looked at as soon as the vehicle is heard."""
-        self._look_at = self._context.clock()
+        self._look_at = self._clock()
         self._start()
 
     def retry(self) -> None:
         """Do at once what waits for the vehicle or for the end of a flight: there are news of the vehicle."""
-        now = self._context.clock()
+        now = self._clock()
         self._due = {key: at if key[1] else now for key, at in self._due.items()}
         if self._look_at < inf:
             self._look_at = now
@@ -110,18 +124,18 @@ class Repair:
 
     async def finish(self) -> None:
         """Repair everything of this mount: it ends. A directory that cannot be listed is left alone."""
-        context, doubt = self._context, self._context.store.in_doubt()
-        ours = context.own.needed.keys() | context.own.targets.keys()
+        doubt = self._store.in_doubt()
+        ours = self._own.needed.keys() | self._own.targets.keys()
         directories = {split(path)[0] for path in ours}
         directories |= {directory for directory, only_in_doubt in self._due if doubt or not only_in_doubt}
-        context.own.needed.clear()
+        self._own.needed.clear()
         self._due.clear()
         for directory in directories:
             await self._list(directory)
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """Repair what a listing shows. Raises no MavftpfsError: the listing is valid even if this fails."""
-        if directory is not self._context.directories.known(path):
+        if directory is not self._directories.known(path):
             return  # it began before a change of ours that was interrupted, and proves nothing
         found = self._see(path, directory)
         waits = [seconds for _, _, seconds in found if seconds > 0.0]
@@ -132,7 +146,7 @@ class Repair:
         self._busy.add(path)
         try:
             for left, name, seconds in found[:MOST_AT_ONCE]:
-                if seconds > 0.0 or self._context.own.is_needed(left, self._context.clock()):
+                if seconds > 0.0 or self._own.is_needed(left, self._clock()):
                     continue
                 if not await self._repair(left, name, directory):
                     self.list_later(path, IN_FLIGHT)
@@ -147,7 +161,7 @@ class Repair:
     def _see(self, path: bytes, directory: Directory) -> list[tuple[bytes, Reserved, float]]:
         """Return the temporary names in a listing, those of old files first, each with the seconds until it
         is to be repaired."""
-        own, now, seen, found = self._context.own, self._context.clock(), directory.seen, []
+        own, now, seen, found = self._own, self._clock(), directory.seen, []
         for entry in directory.entries.values():
             name, left = parse(entry.name), join(path, entry.name)
             if name is None or entry.kind is EntryKind.DIRECTORY:
@@ -166,20 +180,20 @@ class Repair:
 
     def _target(self, left: bytes, name: Reserved) -> bytes:
         """Return the path that an old file is to get."""
-        told = self._context.own.target_of(left, name)
+        told = self._own.target_of(left, name)
         return told or join(split(left)[0], b"recovered-o" + name.serial)
 
     async def _repair(self, left: bytes, name: Reserved, directory: Directory) -> bool:
         """Remove what is left, or give it its name; return False if that waits for the end of a flight."""
-        target, ours = self._target(left, name), name.owner == self._context.own.owner
+        target, ours = self._target(left, name), name.owner == self._own.owner
         waits = name.kind is Kind.OLD and split(target)[1] not in directory.entries
-        if self._context.blocked and not (ours and waits):
+        if self._is_blocked() and not (ours and waits):
             return False
         if waits:
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
-            await self._names.rename(left, target, completes=ours)
+            await self.names.rename(left, target, completes=ours)
         else:
-            await self._names.remove_if_there(left)
+            await self.names.remove_if_there(left)
         return True
 
     def _start(self) -> None:
@@ -190,31 +204,30 @@ class Repair:
 
     async def _run(self) -> None:
         """Look and list, as long as there is something to."""
-        context = self._context
         try:
             while self._due or self._look_at < inf:
-                self._news, lost = trio.Event(), context.store.why_lost() is not None
+                self._news, lost = trio.Event(), self._store.why_lost() is not None
                 at = min(self._look_at, *self._due.values(), inf)
-                with trio.move_on_after(LOST_FOR if lost else max(0.0, at - context.clock())):
+                with trio.move_on_after(LOST_FOR if lost else max(0.0, at - self._clock())):
                     await self._news.wait()
-                if context.store.why_lost() is None:
-                    await self._do_due(context.clock())
+                if self._store.why_lost() is None:
+                    await self._do_due(self._clock())
         finally:
             self._running = False
 
     async def _do_due(self, now: float) -> None:
         if self._look_at <= now:
             self._look_at = inf
-            again = await self._look()
-            self._look_at = min(self._look_at, self._context.clock() + again)
+            again = await self.look()
+            self._look_at = min(self._look_at, self._clock() + again)
         for key in [key for key, at in self._due.items() if at <= now]:
             directory, only_in_doubt = key
-            if self._due.pop(key, None) is not None and (not only_in_doubt or self._context.store.in_doubt()):
+            if self._due.pop(key, None) is not None and (not only_in_doubt or self._store.in_doubt()):
                 await self._list(directory)
 
     async def _list(self, directory: bytes) -> None:
         try:
-            await self._context.directories.ask(directory)
+            await self._directories.ask(directory)
         except (NotFound, NotADirectory):
             pass
         except MavftpfsError as error:

@@ -22,8 +22,9 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import trio
 
 from mavftpfs.cache.attributes import SECOND, Stat
+from mavftpfs.cache.card import Card
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.source import Opening, Source
 from mavftpfs.cache.virtual import SnapshotHandle, VirtualTrees
 from mavftpfs.parameters.text import Problem
 from mavftpfs.protocol.payload import crc32
@@ -37,7 +38,7 @@ from mavftpfs.shared.errors import (
     ReadOnly,
     RemoteProtocolError,
 )
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, split
 
 LAST_ERROR = b"last_error.txt"
 MAX_TEXT = 4 << 20
@@ -128,24 +129,14 @@ class TextUpload:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
-    """What all texts of a vehicle need. wall: the time of day. require_writable: raises Armed, ReadOnly."""
-
-    store: VehicleStore
-    virtual: VirtualTrees
-    wall: Callable[[], float]
-    require_writable: Callable[[], None]
-
-
-class Texts(ABC, Generic[B]):
+class Texts(Source, ABC, Generic[B]):
     """The texts in one `@` directory."""
 
     directory: ClassVar[bytes]
 
-    def __init__(self, access: Access) -> None:
-        self._store, self._virtual = access.store, access.virtual
-        self._wall, self._require_writable = access.wall, access.require_writable
+    def __init__(self, card: Card, virtual: VirtualTrees) -> None:
+        self._card, self._store, self._wall = card, card.store, card.wall
+        self._virtual = virtual
         self.error_text = b""
         self._error_at = int(self._wall() * SECOND)
         self._reads: OrderedDict[Program | None, Reads[B]] = OrderedDict()
@@ -187,18 +178,22 @@ class Texts(ABC, Generic[B]):
         parent, name = split(path)
         return parent == self.directory and (name in self.names or name == LAST_ERROR)
 
-    @property
-    def written(self) -> set[bytes]:
-        """The paths that programs write: the texts, and their directory, because editors try to make files
-        in it before they save (`note_other_file`)."""
-        return {self.directory, *(join(self.directory, name) for name in self.names)}
+    def is_only_read(self, path: bytes) -> bool:
+        """See Source."""
+        return split(path)[1] == LAST_ERROR
 
-    async def stat(self, name: bytes) -> Stat:
+    async def stat(self, path: bytes) -> Stat:
         """Return attributes. Raises NotFound; else as show."""
+        return await self._stat(split(path)[1])
+
+    async def _stat(self, name: bytes) -> Stat:
         if name == LAST_ERROR:
             return Stat(EntryKind.FILE, len(self.error_text), self._error_at, 0.0)
         shown = await self.show(name, reread=False)
         return Stat(EntryKind.FILE, len(shown.text), shown.since_ns, 0.0)
+
+    async def set_times(self, path: bytes, mtime_ns: int) -> None:
+        """Ignore it: a text shows when the vehicle changed."""
 
     async def list(self, patience: float) -> list[tuple[bytes, Stat]]:
         """Return the texts that are there. One that was not read within `patience` seconds has size 0."""
@@ -206,37 +201,37 @@ class Texts(ABC, Generic[B]):
         with trio.move_on_after(patience) as scope:
             for name in self.names:
                 with suppress(MavftpfsError):  # it does not open; the program that opens it is told
-                    found[name] = await self.stat(name)
+                    found[name] = await self._stat(name)
         if scope.cancelled_caught:
             unread = Stat(EntryKind.FILE, 0, 0, 0.0)
             found = {name: found.get(name, unread) for name in self.names}
         if found:
-            found[LAST_ERROR] = await self.stat(LAST_ERROR)
+            found[LAST_ERROR] = await self._stat(LAST_ERROR)
         return list(found.items())
 
-    async def open(
-        self, name: bytes, *, write: bool, truncate: bool, append: bool, program: Program | None
-    ) -> TextHandle[B] | SnapshotHandle:
+    async def open(self, path: bytes, how: Opening) -> TextHandle[B] | SnapshotHandle:
         """Open one.
 
         Raises:
             ReadOnly, Armed, NotFound; else as show.
         """
+        name = split(path)[1]
         if name == LAST_ERROR:
-            if write:
+            if how.write:
                 raise ReadOnly(readonly.virtual(name))
             return SnapshotHandle(self.error_text)
-        if write:
+        if how.write:
             try:
                 self._require_writable()
             except MavftpfsError as error:
                 self._tell(name, [f"nothing was set: {error}"])
                 raise
-        shown = await self.show(name, reread=not truncate)
-        return TextHandle(self, name, shown, write=write, truncate=truncate, append=append, program=program)
+        shown = await self.show(name, reread=not how.truncate)
+        return TextHandle(self, name, shown, how)
 
-    async def crc32(self, name: bytes) -> int:
+    async def crc32(self, path: bytes) -> int:
         """Return the CRC32 (start value 0, no final xor) of what a reader gets. Raises as show."""
+        name = split(path)[1]
         text = self.error_text if name == LAST_ERROR else (await self.show(name, reread=False)).text
         return crc32(text)
 
@@ -244,6 +239,11 @@ class Texts(ABC, Generic[B]):
         """Note that a program tried to make a file beside the texts."""
         if program in self._reads:
             self._reads[program].rereads = True
+
+    def _require_writable(self) -> None:
+        if self._card.options.read_only:
+            raise ReadOnly(readonly.NOTHING_BY_OPTION)
+        self._card.require_disarmed()
 
     # --- what handles ask
 
@@ -396,20 +396,16 @@ class TextHandle(OpenFile, Generic[B]):
         texts: Texts[B],
         name: bytes,
         shown: Shown[B],
-        *,
-        write: bool,
-        truncate: bool,
-        append: bool,
-        program: Program | None,
+        how: Opening,
     ) -> None:
-        self.writable = write
+        self.writable = how.write
         self._texts = texts
         self._name = name
-        self._program = program
-        self._append = append and write
-        self._base = None if truncate or self._append else shown.base
+        self._program: Program | None = how.program()
+        self._append = how.append and how.write
+        self._base = None if how.truncate or self._append else shown.base
         self._shown = shown.base
-        self._before = b"" if truncate else shown.text  # what the appended lines follow
+        self._before = b"" if how.truncate else shown.text  # what the appended lines follow
         self._content = bytearray() if self._append else bytearray(self._before)
         self._changed = False
         self._error: MavftpfsError | None = None

@@ -8,16 +8,14 @@ take longer than two minutes.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 
 import trio
 
-from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Draft
-from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.blocks import RateMeter
+from mavftpfs.cache.file import File
 from mavftpfs.cache.options import KIB, MIB
 from mavftpfs.cache.together import together
-from mavftpfs.cache.versions import RateMeter
 from mavftpfs.shared.errors import FileTooLarge
 
 SECONDS = 10.0
@@ -37,69 +35,68 @@ STALL = 5.0
 """After so many seconds in which nothing was ACKed a writer asks why."""
 
 
-class WriteLimit:
-    """How many bytes may be un-ACKed over all uploads: those of ten seconds.
-
-    Attributes:
-        meter: how fast bytes are ACKed.
-    """
-
-    def __init__(self) -> None:
-        self.meter = RateMeter()
-
-    def bytes(self) -> int:
-        """Return the limit as of now."""
-        rate = self.meter.rate
-        return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
-
-
 class Throttle:
     """Makes writers wait while too many bytes are not ACKed.
 
     Attributes:
         waiting: the writers that wait for room. Any event that may give room unparks all of them.
+        meter: how fast bytes are ACKed.
     """
 
-    def __init__(self, context: Context, limit: WriteLimit) -> None:
+    def __init__(
+        self,
+        files: Collection[File],
+        reads: RateMeter,
+        link_rate: float | None,
+        clock: Callable[[], float],
+    ) -> None:
+        """files: all that may be sent. reads: how fast bytes are read. link_rate: bytes per second that the
+        link carries at most, where that is known."""
         self.waiting = trio.lowlevel.ParkingLot()
-        self._context = context
-        self._limit = limit
+        self.meter = RateMeter()
+        self._files = files
+        self._reads = reads
+        self._link_rate = link_rate
+        self._clock = clock
 
-    def require_sendable(self, draft: Draft, size: int) -> None:
+    @property
+    def limit(self) -> int:
+        """How many bytes may be un-ACKed over all uploads."""
+        rate = self.meter.rate
+        return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
+
+    def require_sendable(self, file: File, size: int) -> None:
         """Check that a file of `size` bytes, of which the vehicle has a part, can be sent again.
 
         Raises:
             FileTooLarge.
         """
-        if not draft.base_limit:
-            return
-        limit = self._rewritable(draft)
-        if size > limit:
+        limit = self._rewritable(file)
+        if file.base_matters and size > limit:
             raise FileTooLarge(
                 f"a change of a part sends the whole file: {size} bytes, and two minutes of the link carry "
                 f"{limit}; write a new file instead"
             )
 
-    def _rewritable(self, draft: Draft) -> int:
+    def _rewritable(self, file: File) -> int:
         """Return how large a file may be of which a part is changed, as far as the rates are known."""
-        read = self._context.files.cache.meter.rate
-        write = self._limit.meter.rate or read or self._context.options.link_rate
+        read = self._reads.rate
+        write = self.meter.rate or read or self._link_rate
         read = read or write
         if not write or not read:
             return MOST_REWRITE
-        missing = sum([stop - start for start, stop in draft.missing_base()])
+        missing = sum([stop - start for start, stop in file.content.missing_base()])
         possible = int((REWRITE_SECONDS - missing / read) * write)
         return min(max(possible, LEAST_REWRITE), MOST_REWRITE)
 
-    def is_full(self, node: Node) -> bool:
+    def is_full(self, file: File) -> bool:
         """Return whether the writers of a file have to wait."""
-        draft = node.draft
-        if draft is None or node.removed or draft.unacked <= LEAST:
+        if not file.has_name or file.unacked <= LEAST:
             return False  # a file without a name is not delivered
-        if node.start_after == float("inf") or draft.base_limit:
+        if file.start_after == float("inf") or file.base_matters:
             return False  # nothing of it moves before it is closed: it waits on the local disk
-        streams = sum(other.attempt is not None for other in self._context.nodes)
-        return draft.unacked > self._limit.bytes() // max(streams, 1)
+        streams = sum(other.attempt is not None for other in self._files)
+        return file.unacked > self.limit // max(streams, 1)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
@@ -108,7 +105,7 @@ class Throttle:
             return True
         return False
 
-    async def while_full(self, node: Node, deliver: Callable[[], Awaitable[None]]) -> None:
+    async def while_full(self, file: File, deliver: Callable[[], Awaitable[None]]) -> None:
         """Have a delivery say what is wrong, if anything is. It is cancelled once bytes move again: what it
         would give its name is half a file, whose program is writing on.
 
@@ -126,36 +123,35 @@ class Throttle:
 
         async def look() -> None:
             with watch:
-                while self.is_full(node):
+                while self.is_full(file):
                     await self.waiting.park()
                 delivery.cancel()
 
         await together(try_it, look)
 
-    def on_acked(self, draft: Draft, count: int) -> None:
-        """Note that bytes of a draft were ACKed: writers that wait look again."""
-        self._limit.meter.on_bytes(count, self._context.clock(), draft)
+    def on_acked(self, file: File, count: int) -> None:
+        """Note that bytes of a file were ACKed: writers that wait look again."""
+        self.meter.on_bytes(count, self._clock(), file)
         self.waiting.unpark_all()
 
     @property
     def speed(self) -> float | None:
         """Bytes per second that are ACKed, as people are told; None while it is not known."""
-        return self._limit.meter.shown.at(self._context.clock())
+        return self.meter.shown.at(self._clock())
 
     def transfers(self) -> list[dict[str, object]]:
         """Return the files that are not delivered, those being sent first; eta: seconds at the measured
         rate."""
-        waiting = [node for node in self._context.nodes if node.undelivered]
+        waiting = [file for file in self._files if file.undelivered]
         rate, before, found = self.speed, 0, []
-        for node in sorted(waiting, key=lambda node: node.attempt is None):
-            assert node.draft is not None
-            before += node.draft.unacked
+        for file in sorted(waiting, key=lambda file: file.attempt is None):
+            before += file.unacked
             found.append(
                 {
-                    "path": node.path.decode(errors="replace"),
-                    "size": node.draft.size,
-                    "bytes_left": node.draft.unacked,
-                    "sending": node.attempt is not None,
+                    "path": file.path.decode(errors="replace"),
+                    "size": file.size,
+                    "bytes_left": file.unacked,
+                    "sending": file.attempt is not None,
                     "eta": round(before / rate, 1) if rate else None,
                 }
             )

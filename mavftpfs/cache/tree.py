@@ -1,9 +1,8 @@
 """The vehicle's files, as mounts, commands and programs see them. Layer: cache.
 
-`Tree` decides which part answers: remembered listings (`directories`), blocks of regular files (`files`),
-what is written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
-(`localfiles`). It translates paths: callers name them below the mount's root, the modules behind it name them
-as the vehicle does.
+`Tree` is the facade: it translates paths, which callers name below the mount's root and the sources behind it
+name as the vehicle does, and finds the source of a path: the card (`cardfiles`), snapshots of `@` files
+(`virtual`), texts that stand for such a file (`texts`), or names that never reach the vehicle (`localfiles`).
 """
 
 from __future__ import annotations
@@ -16,33 +15,28 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cache.attributes import SECOND, Stat, shown_mtime
-from mavftpfs.cache.directories import Directories, Directory, Found
-from mavftpfs.cache.draft import Draft, State
-from mavftpfs.cache.files import Files
-from mavftpfs.cache.localfiles import LocalFiles
+from mavftpfs.cache import reading
+from mavftpfs.cache.attributes import SECOND, Stat
+from mavftpfs.cache.background import Background
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.cardfiles import CardFiles
+from mavftpfs.cache.directories import Directory, Found
+from mavftpfs.cache.localfiles import LocalFiles, stays_local
 from mavftpfs.cache.missions import Missions
-from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.parameters import Parameters
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.texts import Access, Program, Texts
-from mavftpfs.cache.versions import BlockCache
+from mavftpfs.cache.source import Opening, Source
+from mavftpfs.cache.texts import Program, Texts
 from mavftpfs.cache.virtual import VirtualTrees
-from mavftpfs.cache.writeback import Writeback
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
-    IsADirectory,
     ListingIncomplete,
     NotADirectory,
-    NotDeliveredYet,
-    NotFound,
-    NotSupported,
     ReadOnly,
 )
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_virtual, join, normalise, split
@@ -75,42 +69,31 @@ class Tree:
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names.
         """
         self._options = options
-        self._clock = clock
         self._forget_copies = invalidate
-        self._store = store
-        self._directories = Directories(
-            store, options, clock=clock, nursery=nursery, on_listed=self._on_listed, on_swept=self._on_swept
-        )
-        self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
-        nodes = Nodes()
-        self._files = Files(
+        self._card = card = Card(
             store,
-            self._blocks,
-            proof_time=options.proof_time,
-            directories=self._directories,
-            nodes=nodes,
-            invalidate=self._invalidate,
-        )
-        self._virtual = VirtualTrees(
-            store, self._directories, options, invalidate=self._invalidate, nursery=nursery
-        )
-        self._local = LocalFiles(
-            options.local_max, lambda: int(wall() * SECOND), used=options.local and not options.read_only
-        )
-        self._writing = Writeback(
-            store=store,
-            directories=self._directories,
-            files=self._files,
-            nodes=nodes,
-            options=options,
+            options,
+            clock=clock,
             wall=wall,
             rng=rng or Random(),
             nursery=nursery,
-            spool_directory=spool,
+            spool=spool,
+            tell_changed=self._invalidate,
+            on_listed=self._on_listed,
+            on_swept=self._on_swept,
         )
-        self._context = self._writing.context
-        access = Access(store, self._virtual, wall, self._require_texts_writable)
-        self._texts: tuple[Texts[Any], ...] = (Parameters(access), Missions(access))
+        self._background = Background(card)
+        self._files = CardFiles(card)
+        self._virtual = VirtualTrees(
+            store, card.directories, options, invalidate=self._invalidate, nursery=nursery
+        )
+        self._texts: tuple[Texts[Any], ...] = (
+            Parameters(card, self._virtual),
+            Missions(card, self._virtual),
+        )
+        self._local = LocalFiles(
+            card.root, options.local_max, lambda: int(wall() * SECOND), self._require_directory_of
+        )
 
     # --- asking
 
@@ -121,38 +104,27 @@ class Tree:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
         remote = self._remote(path)
-        if remote == self._options.root:
-            return Stat(EntryKind.DIRECTORY, 0, shown_mtime(remote, None), self._options.attributes_hold)
-        if is_snapshot(remote):
-            texts = self._texts_of(remote)
-            return await (self._virtual.stat(remote) if texts is None else texts.stat(split(remote)[1]))
-        if self._local.owns(remote):
-            return self._local.stat(remote)
-        self._require_not_reserved(remote)
-        node = self._context.nodes.get(remote)
-        if node is not None and node.draft is not None:
-            return self._draft_stat(remote, node.draft)
-        return self._listed_stat(remote, await self._directories.find(remote))
+        return await self._source(remote).stat(remote)
 
     def is_only_read(self, path: bytes) -> bool:
         """Return whether nothing can ever be written at a path, whatever the vehicle does: below `@`
         directories all but the texts, the directories of these and local files. No traffic."""
         remote = self._remote(path)
-        if not is_virtual(remote) or self._local.owns(remote):
-            return False
-        return not any(remote in texts.written for texts in self._texts)
+        # Editors try to make files in these directories before they save.
+        of_texts = any(remote == texts.directory for texts in self._texts)
+        return not of_texts and self._source(remote).is_only_read(remote)
 
     def negative_valid_for(self, path: bytes) -> float:
         """Return for how many seconds a caller may remember that stat(path) raised NotFound.
 
         0 where the absence is not proven: the listing was incomplete or is not fresh any more.
         """
-        remote = self._remote(path)
-        left = self._virtual.absent_until(remote) - self._clock()
+        remote, directories = self._remote(path), self._card.directories
+        left = self._virtual.absent_until(remote) - self._card.clock()
         parent, name = split(remote)
-        directory = self._directories.known(parent)
+        directory = directories.known(parent)
         if directory is not None and directory.complete and name not in directory.entries:
-            left = max(left, self._directories.left(directory))
+            left = max(left, directories.left(directory))
         return max(0.0, min(self._options.absence_holds, left))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
@@ -169,24 +141,15 @@ class Tree:
                 if texts.directory == remote:
                     files += await texts.list(self._options.probe_time)
             return files
-        if self._local.owns(remote) and self._local.find(remote):
+        if self._is_local(remote) and self._local.find(remote):
             raise NotADirectory(f"{remote!r} is not a directory")
-        directory = await self._directories.get(remote)
-        founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
+        directory, shown = await self._files.list(remote)
         if remote == ROOT:
             await self._virtual.probe(directory.entries)
             for name in self._virtual.shown_in_root(directory.entries):
-                founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
-        shown = {}
-        for name, found in founds.items():
-            if self._options.read_only or not is_reserved(name):
-                shown[name] = self._listed_stat(join(remote, name), found)
-        for node in self._context.nodes:
-            parent, name = split(node.path)
-            if parent == remote and node.draft is not None:
-                shown[name] = self._draft_stat(node.path, node.draft)
-        for name in self._local.names(remote):
-            shown[name] = self._local.stat(join(remote, name))
+                found = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
+                shown[name] = self._virtual.listed_stat(join(ROOT, name), found)
+        shown.update(self._local.below(remote))
         if not directory.complete:
             raise ListingIncomplete(f"{remote!r} was not listed to its end", list(shown.items()))
         return list(shown.items())
@@ -208,28 +171,10 @@ class Tree:
             NotFound, NotADirectory, IsADirectory, ReadOnly, Armed, FileBusy; else as RemoteStore.open_reader
             and read_whole.
         """
-        remote = self._remote(path)
-        texts = self._texts_of(remote)
-        if texts is not None:
-            return await texts.open(
-                split(remote)[1],
-                write=write or truncate,
-                truncate=truncate,
-                append=append,
-                program=program(),
-            )
-        if write or truncate:
-            self._require_writable(remote)
-        if is_snapshot(remote):
-            return await self._virtual.open(remote)
-        if self._local.owns(remote):
-            return self._local.open(remote, write=write or truncate, truncate=truncate)
-        if write or truncate:
-            return await self._writing.open(remote, truncate=truncate)
-        if remote == self._options.root:
-            raise IsADirectory("the mount's root is a directory")
-        self._require_not_reserved(remote)
-        return await self._writing.open_reader(remote)
+        remote, write = self._remote(path), write or truncate
+        how = Opening(write, truncate, append, program)
+        source = self._changing(remote) if write and not self._texts_of(remote) else self._source(remote)
+        return await source.open(remote, how)
 
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file (start value 0, no final xor).
@@ -240,21 +185,7 @@ class Tree:
             NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
         """
         remote = self._remote(path)
-        texts = self._texts_of(remote)
-        if texts is not None:
-            return await texts.crc32(split(remote)[1])
-        if is_snapshot(remote):
-            return await self._virtual.crc32(remote)
-        node = self._context.nodes.get(remote)
-        if node is not None and node.undelivered:
-            raise NotDeliveredYet(f"{remote!r} is not on the vehicle yet")
-        if remote == self._options.root:
-            raise IsADirectory("the mount's root is a directory")
-        found = await self._directories.find(remote)
-        if found.entry.kind is not EntryKind.FILE:
-            raise IsADirectory(f"{remote!r} is a directory")
-        self._directories.require_heard()
-        return await self._store.crc32(remote, size=found.size)
+        return await self._source(remote).crc32(remote)
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
 
@@ -271,11 +202,7 @@ class Tree:
         for texts in self._texts:
             if split(remote)[0] == texts.directory:
                 texts.note_other_file(program())
-        self._require_writable(remote)
-        if self._local.owns(remote):
-            await self._require_parent(remote)
-            return self._local.create(remote, exclusive=exclusive)
-        return await self._writing.create(remote, exclusive=exclusive)
+        return await self._changing(remote).create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file, and deliver it, unless another program has it open for writing.
@@ -284,11 +211,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
         """
         remote = self._remote(path)
-        self._require_writable(remote)
-        if self._local.owns(remote):
-            self._local.resize(self._local.find(remote), size)
-        else:
-            await self._writing.truncate(remote, size)
+        await self._changing(remote).truncate(remote, size)
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime (nanoseconds since 1970 UTC) until the file changes; no server can keep it.
@@ -298,13 +221,8 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
-        if self._texts_of(remote) is not None:
-            return  # it shows when the vehicle changed
-        self._require_writable(remote)
-        if self._local.owns(remote):
-            self._local.find(remote).mtime_ns = mtime_ns
-        else:
-            self._context.times.set(remote, mtime_ns)
+        source = self._texts_of(remote) or self._changing(remote)
+        await source.set_times(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory.
@@ -313,10 +231,7 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, NotSupported (a local name), Armed, PathTooLong.
         """
         remote = self._remote(path)
-        self._require_writable(remote)
-        if self._local.owns(remote):
-            raise NotSupported(f"{remote!r} is a name for files that stay in memory")
-        await self._writing.namespace.mkdir(remote)
+        await self._changing(remote).mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -325,12 +240,10 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        self._require_writable(remote)
-        if self._local.owns(remote) and self._local.find(remote):
-            raise NotADirectory(f"{remote!r} is not a directory")
-        if self._local.names(remote):
+        source = self._changing(remote)
+        if self._local.below(remote):
             raise DirectoryNotEmpty(f"{remote!r} holds local files")
-        await self._writing.namespace.rmdir(remote)
+        await source.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; programs that have it open go on with what was written here.
@@ -339,11 +252,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        self._require_writable(remote)
-        if self._local.owns(remote):
-            self._local.unlink(remote)
-        else:
-            await self._writing.namespace.unlink(remote)
+        await self._changing(remote).unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -353,40 +262,36 @@ class Tree:
             CrossDevice, PathTooLong, Armed, FileBusy.
         """
         source, target = self._remote(old), self._remote(new)
-        self._require_writable(source)
-        self._require_writable(target)
-        if self._local.owns(source) != self._local.owns(target):
+        mover = self._changing(source)
+        if self._changing(target) is not mover:
             raise CrossDevice(f"one of {source!r} and {target!r} is not on the vehicle")
-        if self._local.owns(source):
-            await self._require_parent(target)
-            self._local.rename(source, target, noreplace=noreplace)
-        else:
-            await self._writing.namespace.rename(source, target, noreplace=noreplace)
-            self._local.follow_rename(source, target)
+        await mover.rename(source, target, noreplace=noreplace)
+
+    # --- what is not on the vehicle
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
-        return [self._below(remote) for remote in self._writing.undelivered()]
+        return [self._below(file.path) for file in self._background.undelivered()]
 
     def broken(self) -> Sequence[bytes]:
         """Return the paths of files of which a write failed; the parts that were written are kept."""
-        return [self._below(remote) for remote in self._writing.broken()]
+        return [self._below(file.path) for file in self._card.broken]
 
     async def break_unfinished(self) -> None:
         """Break the files that programs were writing when the mount was taken away. For the end of a mount.
 
         These programs get errors from now on, so what they wrote is a part, which never gets the name.
         """
-        await self._writing.break_unfinished()
+        await self._background.break_unfinished()
 
     async def drain(self, timeout: float) -> Sequence[bytes]:
         """Deliver everything, trying again for at most `timeout` seconds; return what remains."""
-        await self._writing.drain(timeout)
+        await self._background.drain(timeout)
         return self.undelivered()
 
     async def tidy_up(self) -> None:
-        """Remove the old files of replacements that are left on the vehicle. For the end of a mount."""
-        await self._writing.tidy_up()
+        """Remove the temporary files of this mount that are left on the vehicle. For the end of a mount."""
+        await self._background.tidy_up()
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
         """Move undelivered and broken files, each with its description, to a directory, which is made.
@@ -397,13 +302,23 @@ class Tree:
         Raises:
             OSError, NoSpace, SpoolFailed: nothing could be moved.
         """
-        return self._writing.recover_to(directory)
+        return self._background.recover_to(directory)
+
+    # --- news and housekeeping
 
     def armed_changed(self, armed: bool) -> None:
         """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""
-        self._writing.armed_changed(armed)
+        self._background.armed_changed(armed)
 
-    # --- news and housekeeping
+    def link_back(self) -> None:
+        """Heartbeats are back."""
+        self._background.retry()
+
+    def rebooted(self) -> None:
+        """The vehicle restarted: what was known of it must be asked again."""
+        self._card.rebooted()
+        self._forget_virtual()
+        self._background.retry()
 
     async def refresh(self) -> None:
         """As forget_caches; a mount may have to be waited for (client/mountfiles.py)."""
@@ -411,37 +326,53 @@ class Tree:
 
     def forget_caches(self) -> None:
         """Drop everything that no open file uses."""
-        self._directories.forget(ROOT)
-        self._files.forget_closed()
+        self._card.directories.forget(ROOT)
+        self._card.forget_closed()
         self._forget_virtual()
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
-        files, blocks = self._files, self._blocks
-        writing: dict[str, Any] = self._writing.status()
-        transfers = [one for texts in self._texts for one in texts.transfers()] + writing.pop("transfers")
+        card, cache = self._card, self._card.cache
+        transfers = [one for texts in self._texts for one in texts.transfers()]
         return {
-            **writing,
-            "transfers": transfers,
-            **files.status(),
+            **self._background.status(),
+            "transfers": [*transfers, *card.throttle.transfers()],
+            "reads": reading.status(card),
             "bytes_local": self._local.used,
-            "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
-            "rate": blocks.meter.shown.at(blocks.clock()),
-            "listings_cached": len(self._directories),
-            "entries_cached": self._directories.entry_count,
-            "listings_asked": self._directories.sweeps,
+            "bytes_cached": cache.bytes_cached + self._virtual.bytes_cached,
+            "rate": cache.meter.shown.at(card.clock()),
+            "listings_cached": len(card.directories),
+            "entries_cached": card.directories.entry_count,
+            "listings_asked": card.directories.sweeps,
         }
 
-    def link_back(self) -> None:
-        """Heartbeats are back."""
-        self._writing.retry()
+    # --- inside: which source
 
-    def rebooted(self) -> None:
-        """The vehicle restarted: what was known of it must be asked again."""
-        self._directories.rebooted()
-        self._forget_virtual()
-        self._files.rebooted()
-        self._writing.retry()
+    def _source(self, remote: bytes) -> Source:
+        """Return where the file of a path comes from."""
+        if is_snapshot(remote):
+            return self._texts_of(remote) or self._virtual
+        return self._local if self._is_local(remote) else self._files
+
+    def _changing(self, remote: bytes) -> Source:
+        """Return the source of a path that is to be changed. Raises ReadOnly."""
+        if self._options.read_only:
+            raise ReadOnly(readonly.by_option(remote))
+        if is_virtual(remote):
+            raise ReadOnly(readonly.virtual(remote))
+        return self._source(remote)
+
+    def _is_local(self, remote: bytes) -> bool:
+        return self._options.local and not self._options.read_only and stays_local(remote)
+
+    def _texts_of(self, remote: bytes) -> Texts[Any] | None:
+        return next((texts for texts in self._texts if texts.owns(remote)), None)
+
+    async def _require_directory_of(self, remote: bytes) -> None:
+        """Raise NotFound or NotADirectory unless the directory of a path exists, here or there."""
+        parent = split(remote)[0]
+        if (await self._source(parent).stat(parent)).kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{parent!r} is not a directory")
 
     # --- inside
 
@@ -457,58 +388,14 @@ class Tree:
         """Return the mount's name for a path of the vehicle."""
         return remote if self._options.root == ROOT else remote[len(self._options.root) :] or ROOT
 
-    async def _require_parent(self, remote: bytes) -> None:
-        """Raise NotFound or NotADirectory unless the directory of a local path exists, here or there."""
-        parent = split(remote)[0]
-        if (await self.stat(self._below(parent))).kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{parent!r} is not a directory")
-
-    def _require_writable(self, remote: bytes) -> None:
-        if self._options.read_only:
-            raise ReadOnly(readonly.by_option(remote))
-        if is_virtual(remote):
-            raise ReadOnly(readonly.virtual(remote))
-
-    def _require_texts_writable(self) -> None:
-        if self._options.read_only:
-            raise ReadOnly(readonly.NOTHING_BY_OPTION)
-        self._context.require_disarmed()
-
-    def _texts_of(self, remote: bytes) -> Texts[Any] | None:
-        return next((texts for texts in self._texts if texts.owns(remote)), None)
-
-    def _require_not_reserved(self, remote: bytes) -> None:
-        if is_reserved(split(remote)[1]) and not self._options.read_only:
-            raise NotFound(f"{remote!r} is a name of our own")
-
     def _invalidate(self, remote: bytes) -> None:
         self._forget_copies(self._below(remote))
 
     def _on_listed(self, remote: bytes, directory: Directory) -> None:
         """A directory was listed: what is open of it is compared."""
-        self._files.on_listed(remote, directory)
-        self._context.on_listed(remote, directory)
+        reading.on_listed(self._card, remote, directory)
 
     async def _on_swept(self, remote: bytes, directory: Directory) -> None:
-        """A listing is to be given out: leftovers in it are mended first."""
+        """A listing is to be given out: leftovers in it are repaired first."""
         if not self._options.read_only:
-            await self._writing.repair.on_swept(remote, directory)
-
-    def _listed_stat(self, remote: bytes, found: Found) -> Stat:
-        if is_snapshot(remote):
-            return self._virtual.listed_stat(remote, found)
-        valid_for = max(0.0, min(self._options.attributes_hold, self._directories.left(found.directory)))
-        size = found.size
-        user_set, node = None, self._context.nodes.get(remote)
-        if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
-            user_set = self._context.times.get(remote, size, found.entry.mtime)
-        mtime_ns = shown_mtime(remote, found.entry.mtime) if user_set is None else user_set
-        return Stat(found.entry.kind, size, mtime_ns, valid_for)
-
-    def _draft_stat(self, remote: bytes, draft: Draft) -> Stat:
-        mtime_ns = self._context.times.peek(remote)
-        if mtime_ns is None:
-            entry = self._directories.entry(remote)
-            listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
-            mtime_ns = shown_mtime(remote, listed)
-        return Stat(EntryKind.FILE, draft.size, mtime_ns, self._options.attributes_hold)
+            await self._card.repair.on_swept(remote, directory)

@@ -7,7 +7,6 @@ until the vehicle confirmed that, or `looking` found out what has the name.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 from mavftpfs.shared.sameness import Known
 
@@ -17,34 +16,12 @@ class Unsure:
     """What was being placed under a name.
 
     temporary: the verified temporary file; aside: where the old file is, or may be, None if it was not moved.
-    sent: what is placed. changes: the file's `changes` when that was sent.
+    sent: what is placed. changes: the file's `changes` when that was sent. in_place: no temporary file is
+    placed, the card may have bytes of the file under its own name.
     """
 
     temporary: bytes
     aside: bytes | None
     sent: Known
     changes: int
-
-
-class Placeable(Protocol):
-    """A file, as far as giving it its name and looking at it needs it.
-
-    unsure: see Unsure. base: the vehicle's file that it changes, None if it is a new file.
-    """
-
-    unsure: Unsure | None
-    base: Known | None
-
-    @property
-    def path(self) -> bytes:
-        """Its name now."""
-        ...
-
-    @property
-    def changes(self) -> int:
-        """How often its content changed."""
-        ...
-
-    def crc32(self) -> int:
-        """Return the CRC32 of its whole content. Raises SpoolFailed."""
-        ...
+    in_place: bool = False

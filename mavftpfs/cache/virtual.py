@@ -24,6 +24,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.cache.source import Opening, Source
 from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -106,7 +107,7 @@ class SnapshotHandle(OpenFile):
         self._data = None
 
 
-class VirtualTrees:
+class VirtualTrees(Source):
     """stat, list and open below `/@...`. Paths are the vehicle's."""
 
     def __init__(
@@ -230,12 +231,17 @@ class VirtualTrees:
             raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
         return shown
 
-    async def open(self, path: bytes) -> SnapshotHandle:
+    async def open(self, path: bytes, how: Opening) -> SnapshotHandle:
         """Read the file whole, unless that was just done.
 
         Raises:
-            NotFound, NotADirectory, IsADirectory; else as RemoteStore.read_whole.
+            ReadOnly, NotFound, NotADirectory, IsADirectory; else as RemoteStore.read_whole.
         """
+        if how.write:
+            self._refuse(path)
+        return await self._open(path)
+
+    async def _open(self, path: bytes) -> SnapshotHandle:
         found = await self._find(path)
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
@@ -269,7 +275,7 @@ class VirtualTrees:
         Raises:
             As open.
         """
-        handle = await self.open(path)
+        handle = await self._open(path)
         return crc32(await handle.read(0, handle.size))
 
     def forget(self) -> None:

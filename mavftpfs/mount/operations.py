@@ -19,8 +19,7 @@ import mmap
 import os
 import stat as stat_bits
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, NoReturn
 
 import pyfuse3
@@ -192,10 +191,16 @@ class Operations(pyfuse3.Operations):
         """Open a file; O_TRUNC comes in the flags and no setattr follows it."""
         truncate, append = bool(flags & os.O_TRUNC), bool(flags & os.O_APPEND)
         writing = truncate or flags & os.O_ACCMODE != os.O_RDONLY
-        known, path = self._inode(inode), self._path(inode)
+        known = self._inode(inode)
+        self._lose_name(known)
+        path = self._path(inode)
         file = await self._tree.open(
             path, write=writing, truncate=truncate, append=append, program=lambda: program_of(ctx.pid)
         )
+        self._lose_name(known)
+        if known.path is None:
+            file.close()
+            raise FUSEError(errno.ESTALE)  # the kernel looks the name up again, and opens the new inode
         if truncate:
             known.told_size = 0
         elif known.told_size not in (None, file.size):
@@ -216,6 +221,7 @@ class Operations(pyfuse3.Operations):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
+        self._lose_name(self.inodes.reserve(path))
         self._made(path, mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
@@ -257,8 +263,7 @@ class Operations(pyfuse3.Operations):
         known.told_size = max(told, stop)  # the kernel counts on without asking
         if handle.flags & os.O_APPEND and not is_mapped_page(off, stop, told):
             off = file.size  # the size that the kernel knows may be older than ours
-        with self._losing_its_name(handle):
-            return await file.write(off, buf)
+        return await file.write(off, buf)
 
     @handler
     async def flush(self, fh: int) -> None:
@@ -272,8 +277,7 @@ class Operations(pyfuse3.Operations):
         """
         handle = self._file(fh)
         if handle.file.writable:
-            with self._losing_its_name(handle):
-                await handle.file.flush()
+            await handle.file.flush()
         for cancel in list(handle.ahead):
             handle.let_go = True
             cancel()
@@ -283,8 +287,7 @@ class Operations(pyfuse3.Operations):
         """0 means that everything written is on the card, checked, whichever handle wrote it. The kernel also
         calls fsync after each write to a file with O_SYNC, and the write returns its error."""
         handle = self._file(fh)
-        with self._losing_its_name(handle):
-            await handle.file.fsync(ends_write=bool(handle.flags & os.O_DSYNC))
+        await handle.file.fsync(ends_write=bool(handle.flags & os.O_DSYNC))
 
     @handler
     async def release(self, fh: int) -> None:
@@ -293,8 +296,7 @@ class Operations(pyfuse3.Operations):
         if handle is None:
             return
         try:
-            with self._losing_its_name(handle):
-                await handle.file.release()
+            await handle.file.release()
         except MavftpfsError as exc:
             log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
 
@@ -320,8 +322,7 @@ class Operations(pyfuse3.Operations):
     async def _resize(self, ino: int, size: int, fh: int | None) -> None:
         handle = self.files.get(fh) if fh is not None else None
         if handle is not None and handle.file.writable:
-            with self._losing_its_name(handle):
-                await handle.file.truncate(size)
+            await handle.file.truncate(size)
         else:
             await self._tree.truncate(self._path(ino), size)
 
@@ -451,23 +452,14 @@ class Operations(pyfuse3.Operations):
         self.note_entry(old)
         self.note_entry(new)
 
-    def lose_name(self, path: bytes) -> None:
-        """Take the name from an inode, because its file is broken or was taken back. Programs that open the
-        path then get another inode, and so never a page of that file; who reads it keeps it."""
-        self.inodes.unlink(path)
-
     # -- helpers ----------------------------------------------------------------------------------
 
-    @contextmanager
-    def _losing_its_name(self, handle: FileHandle) -> Iterator[None]:
-        """Take the name from the inode of a file that the body breaks."""
-        try:
-            yield
-        except MavftpfsError:
-            inode = self.inodes.get(handle.ino)
-            if handle.file.broken and inode is not None and inode.path is not None:
-                self.lose_name(inode.path)
-            raise
+    def _lose_name(self, inode: Inode) -> None:
+        """Take the path from an inode if a file is open under it that lost the name: others replaced it, or a
+        write of it failed. The path gets another inode, because the kernel has one page cache for each."""
+        for handle in self.files:
+            if handle.ino == inode.ino and inode.path is not None and not handle.file.has_name:
+                self.inodes.unlink(inode.path)
 
     def _inode(self, ino: int) -> Inode:
         inode = self.inodes.get(ino)
@@ -541,6 +533,7 @@ class Operations(pyfuse3.Operations):
 
     async def _attributes_of(self, ino: int) -> EntryAttributes:
         inode = self._inode(ino)
+        self._lose_name(inode)
         if inode.path is not None:
             return self._attributes(inode, await self._tree.stat(inode.path))
         for handle in self.files:

@@ -20,7 +20,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.mount.invalidator import Invalidator
 from mavftpfs.mount.operations import Operations
-from mavftpfs.shared.errors import MavftpfsError, NotSupported
+from mavftpfs.shared.errors import NotSupported
 from mavftpfs.shared.readable import name_text
 
 TELLING_TIME = 1.0
@@ -156,26 +156,17 @@ class ToldFile:
     async def take_back(self) -> bool | None:
         """See File."""
         there = await self._file.take_back()
-        if there is False:
-            self._operations.lose_name(self._path)
         await self._tell()
         return there
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Have the kernel drop its pages of a file that the body changes, and its name if the body breaks
-        it."""
-        if not self._file.writable:
-            yield
-            return
+        """Have the kernel drop its pages of a file that the body changes."""
         try:
             yield
-        except MavftpfsError:
-            if self._file.broken:
-                self._operations.lose_name(self._path)
-            raise
         finally:
-            self._invalidator.on_changed(self._path)
+            if self._file.writable:
+                self._invalidator.on_changed(self._path)
 
     async def _tell(self) -> None:
         """Return when programs that open the file, or look at it, see what it is now."""

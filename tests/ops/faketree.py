@@ -38,7 +38,8 @@ class FakeFile:
     writable: bool = False
     path: bytes = b""
     made: bool = False
-    direct_io = keep_cache = broken = False
+    direct_io = keep_cache = False
+    has_name = True
     verified = ""
 
     @property

@@ -111,15 +111,8 @@ async def test_a_kernel_that_waits_holds_no_answer_up_for_long() -> None:
             kernel.gate.set()
 
 
-async def test_what_is_taken_back_or_gone_loses_its_number() -> None:
+async def test_what_is_gone_loses_its_number() -> None:
     async with knowing(b"/f") as kernel:
-        file = await kernel.files.open(b"/f", write=True, truncate=True)
-        known = kernel.inodes.known(b"/f")
-        assert await file.take_back() is False
-        assert kernel.inodes.known(b"/f") is None
-        assert known is not None
-        assert kernel.inodes.get(known) is not None  # who reads it keeps it
-        kernel.inodes.lookup(b"/f")
         await kernel.files.rename(b"/f", b"/g")
         assert kernel.inodes.known(b"/g") is not None
         await kernel.files.unlink(b"/g")

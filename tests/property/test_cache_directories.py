@@ -15,7 +15,8 @@ import trio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavftpfs.cache.directories import Directories, Sweep
+from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.entries import Directory, Folder, Sweep
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join
@@ -58,8 +59,13 @@ class Racing:
         if self.unnoted is None:
             for path in DIRECTORIES:
                 self.check(path)
-        known = self.directories._known.values()
-        assert self.directories.entry_count == sum(len(directory.entries) for directory in known)
+        assert self.directories.entry_count == sum(len(known.entries) for known in self.known())
+
+    def known(self) -> list[Directory]:
+        """Return all remembered listings."""
+        root = self.directories.root
+        folders = [one for one in (root, *root.walk()) if isinstance(one, Folder)]
+        return [folder.listing for folder in folders if folder.listing is not None]
 
     # --- sweeps
 
@@ -77,8 +83,9 @@ class Racing:
             assert directory.listed_at == paging.sweep.began
 
     def abandon(self, path: bytes) -> None:
-        if self.sweeps.pop(path, None) is not None:
-            del self.directories._sweeps[path]
+        paging = self.sweeps.pop(path, None)
+        if paging is not None:
+            self.directories.end(paging.sweep)
 
     def disturb(self, path: bytes) -> None:
         match self.rng.randrange(8):

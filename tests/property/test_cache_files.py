@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, Blocks
 from mavftpfs.cache.readahead import MAX_WINDOW, Readahead
-from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 
 KIB = 1024
 
@@ -38,7 +38,8 @@ steps = st.builds(
 def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step], seed: int) -> None:
     """After each step, what is readable equals a model of bytes."""
     cache = BlockCache(2 * BLOCK_SIZE, clock=lambda: 0.0, patience=30)
-    blocks = Version(cache, b"/f", size)
+    blocks = Blocks(cache, lambda: None)
+    blocks.size = size
     held: dict[int, int] = {}
     rng = random.Random(seed)
     sample = sorted({0, size - 1, BLOCK_SIZE - 1, BLOCK_SIZE, *(rng.randrange(size or 1) for _ in range(30))})
@@ -48,15 +49,15 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
             blocks.on_data(step.start, bytes([number]) * step.size)
             blocks.on_batch(step.size)
             for at in sample:
-                if step.start <= at < stop and not blocks.ignores_data:
+                if step.start <= at < stop and not blocks.ignoring:
                     held.setdefault(at, number)
         elif step.what == "begin":
-            blocks.ignores_data = False
+            blocks.ignoring = False
         elif step.what == "suspect":
             blocks.on_suspect("test")
             held = {}
         elif step.what == "clear" or blocks.block(step.start // BLOCK_SIZE) is None:
-            blocks.clear()
+            blocks.drop()
         else:
             blocks.evict(step.start // BLOCK_SIZE)
         gone = {at for at in held if blocks.block(at // BLOCK_SIZE) is None}

@@ -489,7 +489,7 @@ async def test_a_close_that_waits_too_long_for_a_change_of_its_path_is_delivered
     tree = here.mount()
     file = await tree.create(FRESH, exclusive=True)
     await file.write(0, NEW)
-    async with tree._files.paths.hold(FRESH, lasting=True):
+    async with tree._card.paths.hold(FRESH, lasting=True):
         with pytest.raises(RequestTimeout):
             await file.flush()
         with suppress(RequestTimeout):

@@ -428,7 +428,7 @@ async def test_after_a_kill_the_next_mount_offers_the_part_and_puts_nothing_back
 
 async def test_a_part_takes_no_room_from_other_files(here: Rig) -> None:
     tree = here.mount(op_deadline=DEADLINE)
-    tree._writing.context.spool.spool_max = 150_000
+    tree._card.spool.spool_max = 150_000
     file = await part_of(tree, FRESH)
     with pytest.raises(MavftpfsError) as told:
         await write_on(file)
@@ -440,7 +440,7 @@ async def test_a_part_takes_no_room_from_other_files(here: Rig) -> None:
 
 async def test_the_oldest_parts_go_when_there_are_too_many(here: Rig) -> None:
     tree = here.mount(op_deadline=DEADLINE)
-    tree._writing.context.spool.spool_max = 250_000
+    tree._card.spool.spool_max = 250_000
     names = [b"/d/a", b"/d/b", b"/d/c"]
     for name in names:
         (await break_it(tree, name)).close()

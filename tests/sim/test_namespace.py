@@ -10,12 +10,12 @@ from contextlib import suppress
 import pytest
 import trio
 
+from mavftpfs.cache.background import PAUSES
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.options import MIN_CACHE_SIZE
 from mavftpfs.cache.repair import AGAIN_AFTER, NAMELESS_FOR, SAME_FOR
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.writeback import PAUSES
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
@@ -196,7 +196,7 @@ async def test_who_changes_names_needs_no_room_for_reading(fat: Rig) -> None:
         for name in (b"/d/a", b"/d/b", b"/d/full/x"):
             readers.start_soon(read, name)
         await trio.sleep(1)
-        assert tree._blocks.reads.value == 0
+        assert tree._card.cache.reads.value == 0
         with trio.fail_after(7):
             await tree.rename(b"/d/full/x", b"/d/full/y")
             await tree.unlink(b"/d/full/y")
@@ -473,7 +473,7 @@ async def test_only_a_listing_that_counts_proves_that_a_name_has_its_file(torn: 
     for aside in torn.litter():
         name = split(aside)[1]
         shown.entries[name] = DirEntry(name, EntryKind.FILE, len(OLD))
-    await tree._writing.repair.on_swept(b"/d", shown)
+    await tree._card.repair.on_swept(b"/d", shown)
     assert len(torn.litter()) == 1
     await tree.list(b"/d")
     assert torn.data(FILE) == OLD

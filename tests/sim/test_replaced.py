@@ -11,8 +11,11 @@ from contextlib import asynccontextmanager
 import pytest
 import trio
 
+from mavftpfs.cache import reading
+from mavftpfs.cache.handles import ReadHandle
 from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import FileChanged
+from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig
 from tests.support.transfers import content
@@ -125,18 +128,18 @@ async def test_a_read_whose_bytes_fell_into_doubt_leaves_the_reader_of_another_r
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with opened("px4") as (_, _, handle):
-        files, version = handle._handle._files, handle._handle._version  # type: ignore[attr-defined]
-        readers, require_same = [], files.require_same
+        assert isinstance(handle, ReadHandle)
+        blocks, readers, prove = handle.file.blocks, [], reading._prove
 
         async def doubt_comes(*args: object, **kwargs: object) -> None:
-            monkeypatch.setattr(files, "require_same", require_same)
-            version.on_suspect("doubt")
+            monkeypatch.setattr(reading, "_prove", prove)
+            blocks.on_suspect("doubt")
             await handle.read(STEP, STEP)  # opens the file anew
-            readers.append(version.reader)
+            readers.append(blocks.reader)
 
-        monkeypatch.setattr(files, "require_same", doubt_comes)
+        monkeypatch.setattr(reading, "_prove", doubt_comes)
         assert await handle.read(0, STEP) == OLD[:STEP]
-        assert version.reader is readers[0]
+        assert blocks.reader is readers[0]
 
 
 @pytest.mark.parametrize("grown", [False, True])
@@ -225,9 +228,11 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(profile: 
 
 async def test_the_end_of_a_copy_by_turns_is_compared() -> None:
     """Between two comparisons the reader gets unproven bytes, except for the last ones."""
-    async with opened("ardupilot5") as (here, _, handle):
+    async with opened("ardupilot5") as (here, tree, handle):
         await read_head(handle)
-        handle._handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
+        listing = tree._card.directories.known(split(PATH)[0])
+        assert listing is not None
+        listing.ended_at = float("inf")  # so it is never listed again only to compare
         replace(here)
         with pytest.raises(FileChanged):
             await read_on(handle, STEP)

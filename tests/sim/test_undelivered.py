@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 import trio
 
+from mavftpfs.cache.background import PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.throttle import UNMEASURED
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.writeback import PAUSES
 from mavftpfs.mount.farewell import keep_the_rest
 from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.session.connection import ConnectOptions
@@ -344,8 +344,7 @@ async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree
     speak(here)
     await trio.sleep(2 * PAUSES[0])
     assert tree.undelivered() == [], "the next one begins anew"
-    assert tree._writing is not None
-    assert list(tree._writing._context.nodes) == []
+    assert tree._card.live == {}
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC])
@@ -520,3 +519,29 @@ async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_
     assert tree.undelivered() == [b"/d/a"], "it stays in the spool"
     assert len(list(spool.path.glob("*.data"))) == 1
     spool.close()
+
+
+async def test_a_changed_file_is_made_whole_while_its_program_pauses(
+    here: Rig, tree: Tree, tmp_path: Path
+) -> None:
+    """The vehicle is gone before the program closes the file: what is kept is a file, not a part of one."""
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"new")
+    await trio.sleep(30.0)
+    fall_silent(here)
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    (copy,) = tree.recover_to(tmp_path / "kept")
+    assert copy.read_bytes() == b"new" + OLD[3:]
+    assert json.loads(copy.with_name(copy.name + ".json").read_text())["whole"]
+
+
+async def test_a_program_that_overwrites_every_byte_makes_nothing_be_fetched(here: Rig, tree: Tree) -> None:
+    """As rsync --inplace does."""
+    file = await tree.open(FILE, write=True)
+    for at in range(0, len(OLD), 10_000):
+        await file.write(at, OLD[::-1][at : at + 10_000])
+        await trio.sleep(0.1)
+    await file.release()
+    assert here.data(FILE) == OLD[::-1]
+    assert here.count(Opcode.READ_FILE, Opcode.BURST_READ_FILE) == 0

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 import trio
 
-from mavftpfs.cache.delivery import START_AT
+from mavftpfs.cache.uploads import START_AT
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode

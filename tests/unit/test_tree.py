@@ -187,7 +187,7 @@ async def test_a_cancelled_sweep_goes_on_for_the_next_caller() -> None:
 
 
 async def test_a_listing_that_is_always_raced_is_given_up_on(here: Rig, tree: Tree) -> None:
-    here.server.answer = lambda request: tree._directories.put(b"/never", None)
+    here.server.answer = lambda request: tree._card.directories.put(b"/never", None)
     assert b"top" in dict(await tree.list(b"/"))
     assert listings(tree) == SWEEP_TRIES
     assert tree.negative_valid_for(b"/none") == 0.0

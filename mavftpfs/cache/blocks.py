@@ -1,14 +1,11 @@
-"""Versions of remote files: what is known of them, their bytes, and the budget of all. Layer: cache.
+"""The vehicle's bytes that are here: blocks in memory, and the budget of all. Layer: cache.
 
-A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
-one version share its bytes and its remote reader. When another file turns out to have the path, or we
-write it, the version is REPLACED: its handles get FileChanged, and later opens start a new version.
+`Blocks` holds what was read of one file on the vehicle. It is the sink that the file's reader fills, and the
+place where reads wait for bytes; they are woken once per batch. `BlockCache` is the byte budget over all
+files: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is atomic (trio);
+nothing here awaits while state is half changed.
 
-A version is the sink that its reader fills; reads that wait for bytes are woken once per batch. `BlockCache`
-is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
-atomic (trio); nothing here awaits while state is half changed.
-
-Bytes in doubt (promise 1). Servers share session ids between clients, so a reply that matches in every field
+Suspect bytes (promise 1): servers share session ids between clients, so a reply that matches in every field
 can carry bytes of another file. When the session layer notices that this may have happened (`on_suspect`),
 every byte is dropped, and bytes that still come from the present reader are ignored: the next read opens a
 new one.
@@ -19,15 +16,13 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 
 import trio
 
 from mavftpfs.cache.readahead import MAX_WINDOW
 from mavftpfs.cache.remote import Reader
-from mavftpfs.shared.errors import FileChanged, RequestTimeout
+from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.speed import Speed
 
 NEVER = float("-inf")
@@ -103,7 +98,7 @@ class BlockCache:
         half of the budget. It is a lock, see `pathlocks`: a task that holds a path alone must not wait for
         it."""
         self.bytes_cached = 0
-        self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
+        self.used: OrderedDict[tuple[Blocks, int], int] = OrderedDict()
 
     def readahead_limits(self, streams: int) -> tuple[int, int]:
         """Return the largest readahead window, and up to which size a file is wanted whole, in bytes, while
@@ -114,7 +109,7 @@ class BlockCache:
         limit = min(limit, int(rate * AHEAD_SECONDS))
         return limit, max(SMALL_FILE, min(limit, int(rate * SMALL_SECONDS)))
 
-    def add(self, owner: Version, index: int, size: int) -> None:
+    def add(self, owner: Blocks, index: int, size: int) -> None:
         """Account for a new block, evicting older ones that no read waits for."""
         for _ in range(len(self.used)):
             if self.bytes_cached + size <= self.budget:
@@ -148,60 +143,29 @@ class _Waiter:
     error: Exception | None = None
 
 
-class VersionState(Enum):
-    """What is known of a version."""
-
-    CURRENT = "current"
-    """The path was proven to be this file since the server last opened it."""
-    UNPROVEN = "unproven"
-    """The server opened the path again after the last proof, or restarted."""
-    REPLACED = "replaced"
-    """Another file has the path now. This state is final."""
-
-
-class Version:
-    """A file as it was when it was opened; implements cache.remote.ReadSink. Times are those of the caches'
-    clock.
+class Blocks:
+    """What was read of one file on the vehicle; implements cache.remote.ReadSink.
 
     Attributes:
-        path: its present path. size: in bytes, by the open reply. mtime: None if not known to belong to this
-            size.
-        proven_at: when the path was last proven to be this file; NEVER after the vehicle restarted.
-        opened_at: when the server opened the file for the present session.
-        compare_after: until then no listing is asked for only to compare it.
-        reader: where its bytes come from, if it is open. handles: how many are open. in_kernel: the kernel
-            may have pages of it, and all of them are right.
-        ignores_data: what comes from the present reader is ignored, until a new one is opened.
-        doubts: how often all bytes were dropped because they were in doubt.
+        size: bytes of the vehicle's file, by the reply to its last open.
+        opened_at: when the vehicle opened the file that the present bytes come from, by the caches' clock.
+        reader: where bytes come from, if the file is open there.
+        ignoring: bytes of the present reader are ignored, because they are suspect.
+        received, received_at: bytes that arrived, and when.
     """
 
-    def __init__(
-        self,
-        cache: BlockCache,
-        path: bytes,
-        size: int = 0,
-        mtime: int | None = None,
-        *,
-        on_doubt: Callable[[Version], None] = lambda version: None,
-    ) -> None:
-        """`on_doubt` is called when its bytes are dropped in doubt: the kernel may have copies."""
-        self.path = path
-        self.size = size
-        self.mtime = mtime
+    def __init__(self, cache: BlockCache, on_suspect: Callable[[], None]) -> None:
+        """`on_suspect` is called when the bytes are dropped because they are suspect."""
+        self.size = 0
+        self.opened_at = NEVER
         self.reader: Reader | None = None
-        self.handles = 0
-        self.proven_at = cache.clock()
-        self.opened_at = self.compare_after = NEVER
-        self.in_kernel = self.ignores_data = False
-        self.doubts = 0
-        self._why = ""  # it was replaced
-        self._on_doubt = on_doubt
+        self.ignoring = False
+        self.received, self.received_at = 0, NEVER
         self._cache = cache
+        self._tell_suspect = on_suspect
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
         self._waiters: list[_Waiter] = []
-        self.received = 0
-        self.received_at = NEVER
 
     def block(self, index: int) -> bytearray | None:
         """Return a block if it is here."""
@@ -214,7 +178,7 @@ class Version:
 
     @property
     def progress(self) -> int:
-        """How many of the file's bytes came, or were here before."""
+        """How many of the file's bytes arrived, or were here before."""
         return min(self.size, max(self.received, self._present.total))
 
     # --- the sink
@@ -229,7 +193,7 @@ class Version:
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes that are not here yet, up to the opened size."""
-        if self.ignores_data:
+        if self.ignoring:
             return
         count = len(data)
         block = self._blocks.get(offset // BLOCK_SIZE)
@@ -278,14 +242,10 @@ class Version:
 
     def on_suspect(self, reason: str) -> None:
         """Drop every byte, given out or not; reads that wait ask again."""
-        if self.ignores_data:
-            return
-        self.ignores_data = True
-        self.doubts += 1
-        for index in list(self._blocks):
-            self.evict(index)
-        self.ask_again()
-        self._on_doubt(self)
+        if not self.ignoring:
+            self.ignoring = True
+            self.drop()
+            self._tell_suspect()
 
     def on_failed(self, error: Exception) -> None:
         """Reads that wait get the error; later ones ask again."""
@@ -299,64 +259,27 @@ class Version:
         for waiter in self._waiters:
             waiter.woken.set()
 
-    # --- life of the version
-
-    @property
-    def state(self) -> VersionState:
-        """See VersionState."""
-        if self._why:
-            return VersionState.REPLACED
-        return VersionState.CURRENT if self.proven_at >= self.opened_at else VersionState.UNPROVEN
-
-    @property
-    def current(self) -> bool:
-        """Whether it is in the state CURRENT."""
-        return self.state is VersionState.CURRENT
-
-    @property
-    def replaced(self) -> bool:
-        """Whether it is in the state REPLACED."""
-        return self.state is VersionState.REPLACED
-
-    @property
-    def known(self) -> Known:
-        """What it is compared by."""
-        restarted = self.proven_at == NEVER
-        return Known(self.size, self.mtime, restarted=restarted)
-
-    def require_not_replaced(self) -> None:
-        """Raise FileChanged if another file has the path."""
-        if self.replaced:
-            raise FileChanged(self._why)
-
-    def prove(self, at: float) -> None:
-        """Note a proof that the path was this file at that time."""
-        self.proven_at = max(self.proven_at, at)
-
-    def on_restart(self, at: float) -> None:
-        """Forget all proofs, because the vehicle restarted."""
-        self.proven_at = self.compare_after = NEVER
-        self.on_opened(at)
+    # --- for its file
 
     def close_reader(self) -> None:
-        """Close the remote reader. What is wanted of it does not come any more."""
+        """Close the remote reader; reads that wait for its bytes ask again."""
         reader, self.reader = self.reader, None
         if reader is not None:
             reader.close()
+        self.ask_again()
 
-    def mark_replaced(self, why: str) -> None:
-        """Become REPLACED: another file has the path. Reads that wait get FileChanged with this reason."""
-        self._why = why
-        self.close_reader()
-        self.on_failed(FileChanged(why))
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget every block that no read waits for."""
-        pinned = self.pinned()
+    def drop(self) -> None:
+        """Forget every byte; reads that wait ask again."""
         for index in list(self._blocks):
-            if index not in pinned:
-                self.evict(index)
+            self.evict(index)
+        self.ask_again()
+
+    def end(self, error: Exception) -> None:
+        """Close the reader and forget every byte, because the vehicle's file is another one; reads that wait
+        get the error."""
+        self.on_failed(error)
+        self.close_reader()
+        self.drop()
 
     # --- for the cache
 

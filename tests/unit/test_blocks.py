@@ -8,7 +8,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, Blocks
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
 from tests.support.transfers import content
 
@@ -16,11 +16,17 @@ KIB = 1024
 PATIENCE = 30.0
 
 
+def make_blocks(cache: BlockCache, size: int) -> Blocks:
+    blocks = Blocks(cache, lambda: None)
+    blocks.size = size
+    return blocks
+
+
 def make_cache(budget: int = 1024 * KIB) -> BlockCache:
     return BlockCache(budget, clock=trio.current_time, patience=PATIENCE)
 
 
-def deliver(blocks: Version, offset: int, data: bytes, *, batch: bool = True) -> None:
+def deliver(blocks: Blocks, offset: int, data: bytes, *, batch: bool = True) -> None:
     blocks.on_data(offset, data)
     if batch:
         blocks.on_batch(len(data))
@@ -28,7 +34,7 @@ def deliver(blocks: Version, offset: int, data: bytes, *, batch: bool = True) ->
 
 
 async def read(
-    blocks: Version, start: int, stop: int, want: Callable[[], None] = lambda: None
+    blocks: Blocks, start: int, stop: int, want: Callable[[], None] = lambda: None
 ) -> bytes | memoryview | None:
     async with blocks._cache.reads:
         want()
@@ -39,7 +45,7 @@ async def read(
 class Reading:
     """A read under way in a nursery."""
 
-    def __init__(self, blocks: Version, start: int, stop: int) -> None:
+    def __init__(self, blocks: Blocks, start: int, stop: int) -> None:
         self.blocks = blocks
         self.range = (start, stop)
         self.wanted: list[list[tuple[int, int]]] = []
@@ -62,7 +68,7 @@ class Reading:
         self.wanted.append(self.blocks.missing(*self.range))
 
 
-async def start_read(nursery: trio.Nursery, blocks: Version, start: int, stop: int) -> Reading:
+async def start_read(nursery: trio.Nursery, blocks: Blocks, start: int, stop: int) -> Reading:
     reading = Reading(blocks, start, stop)
     nursery.start_soon(reading.run)
     await trio.testing.wait_all_tasks_blocked()
@@ -73,7 +79,7 @@ async def start_read(nursery: trio.Nursery, blocks: Version, start: int, stop: i
 
 
 async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
-    blocks = Version(make_cache(), b"/f", 100)
+    blocks = make_blocks(make_cache(), 100)
     deliver(blocks, 0, content(100))
     view = blocks.get(10, 20)
     assert isinstance(view, memoryview)
@@ -85,7 +91,7 @@ async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
 
 async def test_least_recently_read_blocks_go_first() -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    first, second = Version(cache, b"/f", 3 * BLOCK_SIZE), Version(cache, b"/f", 2 * BLOCK_SIZE)
+    first, second = make_blocks(cache, 3 * BLOCK_SIZE), make_blocks(cache, 2 * BLOCK_SIZE)
     deliver(first, 0, content(3 * BLOCK_SIZE))
     deliver(second, 0, content(BLOCK_SIZE))
     assert first.get(0, 1) is not None
@@ -97,18 +103,17 @@ async def test_least_recently_read_blocks_go_first() -> None:
 
 async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    waited = Version(cache, b"/f", 2 * BLOCK_SIZE)
+    waited = make_blocks(cache, 2 * BLOCK_SIZE)
     deliver(waited, 0, content(BLOCK_SIZE))
     reading = await start_read(nursery, waited, 0, 2 * BLOCK_SIZE)
-    other = Version(cache, b"/f", 10 * BLOCK_SIZE)
+    other = make_blocks(cache, 10 * BLOCK_SIZE)
     for index in range(10):
         deliver(other, index * BLOCK_SIZE, content(BLOCK_SIZE))
-    waited.clear()
     deliver(waited, BLOCK_SIZE, content(BLOCK_SIZE))
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [content(BLOCK_SIZE) * 2]
     cache.check_invariants()
-    waited.clear()
+    waited.drop()
     assert waited.block(0) is None
 
 
@@ -117,7 +122,7 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> Non
 
 @pytest.mark.holds("promise 4")
 async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
+    blocks = make_blocks(make_cache(), 1000)
     mine = await start_read(nursery, blocks, 0, 100)
     for step in range(60):
         await trio.sleep(1)
@@ -128,7 +133,7 @@ async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -
 
 
 async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 100)
+    blocks = make_blocks(make_cache(), 100)
     readings = [await start_read(nursery, blocks, 0, 50), await start_read(nursery, blocks, 0, 100)]
     deliver(blocks, 0, content(50))
     blocks.on_failed(VehicleLost("gone"))
@@ -144,7 +149,7 @@ async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nu
 
 async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    blocks = Version(cache, b"/f", 100)
+    blocks = make_blocks(cache, 100)
     reading = await start_read(nursery, blocks, 0, 100)
     reading.scope.cancel()
     await trio.testing.wait_all_tasks_blocked()
@@ -160,7 +165,7 @@ async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> 
 
 async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: trio.Nursery) -> None:
     cache = make_cache(8 * BLOCK_SIZE)
-    blocks = Version(cache, b"/f", 20 * BLOCK_SIZE)
+    blocks = make_blocks(cache, 20 * BLOCK_SIZE)
     readings = [await start_read(nursery, blocks, i * BLOCK_SIZE, (i + 1) * BLOCK_SIZE) for i in range(4)]
     assert [len(reading.wanted) for reading in readings] == [1, 1, 0, 0]
     deliver(blocks, 0, content(BLOCK_SIZE))
@@ -175,7 +180,7 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
 
 
 async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 100)
+    blocks = make_blocks(make_cache(), 100)
     reading = await start_read(nursery, blocks, 0, 100)
     blocks.on_suspect("test")
     await trio.testing.wait_all_tasks_blocked()

@@ -1,0 +1,189 @@
+"""The one content of a file: which of its bytes are here, and where. Layer: cache.
+
+Each byte below `size` is one of three:
+- *held*: a program wrote it, or it was fetched beside written bytes; the local spool file has it;
+- *base*: below `base_limit` and not held: it is the vehicle's, and in memory (`blocks`) if it was read;
+- *zero*: a gap before a write beyond the old end, or an extension.
+
+A file that nobody changed holds nothing: all of it is base. A file that is sent to the vehicle is *whole*:
+no byte of it is base. After the delivery the spool file serves reads until the last program closes the file.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from mavftpfs.cache.blocks import Blocks
+from mavftpfs.cache.spool import Spool, SpoolContent
+from mavftpfs.protocol.payload import crc32
+from mavftpfs.shared.extents import ExtentSet
+
+STEP = 64 * 1024
+"""Bytes read from the spool at once for a checksum."""
+
+
+class Where(Enum):
+    """Where a byte of the content is."""
+
+    HELD = "held"
+    BASE = "base"
+    ZERO = "zero"
+
+
+class Content:
+    """The bytes of one file.
+
+    Attributes:
+        blocks: what was read of the vehicle's file.
+        size: bytes, as programs see it.
+        base_limit: below this, bytes that are not held are the vehicle's. 0: none is, so the file is replaced
+            whatever the vehicle has under its name by then.
+        spooled: the local file; None while nobody changed the file.
+    """
+
+    def __init__(self, blocks: Blocks) -> None:
+        self.blocks = blocks
+        self.size = 0
+        self.base_limit = 0
+        self.spooled: SpoolContent | None = None
+        self._held = ExtentSet()
+
+    # --- what it is
+
+    @property
+    def held(self) -> ExtentSet:
+        """What the spool has (a copy)."""
+        return ExtentSet(self._held)
+
+    @property
+    def whole(self) -> bool:
+        """Whether no byte of it is the vehicle's."""
+        return self._held.covers(0, min(self.base_limit, self.size))
+
+    def missing_base(self) -> list[tuple[int, int]]:
+        """Return the ranges of which only the vehicle has the bytes."""
+        return self._held.missing(0, min(self.base_limit, self.size))
+
+    def segments(self, start: int, stop: int) -> list[tuple[Where, int, int]]:
+        """Return where each part of [start, stop) is, cut at the file's size, ascending."""
+        found = []
+        at, end = start, min(stop, self.size)
+        for a, b in [*self._held.intersection(start, end), (end, end)]:
+            if at < min(a, self.base_limit):
+                found.append((Where.BASE, at, min(a, self.base_limit)))
+                at = min(a, self.base_limit)
+            if at < a:
+                found.append((Where.ZERO, at, a))
+            if a < b:
+                found.append((Where.HELD, a, b))
+            at = max(at, b)
+        return found
+
+    def get(self, start: int, stop: int) -> bytes:
+        """Return [start, stop), no byte of which may be the base's.
+
+        Raises:
+            SpoolFailed.
+        """
+        parts = []
+        for where, a, b in self.segments(start, stop):
+            assert where is not Where.BASE
+            if where is Where.HELD:
+                assert self.spooled is not None
+                parts.append(self.spooled.get(a, b))
+            else:
+                parts.append(bytes(b - a))
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def crc32(self) -> int:
+        """Return the CRC32 of whole content, as the vehicle computes it (servers.md 10).
+
+        Raises:
+            SpoolFailed.
+        """
+        value = 0
+        for at in range(0, self.size, STEP):
+            value = crc32(self.get(at, min(at + STEP, self.size)), value)
+        return value
+
+    # --- what the vehicle has
+
+    def on_opened(self, size: int) -> None:
+        """Note how large the vehicle's file is; bytes of a file with another size are forgotten."""
+        if size != self.blocks.size:
+            self.blocks.drop()
+            self.blocks.size = size
+        if self.spooled is None:
+            self.size = self.base_limit = size
+
+    # --- what programs do
+
+    def spool(self, spool: Spool, name: bytes) -> SpoolContent:
+        """Keep changes in a local file from now on; nothing is written yet."""
+        if self.spooled is None:
+            self.spooled = SpoolContent(spool, name)
+        return self.spooled
+
+    def write(self, offset: int, data: bytes | memoryview) -> None:
+        """Replace bytes; a gap behind the present end becomes zeros.
+
+        Raises:
+            NoSpace, SpoolFailed: nothing changed.
+        """
+        assert self.spooled is not None
+        stop = offset + len(data)
+        self.spooled.put(offset, data)
+        self._held.add(offset, stop)
+        self.size = max(self.size, stop)
+
+    def truncate(self, size: int) -> None:
+        """Cut, or extend with zeros.
+
+        Raises:
+            NoSpace, SpoolFailed: nothing changed.
+        """
+        assert self.spooled is not None
+        if size < self.size:
+            self.spooled.cut(size)
+            self._held.discard(size, max(size, self._held.end))
+            self.base_limit = min(self.base_limit, size)
+        self.size = size
+
+    def fill(self, offset: int, data: bytes | memoryview) -> None:
+        """Hold bytes of the base, where nothing newer is held.
+
+        Raises:
+            NoSpace, SpoolFailed.
+        """
+        assert self.spooled is not None
+        stop = min(offset + len(data), self.base_limit, self.size)
+        for start, end in self._held.missing(offset, stop):
+            self.spooled.put(start, memoryview(data)[start - offset : end - offset])
+            self._held.add(start, end)
+
+    # --- its end
+
+    def on_delivered(self) -> None:
+        """Note that the vehicle has these bytes: the next change lies over them."""
+        assert self.spooled is not None
+        self.base_limit = self.size
+        self.spooled.mark_unneeded()
+
+    def on_unneeded(self) -> None:
+        """Note that no vehicle is to get these bytes: the file has no name any more."""
+        if self.spooled is not None:
+            self.spooled.name = None
+            self.spooled.mark_unneeded()
+
+    def forget(self) -> None:
+        """Forget every byte."""
+        self.blocks.drop()
+        if self.spooled is not None:
+            self.spooled.close()
+        self.spooled, self._held = None, ExtentSet()
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the books are wrong (for tests)."""
+        assert self._held.end <= self.size
+        assert self.base_limit <= self.size
+        assert self.spooled is not None or self._held.empty

@@ -1,0 +1,271 @@
+"""A file of this mount is an object: handles keep it when it is renamed, or removed. Layer: cache.
+
+A file has one content, a state, and a base: what the vehicle is known to have under its name. All
+handles of a file share them. TRANSITIONS is the table of the states.
+
+    CLEAN    the vehicle has the content
+    DIRTY    the vehicle lacks some of it
+    STALE    others replaced the vehicle's file. If this mount had changed the file, it keeps its name here,
+             until it is emptied or removed; otherwise it lost the name
+    BROKEN   a program was told that a write failed, so nothing of the file is ever placed; it lost its name
+
+Two facts beside the state say how an interruption is to be cleared up: `unsure` is what this mount was
+placing under the name when it was interrupted, and a proof is a time: `proven_at` is void if it is older than
+the file's last opening on the vehicle, or than the mount's epoch (`card`).
+
+Locks: see `pathlocks`. A file's lock is taken before the path lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from enum import Enum
+
+import trio
+
+from mavftpfs.cache.blocks import NEVER, BlockCache, Blocks
+from mavftpfs.cache.content import Content
+from mavftpfs.cache.entries import Entry, Folder
+from mavftpfs.cache.remote import Upload
+from mavftpfs.cache.unsure import Unsure
+from mavftpfs.shared.errors import FileBusy, FileChanged, LocalProtocolError, MavftpfsError, WriteFailed
+from mavftpfs.shared.sameness import Known
+from mavftpfs.shared.sending import SendBuffer
+
+
+class State(Enum):
+    """What the vehicle has of a file; see the module."""
+
+    CLEAN = "clean"
+    DIRTY = "dirty"
+    STALE = "stale"
+    BROKEN = "broken"
+
+
+class Event(Enum):
+    """What happens to a file.
+
+    CHANGED: a program made it, wrote or truncated it. EMPTIED: a program truncated it to nothing, so the base
+    matters no more. PLACED: the vehicle has all of it under its name, verified. REPLACED: others replaced the
+    vehicle's file, and bytes of that matter. FAILED: a write was answered with an error after others had been
+    taken.
+    """
+
+    CHANGED = "changed"
+    EMPTIED = "emptied"
+    PLACED = "placed"
+    REPLACED = "replaced"
+    FAILED = "failed"
+
+
+TRANSITIONS: dict[State, dict[Event, State]] = {
+    State.CLEAN: {
+        Event.CHANGED: State.DIRTY,
+        Event.EMPTIED: State.DIRTY,
+        Event.REPLACED: State.STALE,
+    },
+    State.DIRTY: {
+        Event.CHANGED: State.DIRTY,
+        Event.EMPTIED: State.DIRTY,
+        Event.PLACED: State.CLEAN,
+        Event.REPLACED: State.STALE,
+        Event.FAILED: State.BROKEN,
+    },
+    State.STALE: {
+        Event.EMPTIED: State.DIRTY,
+        Event.REPLACED: State.STALE,
+    },
+    State.BROKEN: {},
+}
+"""State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One try to send a file.
+
+    path: where its bytes go: a temporary file, or the file's own name if it is sent `in_place`. begun_at:
+    when it began, by the caches' clock.
+    """
+
+    path: bytes
+    in_place: bool
+    sending: SendBuffer
+    upload: Upload
+    begun_at: float
+
+    def fits(self, *, in_place: bool) -> bool:
+        """Return whether the bytes that it sent are still right, and the place that they go to."""
+        return not self.sending.overtaken and in_place == self.in_place
+
+
+class File(Entry):
+    """One file.
+
+    Attributes:
+        content: its bytes. state: see State.
+        base: what the vehicle is known to have under its name; None if it has nothing there.
+        proven_at: when the vehicle was last seen to have that, by the caches' clock.
+        attempt: the try to send it that is under way.
+        unsure: what this mount was placing under the name when it was interrupted.
+        changes: counts the changes of the content.
+        error: why the last delivery failed, or the write that broke the file.
+        handles: how many are open; writers: how many of them may write. changers: the open handles that
+            changed the file since the vehicle last had all of it.
+        verified: see OpenFile.verified.
+        delivered_since_open: it was delivered since its first writer opened it.
+        start_after: no upload begins by itself before that time (infinite: only a close sends the file).
+        in_kernel: the kernel may have pages of it, and all of them are right.
+        lock: a program changes the file, it is being delivered, or a call takes its name or content away.
+        delivery: the scope of the delivery that is under way. claims: how many calls wait
+            for the lock to take the name or the content away; they go before deliveries.
+    """
+
+    def __init__(
+        self, folder: Folder, name: bytes, cache: BlockCache, on_suspect: Callable[[File], None]
+    ) -> None:
+        """`on_suspect` is called when its bytes were dropped because they are suspect."""
+        super().__init__(folder, name)
+        self.content = Content(Blocks(cache, lambda: on_suspect(self)))
+        self.state = State.CLEAN
+        self.base: Known | None = None
+        self.proven_at = NEVER
+        self.attempt: Attempt | None = None
+        self.error: MavftpfsError | None = None
+        self.handles = self.writers = 0
+        self.changers: set[object] = set()
+        self.unsure: Unsure | None = None
+        self.changes = 0
+        self.verified = ""
+        self.delivered_since_open = False
+        self.start_after = NEVER
+        self.in_kernel = False
+        self.lock = trio.Lock()
+        self.delivery: trio.CancelScope | None = None
+        self.claims = 0
+
+    # --- what it is
+
+    @property
+    def blocks(self) -> Blocks:
+        """What was read of the vehicle's file."""
+        return self.content.blocks
+
+    @property
+    def is_local(self) -> bool:
+        """Whether programs are answered from here, whatever a listing says."""
+        return self.content.spooled is not None
+
+    @property
+    def undelivered(self) -> bool:
+        """Whether the vehicle lacks something of it that it should have."""
+        return self.state in (State.DIRTY, State.STALE) and self.has_name
+
+    @property
+    def broken(self) -> bool:
+        """Whether a write of it failed."""
+        return self.state is State.BROKEN
+
+    @property
+    def is_new_and_empty(self) -> bool:
+        """Whether the vehicle has no file of it yet, and nothing was written to it."""
+        return self.is_local and self.base is None and not self.content.size
+
+    @property
+    def base_matters(self) -> bool:
+        """Whether bytes of the vehicle's file are to stay, so that no other file may be replaced by it."""
+        return self.content.base_limit > 0
+
+    @property
+    def lies_in_place(self) -> bool:
+        """Whether the card may have bytes of it under its own name, or an old file that this mount may have
+        emptied (cards that cannot rename)."""
+        if self.unsure is not None and self.unsure.in_place:
+            return True
+        if self.attempt is None or not self.attempt.in_place:
+            return False
+        # A new file is ours once bytes went out: CreateFile was ACKed. An old one may be emptied before that.
+        sending = self.attempt.sending
+        return sending.handed_out > 0 if self.base is None else sending.begun
+
+    @property
+    def unacked(self) -> int:
+        """Bytes that are to be sent, and not ACKed yet. A file is sent as a whole."""
+        if self.attempt is not None and not self.attempt.sending.overtaken:
+            return self.attempt.sending.unacked
+        return self.content.size if self.state is State.DIRTY else 0
+
+    @property
+    def size(self) -> int:
+        """Bytes, as programs see it."""
+        return self.content.size
+
+    def crc32(self) -> int:
+        """Return the CRC32 of whole content. Raises SpoolFailed."""
+        return self.content.crc32()
+
+    def changed_since(self, unsure: Unsure) -> bool:
+        """Return whether a program changed the file since that was sent."""
+        return self.changes != unsure.changes
+
+    def require_alive(self) -> None:
+        """Raise FileChanged if others replaced the file: nothing of it is read any more."""
+        if self.state is State.STALE and not self.has_name:
+            raise FileChanged(f"{self.path!r} was replaced on the vehicle")
+
+    def require_base(self) -> None:
+        """Raise FileChanged unless the vehicle's file of this name is the file's own."""
+        if self.state is State.STALE:
+            raise FileChanged(f"{self.path!r} is another file by now")
+        if not self.has_name:
+            raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
+
+    def require_not_broken(self) -> None:
+        """Raise WriteFailed if a write of it failed."""
+        if self.broken:
+            raise WriteFailed(
+                f"nothing written to {self.path!r} reaches the card, because a write failed: {self.error}"
+            )
+
+    # --- what happens to it
+
+    def on(self, event: Event) -> None:
+        """Go to the next state.
+
+        Raises:
+            LocalProtocolError: that cannot happen now.
+        """
+        after = TRANSITIONS[self.state].get(event)
+        if after is None:
+            raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
+        self.state = after
+
+    def prove(self, at: float) -> None:
+        """Note that the vehicle's file of this name was seen to be the base at that time."""
+        self.proven_at = max(self.proven_at, at)
+
+    @asynccontextmanager
+    async def claim(self, patience: float) -> AsyncIterator[None]:
+        """Hold the lock while the body removes, renames or empties the file. A delivery that is under way is
+        cancelled first, and its caller begins it again later. Exception: a file that is being placed is
+        waited for.
+
+        Raises:
+            FileBusy: the file was not placed within `patience` seconds.
+        """
+        self.claims += 1
+        try:
+            if self.delivery is not None:
+                self.delivery.cancel()
+            with trio.move_on_after(patience) as scope:
+                await self.lock.acquire()
+            if scope.cancelled_caught:
+                raise FileBusy(f"{self.path!r} is just getting its name on the vehicle")
+        finally:
+            self.claims -= 1
+        try:
+            yield
+        finally:
+            self.lock.release()

@@ -1,0 +1,205 @@
+"""Sending files: the attempts that are under way, and what they leave on the card. Layer: cache.
+
+A file is sent as a whole to a temporary file beside it; on a card that cannot rename, under its own name.
+`push` begins that while a program still writes, and bytes that are appended meanwhile join it. `attempt`
+gives the delivery what is under way, or begins anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+
+import trio
+
+from mavftpfs.cache import verify
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.file import Attempt, File, State
+from mavftpfs.cache.reserved import Kind
+from mavftpfs.cache.unsure import Unsure
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    Armed,
+    FileChanged,
+    FtpNak,
+    LinkError,
+    MavftpfsError,
+    NotSupported,
+    NotVerified,
+    RequestTimeout,
+    SessionBusy,
+    SessionLost,
+)
+from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.sameness import Known
+from mavftpfs.shared.sending import SendBuffer
+
+log = logging.getLogger("mavftpfs.cache")
+
+START_AT = 64 * 1024
+"""A background upload begins when so many bytes wait; fewer wait for the close. Before the first file of such
+a size is sent, it is found out whether the card can rename. A smaller one is sent twice if it cannot, once in
+a mount: finding out costs four requests on every card."""
+
+START_PAUSE = 5.0
+"""Seconds after which an upload that could not begin is tried again."""
+
+PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, NotVerified, Armed)
+"""Errors after which the upload goes on where it stopped."""
+
+
+def may_pass(file: File) -> bool:
+    """Return whether trying a delivery again may help: none failed yet, or its error may pass."""
+    return file.error is None or isinstance(file.error, PASSING)
+
+
+def require_deliverable(card: Card, file: File) -> None:
+    """Check that a file may replace what the vehicle has under its name.
+
+    Raises:
+        FileChanged: the vehicle has another file there now. NotSupported: that cannot be replaced safely.
+    """
+    if file.state is State.STALE:
+        raise FileChanged("others replaced the file on the vehicle while it was changed here")
+    in_place = card.store.traits.rename_works is False
+    if in_place and file.base is not None and not (card.options.inplace or file.lies_in_place):
+        raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
+
+
+async def push(card: Card, file: File) -> None:
+    """Begin to send a file that changed, or go on, while the program writes. The caller has the file's
+    lock."""
+    attempt = file.attempt
+    if not file.undelivered:
+        return
+    card.touch(file)
+    if attempt is not None:
+        if not attempt.sending.overtaken:
+            attempt.sending.growing = True
+            attempt.upload.wake()
+            return
+        file.start_after = float("inf")  # a program that changed sent bytes will do so again
+    due = card.clock() >= file.start_after and not card.blocked and not file.claims
+    if not due or file.base_matters or file.unacked < START_AT or not may_pass(file) or file.unsure:
+        return  # of a file that only changes every byte is sent again: that waits for the close
+    try:
+        with trio.CancelScope() as file.delivery:
+            async with card.paths.steady(file, lasting=True):
+                attempt = await need_attempt(card, file)
+                attempt.sending.growing = True
+                attempt.upload.wake()
+    except MavftpfsError as error:
+        file.start_after = card.clock() + START_PAUSE
+        level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line for all files
+        log.log(level, "%r is not sent just now: %s", file.path, error)
+    finally:
+        file.delivery = None
+        card.throttle.waiting.unpark_all()
+
+
+async def need_attempt(card: Card, file: File) -> Attempt:
+    """Return the attempt that is under way if it still fits, else a new one.
+
+    Raises:
+        As require_deliverable and require_untouched; else as VehicleStore.open_upload.
+    """
+    attempt, traits = file.attempt, card.store.traits
+    require_deliverable(card, file)
+    if attempt is not None and attempt.fits(in_place=traits.rename_works is False):
+        return attempt
+    if attempt is not None:
+        await abandon(card, file)
+    # With `inplace` the card may have no room for both files, so it is found out before any file.
+    overwrites = card.options.inplace and file.base is not None
+    if traits.rename_works is None and (file.size >= START_AT or overwrites):
+        await card.names.learn_rename_works(file.path)
+        require_deliverable(card, file)
+    return await _begin(card, file, in_place=traits.rename_works is False)
+
+
+async def _begin(card: Card, file: File, *, in_place: bool) -> Attempt:
+    """Begin to send a whole file. in_place: under its own name, because the card cannot rename."""
+    begun_at = card.clock()
+    if in_place:
+        await require_untouched(card, file)
+        path = file.path
+        await card.store.wait_out(path)
+    else:
+        path = card.own.need(file.path, Kind.NEW)
+    sending = SendBuffer(file.content.get, file.size, partial(card.throttle.on_acked, file))
+    try:
+        upload = card.store.open_upload(path, sending)
+    except MavftpfsError:
+        card.own.on_gone(path)
+        raise
+    attempt = file.attempt = Attempt(path, in_place, sending, upload, begun_at)
+    if in_place:
+        card.directories.put(path, DirEntry(b"", EntryKind.FILE))
+    return attempt
+
+
+async def abandon(card: Card, file: File) -> None:
+    """Cancel the attempt that is under way. Its temporary file is removed now, else by the repair. The caller
+    has the file's lock, or holds its path alone."""
+    attempt = file.attempt
+    if attempt is None:
+        return
+    forget_attempt(file, attempt)
+    try:
+        await attempt.upload.end()
+        if not attempt.in_place and attempt.upload.may_exist:
+            await card.names.discard(attempt.path)
+    finally:
+        card.own.release(attempt.path)
+
+
+def forget_attempt(file: File, attempt: Attempt) -> None:
+    """Note that an attempt ended without success. What it left under the file's own name is the file's."""
+    if file.lies_in_place:
+        file.unsure = Unsure(attempt.path, None, Known(attempt.sending.size), file.changes, in_place=True)
+    file.attempt = None
+
+
+async def require_untouched(card: Card, file: File) -> None:
+    """Check that others left the name alone: that of a new file is free, and a base of which a part stays is
+    still the same.
+
+    Raises:
+        AlreadyExists. FileChanged: others changed the base. Else as Names.is_free and is_same.
+    """
+    path = file.path
+    if file.lies_in_place:
+        return
+    if file.base is not None and file.base_matters:
+        if not await verify.is_same(card, path, file.base):
+            raise FileChanged(f"others changed {path!r} on the vehicle while it was changed here")
+    elif file.base is None and not await _is_free(card, path):
+        raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
+
+
+async def _is_free(card: Card, path: bytes) -> bool:
+    return await card.names.is_free(path) or await is_empty_in_place(card, path)
+
+
+async def is_empty_in_place(card: Card, path: bytes) -> bool:
+    """Return whether files are sent under their own names, and an empty one is there: a CreateFile of this
+    mount that was not answered may have made it, and otherwise there is nothing to lose."""
+    return card.store.traits.rename_works is False and await card.names.size(path) == 0
+
+
+async def remove_parts(card: Card, path: bytes | None = None) -> None:
+    """Remove from the card what broken files left there. path: only of this one.
+
+    If the vehicle refuses, the part stays on the card, and the log names it.
+
+    Raises:
+        As VehicleStore, but no FtpNak: what is left is tried again later.
+    """
+    for part in [part for part in card.parts if path in (None, part)]:
+        try:
+            await card.names.remove_if_there(part)
+        except FtpNak as nak:
+            log.info("%r stays on the card: %s", part, nak)
+        if part in card.parts:  # else another call was faster
+            card.parts.remove(part)
+        card.own.release(part)

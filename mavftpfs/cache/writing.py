@@ -1,0 +1,299 @@
+"""What programs do to the content of files: opening for writing, changing, breaking. Layer: cache.
+
+A change is put into the local spool at once. **What is dirty becomes whole**: if a program changes a part of
+a file, the rest is fetched from the vehicle once the program pauses, or when it closes the file. So what is
+sent, or kept when it cannot be sent, is always a file; and a program that overwrites every byte makes nothing
+be fetched.
+
+**A write that was answered with an error breaks its file**: the program knows that its copy failed, so
+nothing of it may become the vehicle's file later. The file loses its name, and the name shows the vehicle's
+file again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+
+import trio
+
+from mavftpfs.cache import reading, uploads
+from mavftpfs.cache.card import Card
+from mavftpfs.cache.file import Event, File, State
+from mavftpfs.cache.reserved import require_writable
+from mavftpfs.protocol.payload import crc32
+from mavftpfs.shared.errors import (
+    FileBusy,
+    FileChanged,
+    IsADirectory,
+    MavftpfsError,
+    NoSpace,
+    NotFound,
+    SpoolFailed,
+)
+from mavftpfs.shared.model import EntryKind, require_listable
+from mavftpfs.shared.readable import readable
+from mavftpfs.shared.sameness import Known
+
+log = logging.getLogger("mavftpfs.cache")
+
+STEP = 128 * 1024
+"""Bytes fetched at once."""
+
+QUIET = 1.0
+"""Seconds for which a program makes no change before the rest of its file is fetched."""
+
+
+# --- opening
+
+
+async def for_writing(card: Card, path: bytes, *, truncate: bool) -> File:
+    """Return the file of a path that exists. truncate: the caller is about to empty it.
+
+    Raises:
+        NotFound, IsADirectory, NotSupported, PathTooLong, FileBusy; else as reading.opened.
+    """
+    file = card.find(path)
+    if file is not None and file.is_local:
+        return file
+    require_writable(path)
+    entry = await card.entry(path)
+    if entry is None:
+        raise NotFound(f"{path!r} does not exist")
+    if entry.kind is not EntryKind.FILE:
+        raise IsADirectory(f"{path!r} is a directory")
+    if not truncate:
+        file, _ = await reading.opened(card, path)  # the reply tells the size better than a listing
+        try:
+            card.require_idle(path)
+        except FileBusy:
+            card.maybe_forget(file)
+            raise
+        return file
+    # If the size is 0 there is nothing to do: so it has to be true, not remembered.
+    size = entry.size or await card.store.stat_size(path)
+    card.require_idle(path)
+    file = card.need(path)
+    if not file.is_local:
+        file.base = Known(size)
+        file.content.on_opened(size)
+        file.prove(card.clock())
+    return file
+
+
+async def made(card: Card, path: bytes) -> File | None:
+    """Make a file, as far as programs see; return None if there is one.
+
+    Raises:
+        NotFound, NotADirectory: its directory. AlreadyExists: another spelling of a file that is there. Else
+        as RemoteStore.list_directory.
+    """
+    require_writable(path)
+    require_listable(path)
+    file = card.find(path)
+    if (file is not None and file.is_local) or await card.entry(path) is not None:
+        return None
+    await card.names.require_new(path)
+    file = card.find(path)
+    if file is not None and file.is_local:
+        return None
+    if file is not None:  # a program has it open, though others removed it
+        reading.on_replaced(card, file)
+    file = card.need(path)
+    file.base = None
+    file.content.on_opened(0)
+    file.content.spool(card.spool, path)
+    file.on(Event.CHANGED)
+    card.keep(file)
+    card.touch(file)
+    return file
+
+
+# --- changing (the caller has the file's lock)
+
+
+def require_not_stale(file: File) -> None:
+    """Raise FileChanged if others replaced the vehicle's file below pending changes."""
+    if file.state is State.STALE:
+        raise FileChanged(f"{file.path!r} is another file by now")
+
+
+def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None:
+    """Put bytes into a file.
+
+    Raises:
+        NoSpace, SpoolFailed: nothing changed.
+    """
+    if len(data):
+        file.content.spool(card.spool, file.path)
+        file.content.write(offset, data)
+        _on_changed(card, file, offset, Event.CHANGED)
+
+
+def truncate(card: Card, file: File, size: int) -> None:
+    """Cut a file, or extend it with zeros.
+
+    Raises:
+        NoSpace, SpoolFailed: nothing changed.
+    """
+    before = file.size
+    file.content.spool(card.spool, file.path)
+    file.content.truncate(size)
+    _on_changed(card, file, min(before, size), Event.CHANGED if size else Event.EMPTIED)
+    if file.has_name and not size:
+        card.forget_broken(file.path)
+
+
+def _on_changed(card: Card, file: File, start: int, event: Event) -> None:
+    file.on(event)
+    file.changes += 1
+    file.in_kernel = False
+    card.keep(file)
+    if file.attempt is not None:
+        file.attempt.sending.on_changed(start, file.size)
+    if not file.content.whole and file not in card.fetchers:
+        card.fetchers.add(file)
+        card.nursery.start_soon(_fetch_when_quiet, card, file)
+
+
+# --- fetching what is missing
+
+
+async def _fetch_when_quiet(card: Card, file: File) -> None:
+    """Fetch the rest of a file once its program pauses. A failure is told by the close, which tries again."""
+    try:
+        seen = None
+        while seen != file.changes:
+            seen = file.changes
+            await trio.sleep(QUIET)
+        with suppress(MavftpfsError):
+            await make_whole(card, file)
+    finally:
+        card.fetchers.discard(file)
+
+
+async def make_whole(card: Card, file: File) -> None:
+    """Fetch the bytes of a file that only the vehicle has.
+
+    Raises:
+        NoSpace; else as reading.read.
+    """
+    if not file.content.whole:
+        await card.fetching.run(file, partial(_fetch, card, file))
+
+
+async def _fetch(card: Card, file: File) -> None:
+    """Fetch what is missing. Where listings tell no times, the whole old file is read to know its checksum.
+    The delivery compares that before it replaces the old file."""
+    content, base = file.content, file.base
+    if base is None:
+        return  # others removed it meanwhile, so nothing of it is missing
+    whole_base = content.base_limit == base.size <= card.options.verify_max
+    if whole_base and not card.directories.tells_times:
+        value = 0
+        for at in range(0, base.size, STEP):
+            value = crc32(await _fetch_step(card, file, at, min(at + STEP, base.size)), value)
+        if file.base == base:
+            file.base = replace(base, crc32=value)
+    while missing := content.missing_base():
+        start, stop = missing[0]
+        await _fetch_step(card, file, start, min(start + STEP, stop))
+
+
+async def _fetch_step(card: Card, file: File, start: int, stop: int) -> bytes | memoryview:
+    data = await reading.read(card, file, start, stop, base=True)
+    if len(data) != stop - start or not file.is_local:
+        raise FileChanged(f"{file.path!r} became shorter on the vehicle")
+    file.content.fill(start, data)
+    return data
+
+
+# --- breaking
+
+
+async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
+    """Break a file, because a program was told that a write failed after others had been taken.
+
+    Nothing of the file is placed, and the vehicle's file, if there is one, has the name again. The part that
+    was written is kept for the recovery directory. The caller has the file's lock, and the file is DIRTY.
+    """
+    path, attempt = file.path, file.attempt
+    file.on(Event.FAILED)
+    file.error = error
+    if attempt is not None:
+        uploads.forget_attempt(file, attempt)
+        if not attempt.in_place and attempt.upload.may_exist:
+            card.parts.append(attempt.path)
+    if file.base is None and file.lies_in_place:
+        card.parts.append(path)
+    if not file.lies_in_place:
+        card.names.settle(file)
+    card.live.pop(file, None)
+    file.lose_name()
+    card.forget_broken(path)
+    card.broken.append(file)
+    file.blocks.end(FileChanged(f"a write to {path!r} failed"))
+    card.forget_time(path)
+    card.tell_changed(path)
+    card.retry_later()
+    card.throttle.waiting.unpark_all()
+    log.warning(
+        "a write to %r failed (%s): the vehicle does not get this version; copy the file again (umount "
+        "moves the part that was written to a recovery directory; `mavftpfs recover` lists it)",
+        path,
+        error,
+    )
+    persist(card, file)
+    if file.content.spooled is not None:
+        file.content.spooled.leave_budget()
+    _forget_oldest_parts(card)
+    if attempt is not None:
+        await attempt.upload.end()
+
+
+def _forget_oldest_parts(card: Card) -> None:
+    """Forget the oldest broken files if they hold more than the spool may, beside the spool."""
+    held = sum(file.content.held.total for file in card.broken)
+    for file in card.broken[:-1]:
+        if held > card.spool.spool_max:
+            held -= file.content.held.total
+            log.warning("the part of %r is removed here: later failed writes need its room", file.path)
+            card.forget_broken(file.path)
+
+
+def persist(card: Card, file: File) -> None:
+    """Hold the bytes of a file, and what is known of it, where they outlive this process."""
+    try:
+        if file.content.spooled is not None:
+            file.content.spooled.persist(describe(file, card.wall))
+    except (NoSpace, SpoolFailed, OSError) as trouble:
+        log.warning("%r may be lost when this mount ends: %s", file.path, trouble)
+
+
+def describe(file: File, wall: Callable[[], float]) -> dict[str, object]:
+    """Return the description of a spooled file, for people and JSON; `held`: the extents whose bytes are
+    here; `broken`: it is what was written before a write failed."""
+    return {
+        "path": file.path.decode(errors="surrogateescape"),
+        "size": file.size,
+        "whole": file.content.whole,
+        "broken": file.broken,
+        "held": list(file.content.held),
+        "size_on_vehicle": None if file.base is None else file.base.size,
+        "error": None if file.error is None else readable(str(file.error)),
+        "at": wall(),
+    }
+
+
+def undo(card: Card, file: File) -> None:
+    """Forget what a failed call changed: programs see the vehicle's file again. The caller has the lock."""
+    size = 0 if file.base is None else file.base.size
+    file.content.forget()
+    file.content.on_opened(size)
+    file.state, file.error = State.CLEAN, None
+    file.changers.clear()
+    file.blocks.close_reader()
+    card.tell_changed(file.path)
