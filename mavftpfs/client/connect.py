@@ -26,7 +26,7 @@ from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.undelivered import rescue, spool_for
 from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link
-from mavftpfs.link.hublink import Wish
+from mavftpfs.link.hublink import PortRequest
 from mavftpfs.link.messages import OWN_COMPONENT, Address, AutopilotVersion
 from mavftpfs.link.peers import names_of, vehicles_in
 from mavftpfs.link.samelink import leads_back
@@ -140,7 +140,7 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
         LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
     """
     own = Address(options.source_system, OWN_COMPONENT)
-    wish = Wish(own, options.forward, process_name(), beats)
+    wanted = PortRequest(own, options.forward, process_name(), beats)
     for place in options.forward:
         if leads_back(parse_source(place), spec):
             raise UsageError(
@@ -148,7 +148,7 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
             )
     async with AsyncExitStack() as stack:
         try:
-            link = await stack.enter_async_context(open_shared(spec, wish))
+            link = await stack.enter_async_context(open_shared(spec, wanted))
         except LinkClosed as exc:
             cause = exc.__cause__
             status = None

@@ -63,7 +63,7 @@ GONE: Mapping[str, Gone] = {
 log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 1.0."""
 
 
-_NO_BAUD = "option baud is gone, and means nothing here: SOURCE is no serial port"
+_NO_BAUD = "option baud is gone, and means nothing here: SOURCE is not a serial port"
 
 
 def take_gone(values: dict[str, Any], name: str, text: str) -> bool:

@@ -1,8 +1,8 @@
-"""Which network address each MAVLink sender is known by. Layer: link; pure.
+"""The network address by which each MAVLink sender is known. Layer: link; pure.
 
 Any program can send to a UDP port and claim to be the vehicle. So a sender is known by the address at which
-it was first heard, and counts only from there. Another address may take its place after 5 s of silence: the
-vehicle's router restarted, or it comes over its other link.
+it was first heard, and its frames count only from there. Another address may replace it after 5 s of silence:
+the vehicle's router restarted, or the vehicle uses its other link.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from mavftpfs.link.messages import Address
 
 PATIENCE = 5.0
-"""Seconds of silence after which a sender may come from another address."""
+"""Seconds of silence after which another address may replace a sender's."""
 
 _MOST_SENDERS = 256
 
@@ -31,7 +31,7 @@ class AddressBook:
     """The senders of one link.
 
     Attributes:
-        distrusted: where another vehicle answered for a sender. Any other address may take its place at once.
+        distrusted: addresses where another vehicle answered for a sender. Any other may replace them at once.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class AddressBook:
         return sender in self._senders
 
     def accepts(self, sender: Address, address: NetAddress, now: float) -> bool:
-        """Return whether a frame of a sender counts that came from an address, and note that it was heard."""
+        """Return whether a sender's frame from an address counts, and note that the sender was heard."""
         known = self._senders.get(sender)
         if known is None:
             if len(self._senders) >= _MOST_SENDERS:

@@ -1,7 +1,7 @@
 """The interface of links, and the base of links over a descriptor. Layer: link.
 
-A link moves bytes and does not interpret them. When a peer goes away and comes back, the link reopens by
-itself and says so. LinkClosed means that it will never work again.
+A link moves bytes and does not interpret them. If a peer goes away and comes back, the link reopens by itself
+and `receive` says so. LinkClosed means that the link will never work again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Piece: TypeAlias = tuple[bytes, NetAddress | None]
 """Bytes that arrived together, and the address that sent them; None where there is only one sender."""
 
 REOPENED: Piece = (b"", None)
-"""The piece that says: the link was reopened, so the rest of a half-received frame does not come."""
+"""The piece that marks a reopened link: the rest of a half-received frame will not arrive."""
 
 
 @dataclass(slots=True)
@@ -80,7 +80,7 @@ class Link(Protocol):
         ...
 
     async def receive(self) -> list[Piece]:
-        """Wait for input and return 1..256 pieces, with all that is there.
+        """Wait for input and return 1..256 pieces: everything that has arrived.
 
         Raises:
             LinkClosed: the link will never work again.
@@ -90,15 +90,15 @@ class Link(Protocol):
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
         """Send whole MAVLink frames, several to a datagram or write where they fit in 1400 bytes.
 
-        to: an address that `receive` returned. None: the only peer; where there may be several, the one that
-        was heard last. Never blocks, and never raises for a full or absent peer: what cannot be kept within
-        a bounded backlog is dropped and counted, as a radio would.
+        to: an address that `receive` returned. None: the only peer, or where there may be several, the one
+        that was heard last. Never blocks, and never raises for a full or absent peer: the link drops and
+        counts what exceeds a bounded backlog, as a radio would.
         """
         ...
 
 
 async def look_up(host: str, port: int, kind: socket.SocketKind, flags: int = 0) -> list[Any]:
-    """Return what `getaddrinfo` says.
+    """Return the result of `getaddrinfo`.
 
     Raises:
         OSError: there is no such host; also for a text that cannot be a host name.
@@ -106,7 +106,7 @@ async def look_up(host: str, port: int, kind: socket.SocketKind, flags: int = 0)
     try:
         return await trio.socket.getaddrinfo(host, port, type=kind, flags=flags)
     except UnicodeError as exc:
-        raise socket.gaierror(socket.EAI_NONAME, f"{host!r} is no host name") from exc
+        raise socket.gaierror(socket.EAI_NONAME, f"{host!r} is not a host name") from exc
 
 
 def pack(frames: Sequence[bytes]) -> Iterable[bytes]:
@@ -134,17 +134,17 @@ class Pipe(Protocol):
         ...
 
     def close(self) -> None:
-        """Close it; harmless twice."""
+        """Close the pipe; harmless twice."""
         ...
 
 
 class PipeLink:
-    """A link over a descriptor: waits for it, and keeps what the kernel does not take.
+    """A link over a descriptor: waits for the descriptor, and keeps what the kernel refuses.
 
     Args:
-        pipe: None where it is opened later.
-        outbox_limit: bytes to keep for a slow peer. What does not fit is dropped whole, so that a stream is
-            never cut inside a frame.
+        pipe: None if it is opened later.
+        outbox_limit: bytes to keep for a slow peer. What does not fit is dropped whole, because a stream must
+            never be cut inside a frame.
 
     Attributes:
         backlog: see Link.
@@ -162,7 +162,7 @@ class PipeLink:
         self._closed = False
         self._limit = outbox_limit
         self._outbox: deque[Piece] = deque()
-        self._changed = trio.lowlevel.ParkingLot()  # what waits, or whether there is a pipe
+        self._changed = trio.lowlevel.ParkingLot()  # signals bytes that wait, or another pipe
 
     async def receive(self) -> list[Piece]:
         """See Link."""
@@ -171,7 +171,7 @@ class PipeLink:
         while not self._closed:
             pieces = self._take()
             if pieces:
-                if not waited:  # one checkpoint per batch, and none where data could be lost
+                if not waited:  # one checkpoint per batch, and none where a cancellation would lose data
                     await trio.lowlevel.cancel_shielded_checkpoint()
                 self.stats.received_bytes += sum(len(data) for data, _ in pieces)
                 return pieces
@@ -181,7 +181,7 @@ class PipeLink:
         raise LinkClosed(f"{self.description} is closed")
 
     async def run(self) -> None:
-        """Send what had to wait for the kernel; runs until cancelled."""
+        """Send what waits for the kernel; run until cancelled."""
         while True:
             if not self._outbox:
                 await self._changed.park()
@@ -201,13 +201,13 @@ class PipeLink:
             await self._changed.park()
 
     async def aclose(self) -> None:
-        """Close; what the kernel has not taken by now is lost."""
+        """Close the link, and drop what the kernel has not accepted."""
         self._closed = True
         self._drop_pipe()
         await trio.lowlevel.checkpoint()
 
     def _keep(self, data: bytes, to: NetAddress | None = None, *, force: bool = False) -> None:
-        """Keep what the kernel did not take; drop and count it where there is no room."""
+        """Keep what the kernel did not accept; drop and count it where there is no room."""
         if force or self.backlog + len(data) <= self._limit:
             self._outbox.append((data, to))
             self.backlog += len(data)
@@ -216,7 +216,8 @@ class PipeLink:
             self.stats.dropped_sends += 1
 
     def _drop_pipe(self) -> None:
-        """Close the pipe, and drop what waits for it: an old request is worse than a lost one."""
+        """Close the pipe, and drop what waits for it, because an old request does more harm than a lost
+        one."""
         pipe, self._pipe = self._pipe, None
         if pipe is not None:
             trio.lowlevel.notify_closing(pipe.fileno())
@@ -227,19 +228,19 @@ class PipeLink:
         self._changed.unpark_all()
 
     async def _until(self, ready: Callable[[int], Awaitable[None]]) -> None:
-        """Wait until the pipe is ready, or gone, or until there is one."""
+        """Wait until the pipe is ready or gone; without a pipe, until there is one."""
         if self._pipe is None:
             await self._changed.park()
         else:
-            with suppress(trio.ClosedResourceError, OSError):  # it was closed meanwhile; look again
+            with suppress(trio.ClosedResourceError, OSError):  # closed meanwhile; the caller looks again
                 await ready(self._pipe.fileno())
 
     def _take(self) -> list[Piece]:
-        """Return what is there. It may find that the pipe broke."""
+        """Return all pieces that have arrived. May drop a broken pipe."""
         raise NotImplementedError
 
     def _write(self, data: bytes, to: NetAddress | None) -> int:
-        """Hand an item to the kernel; return how many bytes it took. What is lost counts as taken."""
+        """Hand an item to the kernel; return the number of bytes it took. Lost bytes count as taken."""
         raise NotImplementedError
 
 
@@ -249,8 +250,8 @@ async def background(
 ) -> AsyncIterator[None]:
     """Run `task` beside the body; when the body ends, `close` (shielded) and cancel the task.
 
-    An Exception of the body comes out as itself, not inside an ExceptionGroup as a bare nursery would
-    have it: callers catch LinkClosed by name.
+    An Exception of the body leaves as itself, while a bare nursery would wrap it in an ExceptionGroup,
+    because callers catch LinkClosed by name.
     """
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:

@@ -1,10 +1,9 @@
 """FILE_TRANSFER_PROTOCOL frames, built and parsed by hand. Layer: link; pure, no pymavlink.
 
-pymavlink needs about 16 µs to build such a frame and 8 µs to parse one, which makes the codec the
-bottleneck of a transfer. These functions do the one case that carries all the data: message 110,
-MAVLink 2, unsigned. Whatever is not exactly that is left to `framing` and pymavlink, and a property
-test holds both byte-identical. The message's extra CRC byte is passed in by `framing`, which takes it
-from pymavlink's dialect.
+pymavlink needs about 16 µs to build such a frame and 8 µs to parse one, which makes the codec the bottleneck
+of a transfer. These functions do the one case that carries all the data: message 110, MAVLink 2, unsigned.
+`framing` and pymavlink do all others, and a property test compares the two byte by byte. `framing` passes the
+message's extra CRC byte in, which it takes from pymavlink's dialect.
 
 Layout (MAVLink guide, "Packet Serialization"): FD, payload length, incompat flags, compat flags, seq,
 system, component, message id u24 LE, payload with trailing zeros cut (never to nothing), CRC-16/MCRF4XX
@@ -76,12 +75,12 @@ class FtpFrameCodec:
     def decode_runs(self, data: bytes, start: int, out: list[Message]) -> int:
         """Append the unbroken row of whole, valid frames at `start` to `out`; return where it ends.
 
-        Stops, without judging, at the first byte that does not begin such a frame: another message,
-        a bad CRC, a payload shorter than the target ids or longer than 254, the end of the data.
+        Stop, without judging, at the first byte that does not begin such a frame: another message, a bad CRC,
+        a payload shorter than the target ids or longer than 254, the end of the data.
         """
         extra, end, payloads = self._extra, len(data), None
         before_seq, route, length, addresses = self._alike
-        # This loop runs once per chunk of every transfer, mostly over frames that are alike.
+        # This loop runs once per chunk of every transfer, over frames that mostly differ little.
         while start + _SHORTEST <= end:
             if data[start : start + 4] != before_seq or data[start + 5 : start + 13] != route:
                 magic, size, flags, route = _fields(data, start)

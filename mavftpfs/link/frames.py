@@ -1,8 +1,8 @@
-"""Whole frames and what their headers say, for programs that pass them on. Layer: link; pure.
+"""Whole frames and their headers, for programs that pass them on. Layer: link; pure.
 
-A frame is passed on as it came, byte for byte. What is read of it: its bounds, its sender, its target and its
-kind. Frames of other dialects have a CRC that cannot be checked, or looks wrong. They pass, but
-nothing is learned from them: rubbish looks the same.
+The hub passes a frame on as it arrived, byte for byte, and reads only its bounds, its sender, its target and
+its kind. The CRC of another dialect's frame cannot be checked, or looks wrong. Such frames pass, but nobody
+learns anything from them, because rubbish looks the same.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ EVERYBODY = Address(0, 0)
 class Frame(NamedTuple):
     """One frame.
 
-    target: EVERYBODY where it names none. crc_fits: its CRC is known, and is right.
+    target: EVERYBODY if the frame names none. crc_fits: its CRC is known, and is right.
     """
 
     data: bytes
@@ -32,7 +32,7 @@ class Frame(NamedTuple):
 
 
 class Splitter(FrameBuffer[Frame]):
-    """Finds the frames in what one sender's datagrams, or a stream, bring."""
+    """Finds the frames in one sender's datagrams, or in a stream."""
 
     def _take(self, data: bytes, out: list[Frame], *, stream: bool) -> int:
         position, end = 0, len(data)
@@ -54,7 +54,7 @@ def _frame(data: bytes, message_id: int, *, crc_fits: bool) -> Frame:
     places = TARGETS.get(message_id)
     if places is None:
         return Frame(data, source, EVERYBODY, message_id, crc_fits)
-    # MAVLink 2 cuts zeros at the end: what is not there is 0.
+    # MAVLink 2 cuts zeros at the end: missing bytes are 0.
     system, component = (
         data[header + place] if place is not None and place < data[1] else 0 for place in places
     )

@@ -1,22 +1,23 @@
 """Bytes to MAVLink messages and back; the only importer of pymavlink. Layer: link; pure.
 
-Frame boundaries and CRCs are found here, the fields of the few messages that matter are decoded by
-pymavlink, and message 110 takes the short way through `fastframe`. pymavlink's own stream parser is
-not used: after a bad byte it may swallow the good frame behind it.
+This module finds frame boundaries and checks CRCs; pymavlink decodes the fields of the few messages that
+matter, and message 110 takes the short way through `fastframe`. pymavlink's own stream parser is not used,
+because after a bad byte it may swallow the good frame behind it.
 
-Finding frames in a stream. A frame is believed when its CRC fits; the message's extra byte makes that a
-check of the message's layout too. When the CRC does not fit, or cannot be known because the dialect lacks
-the message, the byte behind the claimed end decides: if a frame begins there, the claimed frame is
-skipped whole (it was corrupted, or foreign), else its first byte was garbage and the search goes on one
-byte further. Skipping whole matters: the payload may be a piece of a recorded flight, whose old
-heartbeats must not be taken for live ones. The verdict depends on the bytes alone, never on how they were
-split. At most one frame waits for its rest.
+Finding frames in a stream. A frame is believed if its CRC fits; the message's extra byte makes that a check
+of the message's layout, too. If the CRC does not fit, or cannot be known because the dialect lacks the
+message, the byte behind the claimed end decides. If a frame begins there, the claimed frame is skipped whole
+(it was corrupted, or foreign). Otherwise its first byte was garbage, and the search continues one byte
+further. Skipping whole matters, because the payload may be a piece of a recorded flight, whose old heartbeats
+must not be taken for live ones. The verdict depends on the bytes alone, never on how they were split. At most
+one frame waits for its rest.
 
-A damaged length makes the search wait for up to 280 bytes, which on a link with nothing but heartbeats takes
-many seconds. So the reader of a stream says when it fell silent (`on_silence`): frames come in one piece.
+A damaged length makes the search wait for up to 280 bytes, which takes many seconds on a link with nothing
+but heartbeats. So the reader of a stream reports silence (`on_silence`), because a frame arrives in one
+piece.
 
-A datagram ends what it holds; a frame cut at its end is kept in case a serial bridge split it, and dropped
-when the next datagram begins with a frame of its own.
+A datagram ends its last frame. A frame cut there is kept, because a serial bridge may have split it, and
+dropped if the next datagram begins with a frame of its own.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ _V2 = 0xFD
 _V1 = 0xFE
 _SIGNED = 1
 HIGHEST_ID = 0xFFFF
-"""No public dialect goes beyond; keeps garbage from claiming 280 bytes."""
+"""The longest frame of any public dialect; a longer claim would make garbage hold 280 bytes back."""
 _UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
 _MAGIC = re.compile(b"[\xfd\xfe]")
 _READABLE = frozenset((0, 2, 76, 77, 110, 148, 253, 261))  # the ids of messages whose fields matter
@@ -68,7 +69,7 @@ _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect
 
 
 def _target_offsets() -> dict[int, tuple[int, int | None]]:
-    """Return message id -> where in the payload its target system and component stand."""
+    """Return message id -> the offsets of target system and component in the payload."""
     found = {}
     for number, kind in dialect.mavlink_map.items():
         places, offset = {}, 0
@@ -82,19 +83,19 @@ def _target_offsets() -> dict[int, tuple[int, int | None]]:
 
 
 TARGETS = _target_offsets()
-"""For each message that names a target: where its payload has the target's system and component."""
+"""For each message that names a target: the offsets of the target's system and component in its payload."""
 
 
 def is_known(message_id: int) -> bool:
-    """Return whether the CRC of a message's frames can be checked: it is in the dialect."""
+    """Return whether the CRC of a message's frames can be checked, because the dialect has the message."""
     return message_id in _CRC_EXTRA
 
 
 class Verdict(Enum):
     """Verdict on the bytes at one place."""
 
-    WHOLE = "whole"  # a frame whose CRC fits, or that no CRC is known for
-    DAMAGED = "damaged"  # it has a frame's bounds, and another CRC
+    WHOLE = "whole"  # a frame whose CRC fits, or whose CRC cannot be known
+    DAMAGED = "damaged"  # a frame's bounds, with a wrong CRC
     GARBAGE = "garbage"
     PARTIAL = "partial"
 
@@ -102,9 +103,9 @@ class Verdict(Enum):
 def frame_at(
     data: bytes, position: int, *, stream: bool, highest_id: int = HIGHEST_ID
 ) -> tuple[Verdict, int, int]:
-    """Return what begins at `position`, where it ends, and a frame's message id.
+    """Return the verdict on the bytes at `position`, their end, and a frame's message id.
 
-    stream: more may come behind `data`, so a frame that no CRC proves waits for the byte behind it.
+    stream: more bytes may follow `data`, so a frame without a proving CRC waits for the byte behind it.
     """
     magic = data[position]
     if magic not in (_V1, _V2):
@@ -143,10 +144,10 @@ FoundT = TypeVar("FoundT")
 
 
 class FrameBuffer(Generic[FoundT]):
-    """Keeps what came of a frame until the rest of it comes, in a stream or in a sender's datagrams.
+    """Keeps an incomplete frame until its rest arrives, in a stream or in a sender's datagrams.
 
     Attributes:
-        stream: whether `feed` gets pieces of a stream instead of datagrams.
+        stream: whether `feed` takes pieces of a stream instead of datagrams.
     """
 
     def __init__(self, *, stream: bool) -> None:
@@ -155,11 +156,11 @@ class FrameBuffer(Generic[FoundT]):
 
     @property
     def waiting(self) -> bool:
-        """Whether a stream ended in what may be the beginning of a frame."""
+        """Whether a stream ended in a possible beginning of a frame."""
         return self.stream and bool(self._tail)
 
     def feed(self, data: bytes) -> list[FoundT]:
-        """Take a piece of the stream, or a datagram, and return what it completed."""
+        """Take a piece of the stream, or a datagram, and return what is complete now."""
         if self._tail:
             if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
                 self.reset()  # a datagram begins with a frame of its own: the cut one is lost
@@ -169,20 +170,20 @@ class FrameBuffer(Generic[FoundT]):
         return out
 
     def reset(self) -> None:
-        """Forget a half-received frame: the stream was reopened."""
+        """Drop a half-received frame, because the stream was reopened."""
         self._tail = b""
 
     def on_silence(self) -> list[FoundT]:
-        """The stream fell silent within a frame, so that was no frame, unless it only lacked the byte behind
-        it. Return what is found in the rest."""
+        """Note that the stream fell silent within a frame: the bytes were no frame, unless a frame only
+        lacked the byte behind it. Return what is found in the rest."""
         out: list[FoundT] = []
-        while self._tail:  # as at the end of a datagram: nothing more decides
+        while self._tail:  # as at the end of a datagram, where no more bytes can decide
             self._tail = self._tail[self._take(self._tail, out, stream=False) :][1:]
         return out
 
     def _take(self, data: bytes, out: list[FoundT], *, stream: bool) -> int:
-        """Append what whole frames give; return where a frame begins that is not whole yet. stream: more may
-        come."""
+        """Append the content of whole frames; return the position of the first incomplete frame. stream: more
+        bytes may follow."""
         raise NotImplementedError
 
 
@@ -201,11 +202,11 @@ class Framer(FrameBuffer[Message]):
 
     Args:
         source: the address of this program in the frames that it sends.
-        stream: whether `feed` gets pieces of a stream instead of datagrams.
-        signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
+        stream: whether `feed` takes pieces of a stream instead of datagrams.
+        signing_key: 32 bytes; all sent frames are signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
-            or the vehicle refuses the frames.
-        on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
+            because the vehicle would refuse the frames.
+        on_frame: called with the bytes of each accepted or built frame (for a .tlog), unless None.
     """
 
     def __init__(
@@ -231,7 +232,7 @@ class Framer(FrameBuffer[Message]):
 
     @property
     def source(self) -> Address:
-        """The address of this program in the frames that it sends; may be changed."""
+        """This program's address in the frames that it sends; may be changed."""
         return Address(self._sender.srcSystem, self._sender.srcComponent)
 
     @source.setter
@@ -272,7 +273,8 @@ class Framer(FrameBuffer[Message]):
             start = end
 
     def _step(self, data: bytes, position: int, out: list[Message], *, stream: bool) -> int:
-        """Deal with what begins at `position`; return where to go on, the same if more is needed."""
+        """Handle the bytes at `position`; return where to continue, the same position if more bytes are
+        needed."""
         verdict, stop, message_id = frame_at(data, position, stream=stream)
         if verdict is Verdict.DAMAGED:
             self.stats.bad_crc += 1
@@ -283,7 +285,7 @@ class Framer(FrameBuffer[Message]):
         return stop
 
     def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
-        """Append what a whole frame says, if it is signed as it must be, and its fields make sense."""
+        """Append the message of a whole frame, if its signature is as required and its fields make sense."""
         at = 5 if frame[0] == _V2 else 3
         source = Address(frame[at], frame[at + 1])
         if self._check is not None and message_id not in _UNSIGNED_ALLOWED:
@@ -337,7 +339,7 @@ class Framer(FrameBuffer[Message]):
     def encode_ftp_run(self, target: Address, payloads: Sequence[bytes]) -> list[bytes]:
         """Return the frames of several payloads, in order; otherwise as encode_ftp."""
         if wrong := set(map(len, payloads)) - {FTP_PAYLOAD_SIZE}:
-            raise LocalProtocolError(f"FTP payload of {wrong.pop()} bytes, {FTP_PAYLOAD_SIZE} needed")
+            raise LocalProtocolError(f"FTP payload of {wrong.pop()} bytes instead of {FTP_PAYLOAD_SIZE}")
         if self._check is not None:
             name = "file_transfer_protocol"
             return [self.encode(name, 0, *target, list(payload)) for payload in payloads]
@@ -375,7 +377,7 @@ class Framer(FrameBuffer[Message]):
         return self._encode_command(target, MAV_CMD_REQUEST_MESSAGE, message_id)
 
     def encode_request_capabilities(self, target: Address) -> bytes:
-        """Return the older way to ask for AUTOPILOT_VERSION (ArduPilot before 4.1, PX4 before 1.13)."""
+        """Return the older request for AUTOPILOT_VERSION (ArduPilot before 4.1, PX4 before 1.13)."""
         return self._encode_command(target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1)
 
     def _encode_command(self, target: Address, command: int, value: int) -> bytes:

@@ -1,9 +1,10 @@
 """The link of a program to the hub that has the port. Layer: link.
 
-A Unix socket of whole messages (SOCK_SEQPACKET). First each side sends a JSON object: the request to join,
-and the hub's reply. All others are frames: `F`, the length of a tag, the tag, and whole MAVLink frames. The
-tag is the network address where they came from or go to, as JSON; it is empty where the port has only one, or
-where the hub is to choose. From the hub, a message without frames says that the port was reopened.
+The link is a Unix socket of whole messages (SOCK_SEQPACKET). First each side sends a JSON object: the request
+to join, and the hub's reply. All others are frames: `F`, the length of a tag, the tag, and whole MAVLink
+frames. The tag is the network address of their origin or destination, as JSON; the tag is empty if the port
+has only one, or if the hub is to choose. From the hub, a message without frames means that the port was
+reopened.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from mavftpfs.link.uri import LinkSpec
 from mavftpfs.shared.errors import LinkClosed
 
 PROTOCOL = 3
-"""Counts up when the messages change: a hub of another version may be running."""
+"""Counts up when the messages change, because a hub of another version may be running."""
 MAX_MESSAGE = 32 * 1024
 """Bytes of frames in a message."""
 SOCKET_BUFFER = 1 << 20
 WELCOME_PATIENCE = 30.0
-"""Seconds for the hub, which may have to be started first, to answer."""
+"""Seconds for the hub to answer; the other program may have to start it first."""
 
 _MAX_MESSAGES = 64
 _RECEIVE_SIZE = 64 * 1024
@@ -51,7 +52,7 @@ def pack_facts(facts: Facts) -> bytes:
 
 
 def unpack_facts(message: bytes) -> Facts | None:
-    """Return the object of a message; None if it holds frames, or makes no sense."""
+    """Return the object of a message; None if the message holds frames, or makes no sense."""
     if message[:1] != b"{":
         return None
     try:
@@ -61,7 +62,7 @@ def unpack_facts(message: bytes) -> Facts | None:
     return facts if isinstance(facts, dict) else None
 
 
-@lru_cache(maxsize=256)  # bounded: frames may come from any number of addresses
+@lru_cache(maxsize=256)  # bounded, because frames may arrive from any number of addresses
 def _tag_of(address: NetAddress | None) -> bytes:
     tag = b"" if address is None else json.dumps(address).encode()
     return tag if len(tag) <= _MAX_TAG else b""
@@ -69,7 +70,7 @@ def _tag_of(address: NetAddress | None) -> bytes:
 
 @lru_cache(maxsize=256)
 def _address_of(tag: bytes) -> NetAddress | None:
-    """Return the address of a tag, None if it is none."""
+    """Return the address of a tag, None without an address."""
     with suppress(ValueError, RecursionError):
         address = json.loads(tag)
         if isinstance(address, list) and all(isinstance(part, str | int) for part in address):
@@ -78,7 +79,7 @@ def _address_of(tag: bytes) -> NetAddress | None:
 
 
 def pack_frames(frames: Iterable[bytes], address: NetAddress | None = None) -> list[bytes]:
-    """Return messages that hold frames in order, which came from an address or go there."""
+    """Return messages that hold frames in order, with their origin or destination."""
     tag = _tag_of(address)
     head = _FRAMES + bytes((len(tag),)) + tag
     messages, batch, size = [], [head], 0
@@ -93,7 +94,7 @@ def pack_frames(frames: Iterable[bytes], address: NetAddress | None = None) -> l
 
 
 def unpack_frames(message: bytes) -> Piece:
-    """Return the frames of a message, and the address that it names; no frames if it makes no sense."""
+    """Return the frames of a message, and its address; no frames if the message makes no sense."""
     if message[:1] != _FRAMES or len(message) < 2:
         return b"", None
     stop = 2 + message[1]
@@ -101,7 +102,7 @@ def unpack_frames(message: bytes) -> Piece:
 
 
 def set_buffers(sock: socket.socket) -> None:
-    """Give a socket of the hub room for what comes at once."""
+    """Enlarge the buffers of a hub's socket, because frames arrive in bursts."""
     sock.setblocking(False)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
         sock.setsockopt(socket.SOL_SOCKET, option, SOCKET_BUFFER)  # the kernel caps it silently
@@ -111,9 +112,9 @@ def set_buffers(sock: socket.socket) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """A program's wishes for a port: the address that it would like, the endpoints for `forward=`, its name
-    for people. beats: the program wants only heartbeats."""
+class PortRequest:
+    """A program's request for a port: the address that it prefers, the endpoints for `forward=`, its name for
+    people. beats: the program wants only heartbeats."""
 
     own: Address
     forward: tuple[str, ...] = ()
@@ -122,21 +123,21 @@ class Wish:
 
     @property
     def needs_hub(self) -> bool:
-        """Whether only a hub can do that, even if no other program wants the port."""
+        """Whether only a hub can do that, even if no other program uses the port."""
         return self.beats or bool(self.forward)
 
 
 class HubLink(PipeLink):
-    """Implements link.base.Link between a program and the hub, at either end, until the other end is gone.
-    Run `run` beside it, unless it keeps nothing. Programs get it from `join`."""
+    """Implements link.base.Link between a program and the hub, at either end, until the other end closes. Run
+    `run` beside the link, unless the link keeps nothing. Programs get one from `join`."""
 
     def __init__(self, sock: socket.socket, description: str, outbox_limit: int = 0) -> None:
         super().__init__(description, sock, outbox_limit)
         self._sock = sock
 
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
-        """Hand frames to the other end; drop and count what cannot be kept. From the hub, `to` is where they
-        came from, and no frames mean that the port was reopened."""
+        """Hand frames to the other end; drop and count what cannot be kept. From the hub, `to` is the frames'
+        origin, and an empty `frames` means that the port was reopened."""
         for message in pack_frames(frames, to):
             if self._outbox or not self._write(message, None):
                 self._keep(message)
@@ -162,7 +163,7 @@ class HubLink(PipeLink):
             self._sock.send(data)
         except BlockingIOError:
             return 0
-        except OSError:  # the other end is gone, as the receiver notices
+        except OSError:  # the other end is gone; the receiver notices
             self.stats.dropped_sends += 1
             return len(data)
         self.stats.writes += 1
@@ -171,29 +172,30 @@ class HubLink(PipeLink):
 
 
 class Refused(LinkClosed):
-    """The hub refuses a program; the text says why."""
+    """The hub refuses a program; the text gives the reason."""
 
 
 async def join(
-    sock: socket.socket, spec: LinkSpec, wish: Wish, seat: Seat | None, *, again: bool = False
+    sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: Seat | None, *, again: bool = False
 ) -> HubLink:
-    """Ask the program at the other end of a socket to be let in, and return the link once that is a hub.
+    """Ask the program at the other end of a socket for a share of the port; return the link once the hub
+    grants it.
 
-    seat: the one until now. again: this program had the link before, so the endpoints may take their time.
+    seat: the seat until now. again: this program had the link before, so the endpoints may open later.
 
     Raises:
-        Refused: and why.
-        Busy: it ended, or is about to start the hub: call again.
-        LinkClosed: it does not answer.
+        Refused: the hub refuses; the text gives the reason.
+        Busy: the other program ended, or is about to start the hub: call again.
+        LinkClosed: the other program does not answer.
     """
     hello = {
         "protocol": PROTOCOL,
         "join": spec.description,
-        "own": wish.own if seat is None else seat.own,
+        "own": wanted.own if seat is None else seat.own,
         "number": None if seat is None else seat.number,
-        "forward": wish.forward,
-        "name": wish.name,
-        "beats": wish.beats,
+        "forward": wanted.forward,
+        "name": wanted.name,
+        "beats": wanted.beats,
         "again": again,
     }
     try:
@@ -202,7 +204,7 @@ async def join(
         reply = await hear(sock, WELCOME_PATIENCE)
         if reply is None:
             raise LinkClosed(
-                f"{spec.description}: process {peer_of(sock).pid} has this port and does not answer"
+                f"{spec.description}: process {peer_of(sock).pid} has this port and does not answer; end it"
             )
         if "refused" in reply:
             raise Refused(str(reply["refused"]))
@@ -223,8 +225,8 @@ def tell(sock: socket.socket, facts: Facts) -> None:
 
 
 async def hear(sock: socket.socket, patience: float) -> Facts | None:
-    """Return the facts that the other end sends next: none if it ended or sends nonsense, None if it says
-    nothing for so many seconds."""
+    """Return the next facts of the other end: none if it ended or sends nonsense, None if it sends nothing
+    for so many seconds."""
     with trio.move_on_after(patience):
         await trio.lowlevel.wait_readable(sock)
         try:

@@ -1,6 +1,6 @@
 """MAVLink messages that the framing understands, as plain values. Layer: link; pure, no pymavlink.
 
-Every other message is `Other`: traced, never an error.
+Every other message is `Other`: logged in traces, never an error.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ MAV_TYPE_GCS = 6
 MAV_AUTOPILOT_INVALID = 8
 MAV_COMP_ID_AUTOPILOT1 = 1
 OWN_COMPONENT = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: what mavftpfs is on the link, unless somebody else there has its address."""
+"""MAV_COMP_ID_ONBOARD_COMPUTER: mavftpfs's id on the link, unless another program there has its address."""
 MAV_MODE_FLAG_SAFETY_ARMED = 0x80
 MAV_PROTOCOL_CAPABILITY_FTP = 0x20
 
@@ -26,8 +26,8 @@ class Address(NamedTuple):
 
 
 class FtpRun(NamedTuple):
-    """FILE_TRANSFER_PROTOCOL messages that came in a row from one source to one target. payloads: at least
-    one, each of 251 bytes, zero-padded where MAVLink 2 trimmed it."""
+    """FILE_TRANSFER_PROTOCOL messages that arrived in a row from one source for one target. payloads: at
+    least one, each of 251 bytes, zero-padded where MAVLink 2 trimmed it."""
 
     source: Address
     target: Address
@@ -36,7 +36,7 @@ class FtpRun(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """HEARTBEAT of anything on the link; autopilot: MAV_AUTOPILOT_INVALID where the sender is none."""
+    """HEARTBEAT of any component on the link; autopilot: MAV_AUTOPILOT_INVALID unless the sender is one."""
 
     source: Address
     vehicle_type: int
@@ -66,7 +66,7 @@ class AutopilotVersion:
 
     @property
     def board(self) -> str | None:
-        """The board's unique id in hex, the long one where it is told; None if it tells none."""
+        """The board's unique id in hex, the long one if the message has it; None if it has neither."""
         if any(self.uid2):
             return self.uid2.hex()
         return f"{self.uid:016x}" if self.uid else None
@@ -87,7 +87,7 @@ class StorageInformation:
 
 @dataclass(frozen=True, slots=True)
 class SystemTime:
-    """SYSTEM_TIME; time_boot_ms going back means that the vehicle rebooted."""
+    """SYSTEM_TIME; a decrease of time_boot_ms means that the vehicle rebooted."""
 
     source: Address
     time_boot_ms: int
@@ -95,7 +95,7 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True)
 class CommandLong:
-    """COMMAND_LONG as the simulated vehicle hears it."""
+    """COMMAND_LONG as the simulated vehicle receives it."""
 
     source: Address
     target: Address
@@ -106,7 +106,8 @@ class CommandLong:
 MAV_CMD_COMPONENT_ARM_DISARM = 400
 _ACCEPTED, _IN_PROGRESS = 0, 5
 _DENIALS = ("Arm: ", "Arming denied")
-"""How the texts begin by which ArduPilot and PX4 refuse to be armed. "PreArm: " comes every 30 s unasked."""
+"""The beginnings of texts with which ArduPilot and PX4 refuse to arm. "PreArm: " arrives every 30 s
+unasked."""
 
 
 @dataclass(frozen=True, slots=True)

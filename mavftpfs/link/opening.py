@@ -1,4 +1,4 @@
-"""Opens the link a SOURCE names. Layer: link."""
+"""Opens the link that a SOURCE names. Layer: link."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ def open_link(
 ) -> AbstractAsyncContextManager[Link]:
     """Return an async context manager that opens the link, runs its helper task and closes it.
 
-    patient: a TCP peer or a serial port may come later. source_port: the one from which `udpout` sends, if it
-    is free.
+    patient: a TCP peer or a serial port may appear later. source_port: the preferred local port of `udpout`.
 
     Entering it raises:
-        LinkClosed: it cannot be opened; the text is one line that says what to do.
+        LinkClosed: the link cannot be opened; the text is one line that says what to do.
     """
     match spec.kind:
         case LinkKind.UDP_IN | LinkKind.UDP_OUT:

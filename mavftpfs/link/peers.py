@@ -26,11 +26,11 @@ _TYPES = {
     **{6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-B receiver", 30: "camera"},
     **{33: "gimbal", 34: "battery", 36: "battery", 35: "parachute", 37: "telemetry radio"},
 }
-"""MAV_COMPONENT and MAV_TYPE values people meet."""
+"""Common MAV_COMPONENT and MAV_TYPE values."""
 
 
 def describe_peer(heartbeat: Heartbeat) -> str:
-    """Return what a heartbeat says its sender is."""
+    """Return a description of a heartbeat's sender."""
     kind = _TYPES.get(heartbeat.vehicle_type)
     if heartbeat.vehicle_type == MAV_TYPE_GCS:
         return "ground station"
@@ -45,7 +45,8 @@ def describe_peer(heartbeat: Heartbeat) -> str:
 
 
 def vehicles_in(heard: Iterable[Heartbeat]) -> list[Heartbeat]:
-    """Return a heartbeat of each vehicle, by system id: of its autopilot with the lowest component id."""
+    """Return a heartbeat of each vehicle, by system id: that of its autopilot with the lowest component
+    id."""
     found: dict[int, Heartbeat] = {}
     for one in sorted(heard, key=lambda heartbeat: heartbeat.source):
         if one.autopilot != MAV_AUTOPILOT_INVALID:
@@ -54,5 +55,5 @@ def vehicles_in(heard: Iterable[Heartbeat]) -> list[Heartbeat]:
 
 
 def names_of(senders: Iterable[Heartbeat]) -> str:
-    """Return the addresses of senders, and what they are."""
+    """Return the addresses of senders, with their descriptions."""
     return ", ".join(f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in senders)

@@ -1,7 +1,7 @@
 """The names of ports: who has a port, and who may share it. Layer: link.
 
-A program that opens a port holds the port's *name* as long as it has the port: an abstract Unix socket, of
-which there is one in a network namespace, and which ends with its process. Other programs call there.
+A program that opens a port holds the port's *name* as long as the port: an abstract Unix socket. A network
+namespace has each name once, and a name ends with its process. Other programs call there.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _ACL = "system.posix_acl_access"
 _ACL_USER = 2
 _PRIVILEGED = 1024
 _FIRST_SOURCE_PORT, _SOURCE_PORTS = 24_000, 8_000
-"""Below those that Linux chooses itself."""
+"""Below the ports that Linux chooses itself."""
 
 
 class Busy(LinkClosed):
-    """Another program has the port. In a moment it may be free, or shared."""
+    """Another program has the port. A moment later the port may be free, or shared."""
 
 
 class Peer(NamedTuple):
-    """The process at the other end of a Unix socket: when it connected, or began to listen."""
+    """The process at the other end of a Unix socket, as of the time when it connected or began to listen."""
 
     pid: int
     uid: int
@@ -49,8 +49,8 @@ class Peer(NamedTuple):
 def port_name(spec: LinkSpec) -> str:
     """Return the name of a port, the same for two SOURCEs that exclude each other.
 
-    `tcp` and `udpout` exclude nobody, but all programs of a user share them, because a server may have a
-    single client.
+    `tcp` and `udpout` exclude nobody, but all programs of a user share them, because a server may accept only
+    one client.
     """
     if spec.kind is LinkKind.SERIAL:
         text = f"serial {os.path.realpath(spec.device)}"
@@ -62,13 +62,13 @@ def port_name(spec: LinkSpec) -> str:
 
 
 def source_port(spec: LinkSpec) -> int:
-    """Return the port from which all mavftpfs programs send to one address, because PX4 answers only the
-    first address that it heard (servers.md 5)."""
+    """Return the local port from which all mavftpfs programs send to one address, because PX4 answers only
+    the first address that it heard (servers.md 5)."""
     return _FIRST_SOURCE_PORT + int(port_name(spec).removeprefix("\0" + _PREFIX), 16) % _SOURCE_PORTS
 
 
 def take_name(name: str) -> socket.socket | None:
-    """Take the name of a port; return the socket where others call, None if another program has the name."""
+    """Take the name of a port; return the socket that others call, None if another program has the name."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         sock.setblocking(False)
@@ -86,7 +86,7 @@ def connect(name: str) -> socket.socket:
     """Return a connection to the program that has the name of a port.
 
     Raises:
-        BlockingIOError: as many programs wait there as can.
+        BlockingIOError: the queue of waiting programs is full.
         OSError: no program has that name.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -100,23 +100,23 @@ def connect(name: str) -> socket.socket:
 
 
 def call(name: str, spec: LinkSpec) -> socket.socket | None:
-    """Return a connection to the program that has a port and its name, None if no program has.
+    """Return a connection to the program that has a port and its name, None if there is no such program.
 
     Raises:
-        Busy: as many programs wait there as can.
-        LinkClosed: it is another user's, who may not have that port.
+        Busy: the queue of waiting programs is full.
+        LinkClosed: the program is another user's, who may not have that port.
     """
     try:
         sock = connect(name)
     except BlockingIOError as exc:
-        raise Busy(f"{spec.description}: too many programs wait for this port") from exc
+        raise Busy(f"{spec.description}: too many programs wait for this port; try again later") from exc
     except OSError:
         return None
     if may_share(sock, spec):
         return sock
     pid = peer_of(sock).pid
     sock.close()
-    raise LinkClosed(f"{spec.description} is claimed by process {pid} of another user; end that")
+    raise LinkClosed(f"{spec.description} is claimed by process {pid} of another user; end that process")
 
 
 async def next_caller(sock: socket.socket) -> socket.socket:
@@ -125,7 +125,7 @@ async def next_caller(sock: socket.socket) -> socket.socket:
         await trio.lowlevel.wait_readable(sock)
         try:
             return sock.accept()[0]
-        except OSError:  # it left again, or no descriptors are left
+        except OSError:  # the caller left, or no descriptors are free
             await trio.sleep(_PAUSE)
 
 
@@ -144,13 +144,13 @@ def peer_of(sock: socket.socket) -> Peer:
 
 
 def is_ours(sock: socket.socket) -> bool:
-    """Return whether the other end is of this user, or of root."""
+    """Return whether this user, or root, runs the other end."""
     return peer_of(sock).uid in (0, os.getuid())
 
 
 def may_share(sock: socket.socket, spec: LinkSpec) -> bool:
-    """Return whether the other end could open a port itself, so that it may have the port's name, or share
-    the port. Any user may listen on a network port; a device has permissions."""
+    """Return whether the other end could open a port itself, and so may have the port's name, or share the
+    port. Any user may listen on a network port; a device has permissions."""
     if is_ours(sock):
         return True
     if spec.kind is LinkKind.SERIAL:
@@ -165,7 +165,7 @@ def _may_open(sock: socket.socket, device: str) -> bool:
     try:
         groups = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _GROUPS)
         facts = os.stat(device)
-    except OSError:  # the user is in very many groups, or the device is away
+    except OSError:  # the user is in very many groups, or the device is gone
         return False
     shift = 6 if peer.uid == facts.st_uid else 0
     if shift == 0 and facts.st_gid in (peer.gid, *(one for (one,) in struct.iter_unpack("I", groups))):
@@ -176,7 +176,7 @@ def _may_open(sock: socket.socket, device: str) -> bool:
 def _acl_lets_in(uid: int, device: str) -> bool:
     try:
         acl = os.getxattr(device, _ACL)
-    except OSError:  # it has none
+    except OSError:  # the device has no ACL
         return False
     entries = struct.iter_unpack("<HHI", acl[4:])
     return any(

@@ -1,4 +1,4 @@
-"""Which SOURCEs are the same port, and which lead back to each other. Layer: link."""
+"""Comparison of SOURCEs: the same port, or a loop. Layer: link."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def same_link(one: LinkSpec, other: LinkSpec) -> bool:
 
 
 def leads_back(endpoint: LinkSpec, source: LinkSpec) -> bool:
-    """Return whether frames for an endpoint would be SOURCE's own: it is the same link, or one of them sends
-    to where the other listens."""
+    """Return whether frames for an endpoint would return to SOURCE: both are the same link, or one of them
+    sends to where the other listens."""
     return same_link(endpoint, source) or _reaches(endpoint, source) or _reaches(source, endpoint)
 
 
@@ -38,7 +38,7 @@ def _reaches(one: LinkSpec, other: LinkSpec) -> bool:
 
 
 def _is_here(host: str) -> bool:
-    """Return whether a numeric address is one of this computer's."""
+    """Return whether a numeric address belongs to this computer."""
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
         try:
             sock.bind((str(ipaddress.ip_address(host)), 0))

@@ -1,7 +1,7 @@
 """Serial links: USB ports, telemetry radios, ptys. Layer: link; the only importer of pyserial.
 
-pyserial opens the port (settings, exclusive lock); from then on it is a plain descriptor. A port that
-vanishes (unplugged, vehicle rebooted) is opened again when it returns, under the same name.
+pyserial opens the port (settings, exclusive lock); afterwards this module uses the plain descriptor. A port
+that vanishes (unplugged, vehicle rebooted) is opened again when it returns under the same name.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ async def open_serial(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator
         pipe = None if patient else (await reopen())[0]
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
-    # About a second of the line: what waits longer than that is answered too late anyway.
+    # About a second of the line, because the answer to a request that waits longer arrives too late anyway.
     limit = max(_LEAST_OUTBOX, spec.baud // 10)
     link = StreamLink(spec.description, reopen, pipe, is_serial=True, outbox_limit=limit)
     async with background(link.run, link.aclose):
@@ -68,7 +68,7 @@ def _open_port(spec: LinkSpec) -> Pipe:
 
 
 def _make_reads_tell_empty_from_gone(fd: int) -> None:
-    # pyserial sets VMIN 0, with which a read of nothing and of a port that is gone both return b"".
+    # With pyserial's VMIN 0 a read returns b"" both for an empty port and for one that is gone.
     attributes = termios.tcgetattr(fd)
     attributes[6][termios.VMIN] = 1
     attributes[6][termios.VTIME] = 0

@@ -1,8 +1,9 @@
 """The link of every program: a port of its own, or one shared through the hub. Layer: link.
 
-A program that finds no other one holds the port's name and has the port itself. If a second program calls, it
-starts the hub. The hub calls, too; then the program closes the port, and the hub opens it. From then on each
-program's link leads to the hub. All that is a link that was lost and comes back, as when the hub is killed.
+The first program holds the port's name and opens the port itself. If a second program calls, the first one
+starts the hub. The hub calls, too; then the first program closes the port, and the hub opens it. From then on
+each program's link leads to the hub. To its users this is a link that was lost and returned, as when the hub
+is killed.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import trio
 from mavftpfs.link import ports
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import REOPENED, Link, LinkStats, Piece, Seat, background
-from mavftpfs.link.hublink import PROTOCOL, Facts, Wish, hear, join, tell
+from mavftpfs.link.hublink import PROTOCOL, Facts, PortRequest, hear, join, tell
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.shared.errors import LinkClosed
@@ -32,34 +33,34 @@ log = logging.getLogger("mavftpfs.link")
 PATIENCE = 20.0
 """Seconds for the mavftpfs program that has the port to end, or to share it."""
 GRACE = 0.5
-"""Seconds for a program that was killed to let go of its port."""
+"""Seconds for a killed program's port to become free."""
 HELLO_PATIENCE = 1.0
-"""Seconds for a program that calls to say what it wants."""
+"""Seconds for a program that calls to send its request."""
 START_PATIENCE, COMING = 25.0, 5.0
 """Seconds for the hub to start, and then to call."""
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
-_NO_NUMBER = "port 0 is another one each time, so it cannot be shared; name a port"
+_NO_NUMBER = "port 0 is a different port each time, so it cannot be shared; name a port"
 _OTHER_VERSION = "{}: process {} has this port, with another version of mavftpfs; end that first"
-_UPGRADED = "mavftpfs was upgraded since this program began; start it anew"
+_UPGRADED = "mavftpfs was upgraded since this program started; restart it"
 _PAUSE, _LONGEST_PAUSE = 0.02, 1.0
 _SHARED = "%s is shared with another program from now on: a hub opens it, and all programs use the hub%s"
 _LINE = {LinkKind.SERIAL: "; DTR of the line falls for a moment"}
 _NAME = "mavftpfs: "
 _PACKAGES = str(Path(__file__).parents[2])
-"""Where this program was imported from: the hub is to be the same program, whatever its working directory."""
+"""This program's packages: the hub must run the same program, whatever its working directory."""
 
 
 class SharedLink:
     """Implements link.base.Link by the port itself, or by the hub that has it. Made by `open_shared`."""
 
-    def __init__(self, spec: LinkSpec, wish: Wish) -> None:
+    def __init__(self, spec: LinkSpec, wanted: PortRequest) -> None:
         self.stats = LinkStats()
         self.seat: Seat | None = None
         self.is_stream = not spec.kind.is_udp
         self.is_serial = spec.kind is LinkKind.SERIAL
         self.description = spec.description
         self._spec = spec
-        self._wish = wish
+        self._wanted = wanted
         self._name = ports.port_name(spec)
         self._inner: Link | None = None
         self._was_open = False
@@ -69,7 +70,7 @@ class SharedLink:
     # -- opening, again and again
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Keep the link open until cancelled. This task has started once the link is open.
+        """Keep the link open until cancelled. This task counts as started once the link is open.
 
         Raises:
             LinkClosed: the link cannot be opened the first time.
@@ -81,7 +82,7 @@ class SharedLink:
                 if sock is None:
                     sock = await self._hold_port(task_status)
                     lost_at, said = trio.current_time(), ""
-                hub = await join(sock, self._spec, self._wish, self.seat, again=self._was_open)
+                hub = await join(sock, self._spec, self._wanted, self.seat, again=self._was_open)
                 async with background(hub.run, hub.aclose):
                     with self._used(hub, task_status):
                         await hub.wait_closed()
@@ -98,18 +99,18 @@ class SharedLink:
                 await trio.sleep(min(max(waited / 4, _PAUSE), _LONGEST_PAUSE))
 
     async def _hold_port(self, task_status: trio.TaskStatus[None]) -> socket.socket:
-        """Have the port until a hub comes for it. Return the hub's connection, with port and name closed.
+        """Hold the port until a hub claims it. Return the hub's connection, with port and name closed.
 
         Raises:
             Busy: another program has just taken the name.
-            LinkClosed: the port cannot be opened, or this program needs a hub and that does not start.
+            LinkClosed: the port cannot be opened, or this program needs a hub and the hub does not start.
         """
         name = ports.take_name(self._name)
         if name is None:
-            raise ports.Busy(f"{self.description}: another program is just opening this port")
+            raise ports.Busy(f"{self.description}: another program is opening this port; try again")
         with name:
             async with open_link(self._spec, source_port=ports.source_port(self._spec)) as link:
-                if self._wish.needs_hub:
+                if self._wanted.needs_hub:
                     return await self._started_hub(name)
                 with self._used(link, task_status):
                     hub = await self._hub_that_comes(name)
@@ -117,7 +118,7 @@ class SharedLink:
             return hub
 
     async def _hub_that_comes(self, name: socket.socket) -> socket.socket:
-        """Return the connection of the hub that comes for the port; start it when another program calls."""
+        """Return the connection of the hub that claims the port; start a hub when another program calls."""
         while True:
             caller, request = await _next_call(name)
             if _is_hub(caller, request):
@@ -137,10 +138,10 @@ class SharedLink:
                 tell(caller, {"refused": problem})
 
     async def _started_hub(self, name: socket.socket) -> socket.socket:
-        """Start a hub, and return its connection. Programs that call meanwhile are left to it.
+        """Start a hub, and return its connection. The hub answers programs that call meanwhile.
 
         Raises:
-            LinkClosed: and why there is no hub.
+            LinkClosed: the hub did not start; the text gives the reason.
         """
         await start_hub(self._spec)
         with ExitStack() as others, trio.move_on_after(COMING):
@@ -155,7 +156,7 @@ class SharedLink:
 
     @contextmanager
     def _used(self, link: Link, task_status: trio.TaskStatus[None]) -> Iterator[None]:
-        """Go on with a link that was opened, during the body. Our seat stays."""
+        """Use a link that was opened, during the body. This program's seat stays."""
         link.stats = self.stats
         self.seat = link.seat or self.seat
         self._inner = link
@@ -205,7 +206,7 @@ class SharedLink:
 
 
 def _may_pass(problem: LinkClosed, waited: float) -> bool:
-    """Return whether a link that could not be opened for so many seconds may soon be free."""
+    """Return whether a link that could not be opened for so many seconds may soon become free."""
     if isinstance(problem, ports.Busy):
         return waited < PATIENCE
     return waited < GRACE and getattr(problem.__cause__, "errno", None) in _TAKEN
@@ -223,26 +224,26 @@ async def _next_call(name: socket.socket) -> tuple[socket.socket, Facts]:
 
 
 def _is_hub(caller: socket.socket, request: Facts) -> bool:
-    """Return whether a hub calls that may have the port: of this version, and of this user."""
+    """Return whether the caller is a hub that may have the port: of this version, and of this user."""
     return (
         "hub" in request and request.get("protocol") == PROTOCOL and ports.peer_of(caller).uid == os.getuid()
     )
 
 
 @asynccontextmanager
-async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
+async def open_shared(spec: LinkSpec, wanted: PortRequest) -> AsyncIterator[Link]:
     """Open the link that a SOURCE names, alone or with other mavftpfs programs, for the length of the body.
 
     Raises:
         LinkClosed: it cannot be opened; the text is one line that says what to do.
     """
-    if spec.kind is not LinkKind.SERIAL and spec.port == 0:  # no other program can find it
-        if wish.needs_hub:
+    if spec.kind is not LinkKind.SERIAL and spec.port == 0:  # other programs cannot find the port
+        if wanted.needs_hub:
             raise LinkClosed(_NO_NUMBER)
         async with open_link(spec) as alone:
             yield alone
         return
-    link = SharedLink(spec, wish)
+    link = SharedLink(spec, wanted)
     failure: Exception | None = None
     lasting = trio.CancelScope()
 
@@ -253,9 +254,9 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
     async with trio.open_nursery() as nursery:
         try:
             await nursery.start(run)
-            lasting.shield = True  # a command that is cancelled (Ctrl-C) still closes the vehicle's session
+            lasting.shield = True  # a cancelled command (Ctrl-C) still closes the vehicle's session
             yield link
-        except Exception as exc:  # raised again outside, so that it is not wrapped in a group
+        except Exception as exc:  # raised again outside the nursery, which would wrap it in a group
             failure = exc
         finally:
             lasting.cancel()
@@ -264,16 +265,16 @@ async def open_shared(spec: LinkSpec, wish: Wish) -> AsyncIterator[Link]:
 
 
 def own_environment() -> dict[str, str]:
-    """Return the environment of another process of this very program, wherever it works."""
+    """Return the environment for another process of this very program, in any working directory."""
     path = os.pathsep.join(filter(None, (_PACKAGES, os.environ.get("PYTHONPATH"))))
     return {**os.environ, "PYTHONPATH": path}
 
 
 async def start_hub(spec: LinkSpec) -> None:
-    """Start a hub, which then calls this program, because it has the port. Return when the hub runs.
+    """Start a hub, which then calls this program, because it has the port. Return once the hub runs.
 
     Raises:
-        LinkClosed: and why it does not.
+        LinkClosed: the hub does not start; the text gives the reason.
     """
     command = [sys.executable, "-m", "mavftpfs", "hub", "--serve", spec.description]
     problem = f"it is not ready within {START_PATIENCE:g} s"

@@ -2,7 +2,7 @@
 
 Rules of the MAVLink guide ("Message Signing"): a stream is (link id, system, component); its timestamps,
 in units of 10 µs since 2015-01-01, only grow; a new stream may be at most one minute old. Unlike
-pymavlink's check, nothing is remembered of a frame before its signature proved right: a forged
+pymavlink's check differs: here a frame leaves a trace only after its signature proved right, because a forged
 timestamp must neither lock out the true sender nor grow the table.
 """
 
@@ -25,10 +25,10 @@ class SignatureCheck:
 
     Args:
         key: 32 bytes.
-        clock: present time as a signing timestamp; without one, time is what signed frames say.
+        clock: present time as a signing timestamp; None: the newest timestamp of the accepted frames.
 
     Attributes:
-        bad_times: frames with the right key and a time that is too old.
+        bad_times: number of frames with the right key and too old a time.
     """
 
     def __init__(self, key: bytes, clock: Callable[[], int] | None = None) -> None:
@@ -40,7 +40,7 @@ class SignatureCheck:
 
     @property
     def now(self) -> int:
-        """The newest time known: the clock's, or the latest accepted timestamp if that is ahead."""
+        """The newest known time: the clock's, or the latest accepted timestamp if that is ahead."""
         return max(self._newest, self._clock() if self._clock is not None else 0)
 
     def accept(self, frame: bytes, source: Address) -> bool:

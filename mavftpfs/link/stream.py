@@ -1,7 +1,7 @@
 """Byte streams that are reopened when they fail: what TCP and serial links share. Layer: link.
 
-When a stream fails, what waited to be sent is dropped and counted. A helper task then asks the opener for a
-new one until it gets it, with growing pauses. After that `receive` returns REOPENED.
+If a stream fails, the link drops and counts what waits to be sent. A helper task then asks the opener for a
+new pipe until one opens, with growing pauses. After that `receive` returns REOPENED.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LONGEST_PAUSE = 2.0
 """Seconds between attempts to reopen."""
 
 Opened: TypeAlias = tuple[Pipe, NetAddress | None]
-"""A pipe, and the address that opened it; None if this program did."""
+"""A pipe, and the address that opened it; None if this program opened it."""
 
 Opener = Callable[[], Awaitable[Opened]]
 """Opens a pipe, waiting as long as it takes. Raises OSError: try again later."""
@@ -33,8 +33,8 @@ class StreamLink(PipeLink):
     """Implements link.base.Link over whatever `opener` opens.
 
     Args:
-        pipe: the first one, where it is already open.
-        outbox_limit: bytes to hold for a slow peer.
+        pipe: the first one, if it is already open.
+        outbox_limit: bytes to keep for a slow peer.
     """
 
     is_stream = True
@@ -55,7 +55,7 @@ class StreamLink(PipeLink):
         return self._pipe is not None
 
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
-        """Send frames in one write; drop and count, whole, what cannot be kept."""
+        """Send frames in one write; drop and count whole frames that cannot be kept."""
         if self._pipe is None:
             self.stats.dropped_sends += len(frames)
             return
@@ -71,7 +71,7 @@ class StreamLink(PipeLink):
             self._keep(frame)
 
     async def run(self) -> None:
-        """Write what had to wait, and reopen what failed; runs until cancelled."""
+        """Write what waits, and reopen what failed; run until cancelled."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(super().run)
             nursery.start_soon(self._keep_open)
@@ -92,7 +92,7 @@ class StreamLink(PipeLink):
                 self._use(*opened)
 
     def _use(self, pipe: Pipe, peer: NetAddress | None) -> None:
-        """Go on with a pipe that was opened."""
+        """Use a pipe that was opened."""
         if self._closed:
             pipe.close()
             return
@@ -104,7 +104,7 @@ class StreamLink(PipeLink):
         self._changed.unpark_all()
 
     async def aclose(self) -> None:
-        """Close; what the kernel does not take now is lost."""
+        """Close the link, and drop what the kernel does not accept now."""
         if self._outbox:
             self._write(*self._outbox[0])
         await super().aclose()

@@ -1,8 +1,7 @@
 """TCP links: `tcp` connects (again and again), `tcpin` accepts one peer at a time. Layer: link.
 
-A peer of `tcpin` stays until its connection ends; the next one waits. Both ends use keep-alives and a user
-timeout, so that a vehicle that lost power is noticed within about 10 s although TCP alone would wait for
-minutes.
+A peer of `tcpin` stays until its connection ends; the next peer waits. Both ends use keep-alives and a user
+timeout, so that they notice within about 10 s that a vehicle lost power. TCP alone would wait for minutes.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[St
 
 @asynccontextmanager
 async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
-    """Listen. The link is usable at once, and drops what is sent before a peer connects.
+    """Listen. The link is usable at once; before a peer connects, it drops what is sent.
 
     Raises:
         LinkClosed: the port is taken, or this computer does not have the address.
@@ -65,7 +64,7 @@ async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
         async def accept() -> Opened:
             await trio.lowlevel.wait_readable(listener)
             peer, address = listener.accept()
-            # Each connection has a port of its own: a peer that comes back has the same host.
+            # Each connection has a port of its own, but a returning peer has the same host.
             return _configure(peer), address[:1]
 
         link = StreamLink(bound.description, accept, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
@@ -120,6 +119,6 @@ def _configure(sock: socket.socket) -> socket.socket:
         ("TCP_KEEPCNT", 3),
         ("TCP_USER_TIMEOUT", 10_000),
     ):
-        with suppress(OSError, AttributeError):  # not on every system; a comfort only
+        with suppress(OSError, AttributeError):  # missing on some systems, and not essential
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
     return sock

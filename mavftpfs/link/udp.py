@@ -18,7 +18,7 @@ from mavftpfs.link.uri import LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_DATAGRAMS = 256
-"""Datagrams taken per wake-up: more would starve heartbeats and the kernel's requests."""
+"""Datagrams taken per wake-up: a larger number would delay heartbeats and the kernel's requests."""
 
 _SOCKET_BUFFER = 1 << 20
 _OUTBOX_LIMIT = 64 * 1024
@@ -30,7 +30,7 @@ class UdpLink(PipeLink):
 
     Args:
         sock: bound, non-blocking.
-        target: where udpout sends, whatever `to` is; datagrams from other hosts are ignored. None: udpin.
+        target: the only destination of udpout, which ignores datagrams from other hosts. None: udpin.
     """
 
     def __init__(self, sock: socket.socket, description: str, target: NetAddress | None = None) -> None:
@@ -38,18 +38,20 @@ class UdpLink(PipeLink):
         self._sock = sock
         self._target = target
         self._heard: NetAddress | None = None
-        # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
+        # Datagrams are copied from one buffer, because a bytes object of the largest size for each would
+        # fragment the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
 
     def send(self, frames: Sequence[bytes], to: NetAddress | None = None) -> None:
-        """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
+        """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot be sent."""
         to = self._target or to or self._heard
         for datagram in pack(frames):
             if self._outbox or not self._write(datagram, to):
                 self._keep(datagram, to)
 
     def _take(self) -> list[Piece]:
-        """Take what is there. Errors of the socket come from ICMP messages of other hosts: go on."""
+        """Take all datagrams that have arrived. Ignore the socket's errors: ICMP messages of other hosts
+        cause them."""
         receive, buffer, target = self._sock.recvfrom_into, self._buffer, self._target
         pieces: list[Piece] = []
         for _ in range(MAX_DATAGRAMS):
@@ -73,7 +75,7 @@ class UdpLink(PipeLink):
             sent = self._sock.sendto(data, to)
         except BlockingIOError:
             return 0
-        except OSError:  # no route, no buffer: waiting would not help
+        except OSError:  # no route or no buffer, and waiting would not help
             self.stats.dropped_sends += 1
             return len(data)
         self.stats.writes += 1
@@ -85,7 +87,7 @@ class UdpLink(PipeLink):
 async def open_udp(spec: LinkSpec, source_port: int = 0) -> AsyncIterator[UdpLink]:
     """Open udpin or udpout and run its writer for the length of the `async with`.
 
-    source_port: the one from which udpout sends, if it is free.
+    source_port: the preferred local port of udpout.
 
     Raises:
         LinkClosed: unknown host, or the port is taken.
@@ -134,7 +136,7 @@ def _bind(sock: socket.socket, spec: LinkSpec, address: NetAddress) -> None:
 
 
 def _bind_somewhere(sock: socket.socket, port: int) -> None:
-    """Bind a port if it is free, else one that the kernel chooses."""
+    """Bind a port if it is free, or otherwise one that the kernel chooses."""
     anywhere = "::" if sock.family == socket.AF_INET6 else "0.0.0.0"
     try:
         sock.bind((anywhere, port))

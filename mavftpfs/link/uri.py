@@ -25,7 +25,7 @@ _EXAMPLES = "udpin:0.0.0.0:14550, tcp:192.168.1.10:5760 or /dev/ttyUSB0,57600"
 
 
 class LinkKind(Enum):
-    """Which end opens the conversation, and over what."""
+    """Which end begins, and over which transport."""
 
     UDP_IN = "udpin"
     UDP_OUT = "udpout"
@@ -77,10 +77,10 @@ _KINDS = {
 
 
 def parse_source(text: str) -> LinkSpec:
-    """Return what `text` means.
+    """Return the link that `text` names.
 
     Raises:
-        UsageError: one line that says what is wrong and shows a right example.
+        UsageError: the text is wrong; the message is one line with a right example.
     """
     require_expanded(text)
     source, mark, subtree_text = text.partition("#")
@@ -104,15 +104,15 @@ def parse_source(text: str) -> LinkSpec:
 
 
 def parse_endpoint(text: str) -> LinkSpec:
-    """Return what an endpoint of `forward=` means: as a SOURCE, but it listens for this computer only, unless
-    an address is given.
+    """Return the link of an endpoint of `forward=`: as a SOURCE, except that a listening endpoint without an
+    address serves this computer only.
 
     Raises:
-        UsageError: as parse_source; or it names a directory.
+        UsageError: as parse_source; or the endpoint names a directory.
     """
     spec = parse_source(text)
     if spec.subtree != ROOT:
-        raise UsageError(f"{text!r} is to carry frames, so no directory belongs to it; leave out '#...'")
+        raise UsageError(f"{text!r} carries frames, so it cannot name a directory; leave out '#...'")
     rest = text.partition(":")[2].removeprefix("//")
     if spec.kind.listens and rest.startswith(":"):
         return replace(spec, host=LOOPBACK)
@@ -123,7 +123,7 @@ def require_expanded(source: str) -> None:
     """Check that the shell has expanded a `~` at the beginning of SOURCE.
 
     Raises:
-        UsageError: it has not.
+        UsageError: SOURCE begins with `~`.
     """
     if source.startswith("~/"):
         raise UsageError(f"SOURCE {source!r}: the shell does not expand ~ in quotes; quote only the pattern")
@@ -153,7 +153,7 @@ def _parse_serial(text: str, source: str, separator: str, subtree: bytes) -> Lin
     baud = _number(baud_text)
     if baud is None or not 50 <= baud <= 12_000_000:
         raise UsageError(
-            f"SOURCE {source!r}: {baud_text!r} is no baud rate; write for example {device},57600"
+            f"SOURCE {source!r}: {baud_text!r} is not a baud rate; write for example {device},57600"
         )
     return LinkSpec(LinkKind.SERIAL, device=device, baud=baud, subtree=subtree)
 
@@ -183,7 +183,7 @@ def _parse_host_port(text: str, source: str, kind: LinkKind) -> tuple[str, int]:
         raise UsageError(f"SOURCE {source!r} names no port; write for example {kind.value}:{shown}:{default}")
     port = _number(port_text)
     if port is None or not 0 <= port <= 65535 or (port == 0 and not kind.listens):
-        raise UsageError(f"SOURCE {source!r}: {port_text!r} is no port; write for example {example}")
+        raise UsageError(f"SOURCE {source!r}: {port_text!r} is not a port; write for example {example}")
     return (host or "0.0.0.0", port)
 
 
@@ -196,11 +196,11 @@ def _number(text: str) -> int | None:
 
 
 def cannot_open(spec: LinkSpec, problem: OSError) -> LinkClosed:
-    """Return the error to raise for an OSError met while opening `spec`."""
+    """Return the LinkClosed for an OSError from opening `spec`."""
     if spec.kind is LinkKind.SERIAL:
         gone = f"there is no {spec.device}; is the vehicle plugged in? (ls /dev/ttyACM* /dev/ttyUSB*)"
         taken = f"{spec.device} is in use by another program (a ground station? ModemManager?)"
-        other = f"{spec.device} is no serial port"
+        other = f"{spec.device} is not a serial port"
         remedy = "join its group (often: sudo usermod -aG dialout $USER) and log in again"
         reasons = dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), gone)
         reasons |= dict.fromkeys((errno.EACCES, errno.EPERM), f"no permission for {spec.device}; {remedy}")

@@ -20,8 +20,8 @@ from mavftpfs.link.hublink import (
     PROTOCOL,
     Facts,
     HubLink,
+    PortRequest,
     Refused,
-    Wish,
     hear,
     join,
     pack_facts,
@@ -62,7 +62,7 @@ class Running:
 
     async def joined(self, *forward: str, source: str = "") -> HubLink:
         """Return another client."""
-        return await join(self.call(), parse_source(source or self.source), Wish(US, forward), None)
+        return await join(self.call(), parse_source(source or self.source), PortRequest(US, forward), None)
 
     async def asked(self, request: Facts) -> Facts:
         """Return what the hub replies to a request."""
@@ -93,7 +93,7 @@ async def running(*forward: str, source: str = "", again: bool = False) -> Async
             sock = await next_caller(name)
             sock.setblocking(False)
             assert "hub" in (await hear(sock, 60) or {})
-        first = await join(sock, spec, Wish(US, forward), None, again=again)
+        first = await join(sock, spec, PortRequest(US, forward), None, again=again)
         yield Running(source, ended)
         await first.aclose()
 
@@ -247,7 +247,7 @@ async def test_that_the_port_was_reopened_is_told_between_what_came_before_and_a
 
 
 async def test_a_port_without_a_number_cannot_be_shared() -> None:
-    wish = Wish(US, (f"udpout:{HOST}:{free_udp_port()}",))
+    wish = PortRequest(US, (f"udpout:{HOST}:{free_udp_port()}",))
     with pytest.raises(LinkClosed, match="name a port"):
         async with open_shared(parse_source(f"udpin:{HOST}:0"), wish):
             pass

@@ -174,10 +174,10 @@ async def test_closing_wakes_the_receiver(source: str) -> None:
         (f"tcp:{HOST}:1", "nothing listens on port 1"),
         ("tcp:no-such-host.invalid:1", "no-such-host.invalid"),
         ("udpout:no-such-host.invalid:1", "host 'no-such-host.invalid' is unknown"),
-        ("udpin:a..b:5760", "is no host name"),
-        ("tcp:\N{SNOWMAN}.example:5760", "is no host name"),
-        ("/dev/null", "/dev/null is no serial port"),
-        ("/proc", "/proc is no serial port"),
+        ("udpin:a..b:5760", "is not a host name"),
+        ("tcp:\N{SNOWMAN}.example:5760", "is not a host name"),
+        ("/dev/null", "/dev/null is not a serial port"),
+        ("/proc", "/proc is not a serial port"),
     ],
 )
 async def test_what_cannot_be_opened_says_why_in_a_line(source: str, says: str) -> None:

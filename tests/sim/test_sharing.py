@@ -20,7 +20,7 @@ from mavftpfs.client.connect import plain_nursery
 from mavftpfs.link import hublink, sharing
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.hublink import Wish
+from mavftpfs.link.hublink import PortRequest
 from mavftpfs.link.messages import Address
 from mavftpfs.link.ports import connect, next_caller, port_name, take_name
 from mavftpfs.link.sharing import open_shared
@@ -47,7 +47,7 @@ class Port:
 
     def shared(self, *forward: str) -> Any:
         """Return the context manager of one more program's link."""
-        return open_shared(self.spec, Wish(US, forward))
+        return open_shared(self.spec, PortRequest(US, forward))
 
     async def run_program(self, *, task_status: trio.TaskStatus[tuple[Link, trio.CancelScope]]) -> None:
         """Be one more program until cancelled; starts with its link, and what cancels it."""
@@ -228,7 +228,7 @@ async def test_a_program_keeps_its_port_from_those_of_another_version(
         with monkeypatch.context() as patch:  # an upgrade replaced the files; the hub is of the new version
             patch.setattr(sharing, "PROTOCOL", hublink.PROTOCOL + 1)
             patch.setattr(hublink, "PROTOCOL", hublink.PROTOCOL + 1)
-            with pytest.raises(LinkClosed, match="mavftpfs was upgraded since this program began"):
+            with pytest.raises(LinkClosed, match="mavftpfs was upgraded since this program started"):
                 async with port.shared():
                     pass
         await port.hears(one)
@@ -308,9 +308,9 @@ async def test_the_hub_sends_from_the_port_from_which_the_first_program_sent() -
                     with suppress(BlockingIOError):
                         senders.append(vehicle.recvfrom(2048))
 
-        async with open_shared(spec, Wish(US)) as one:
+        async with open_shared(spec, PortRequest(US)) as one:
             await speak(one, US)
-            async with open_shared(spec, Wish(US)) as two:
+            async with open_shared(spec, PortRequest(US)) as two:
                 assert two.seat is not None
                 await speak(two, two.seat.own)
                 await speak(one, US)

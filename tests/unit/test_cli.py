@@ -224,7 +224,7 @@ def test_a_baud_rate_means_nothing_where_no_serial_port_is() -> None:
     options, _ = commands.connection_of(argparse.Namespace(source=SOURCE, options=["window=4,baud=57600"]))
     window, baud = options.gone
     assert window.startswith("option window is gone")
-    assert baud == "option baud is gone, and means nothing here: SOURCE is no serial port"
+    assert baud == "option baud is gone, and means nothing here: SOURCE is not a serial port"
 
 
 def test_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

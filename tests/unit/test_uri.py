@@ -78,18 +78,18 @@ def test_description_parses_to_the_same(spec: LinkSpec) -> None:
         ("udpin:", "names no port; write for example udpin:0.0.0.0:14550"),
         ("udpin:14550", "a host comes before the port"),
         ("tcp:", "names no host"),
-        ("udpin:0.0.0.0:port", "'port' is no port"),
-        ("udpin:0.0.0.0:65536", "'65536' is no port"),
-        ("udpin:0.0.0.0:-1", "'-1' is no port"),
-        ("udpin:0.0.0.0:²", "is no port"),
-        ("tcp:127.0.0.1:0", "'0' is no port"),
+        ("udpin:0.0.0.0:port", "'port' is not a port"),
+        ("udpin:0.0.0.0:65536", "'65536' is not a port"),
+        ("udpin:0.0.0.0:-1", "'-1' is not a port"),
+        ("udpin:0.0.0.0:²", "is not a port"),
+        ("tcp:127.0.0.1:0", "'0' is not a port"),
         ("udpin:::1:14550", "IPv6 in brackets"),
         ("udpin:[::1:14550", "bracket not closed"),
         ("udpin:[::1]14550", "bracket not closed"),
-        ("/dev/ttyUSB0,fast", "'fast' is no baud rate"),
-        ("/dev/ttyUSB0,0", "'0' is no baud rate"),
-        ("/dev/ttyUSB0,", "'' is no baud rate"),
-        ("serial:///dev/ttyUSB0:x", "'x' is no baud rate"),
+        ("/dev/ttyUSB0,fast", "'fast' is not a baud rate"),
+        ("/dev/ttyUSB0,0", "'0' is not a baud rate"),
+        ("/dev/ttyUSB0,", "'' is not a baud rate"),
+        ("serial:///dev/ttyUSB0:x", "'x' is not a baud rate"),
         ("serial:ttyUSB0", "neither a device path nor a link"),
         ("udpin:0.0.0.0:14550#fs", "must begin with '/'"),
         ("udpin:0.0.0.0:14550#", "must begin with '/'"),
@@ -121,7 +121,7 @@ def test_an_endpoint_listens_for_this_computer_unless_it_says_otherwise(text: st
 
 
 def test_an_endpoint_has_no_directory() -> None:
-    with pytest.raises(UsageError, match="no directory"):
+    with pytest.raises(UsageError, match="cannot name a directory"):
         parse_endpoint("udpout:127.0.0.1:14550#/fs")
 
 
