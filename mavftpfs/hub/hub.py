@@ -1,8 +1,8 @@
 """The hub: sockets around the router. Layer: hub.
 
-The hub calls the program that has the port, which closes the port and becomes the first client. The hub ends
-with its last client. But while a vehicle is armed and an endpoint is heard the hub stays, because the link of
-a ground station outlives the mount.
+The hub calls the program that has the port. That program closes the port and becomes the first client. The
+hub ends with its last client, with one exception: while a vehicle is armed and an endpoint is heard, the hub
+stays, because the link of a ground station outlives the mount.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import trio
 
 from mavftpfs.hub.inlet import Inlet
-from mavftpfs.hub.outbox import Line, Outbox, Waiting
+from mavftpfs.hub.outbox import LinePace, Outbox, Waiting
 from mavftpfs.hub.routing import ALL, BEATS, Kind, Router
 from mavftpfs.hub.senders import PORT, Place
 from mavftpfs.link.addresses import NetAddress, readable_address
@@ -43,18 +43,18 @@ from mavftpfs.shared.errors import LinkClosed, MavftpfsError
 log = logging.getLogger("mavftpfs.hub")
 
 QUIET = 0.1
-"""Seconds of silence within a frame after which the rest of a stream's frame is not waited for."""
+"""Seconds of silence within a frame after which the hub stops waiting for the rest of a stream's frame."""
 ACTIVE = 10.0
 """Seconds for which an endpoint that was heard keeps the hub up, while a vehicle is armed."""
 HELLO_PATIENCE = 10.0
-"""Seconds for the other end of a connection to say what it wants."""
+"""Seconds for the other end of a connection to send its request."""
 
 _DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or frames that a router sends back"
 _POLL = 0.003
 _LOOK = 1.0
 _RETRY = 2.0
 _COMPONENTS = 249
-"""Our component ids are 1 to 249: each is a program's own, and none is a router's."""
+"""mavftpfs programs have component ids from 1 to 249, each its own; a router's is above."""
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
 _USB = "/dev/ttyACM"
@@ -64,13 +64,13 @@ _OTHERS = (
 
 
 Sent: TypeAlias = tuple[Place, Frame, NetAddress | None]
-"""A frame, the place that it came from, and the address of the port that a client sends it to."""
+"""A frame, the place where it arrived, and the port's address that a client sends it to."""
 
 
 @dataclass(slots=True)
 class _Client:
-    """A program that shares the port. number: the link id of its signatures. forward: the endpoints that it
-    asked for. Its link loses what its socket has no room for, as a port of its own would."""
+    """A program that shares the port. number: the link id of its signatures. forward: the endpoints that the
+    program asked for. The client's link drops what its socket has no room for, as a port of its own would."""
 
     side: int
     link: HubLink
@@ -82,8 +82,8 @@ class _Client:
 
 @dataclass(slots=True)
 class _Endpoint:
-    """The side of a ground station, or of another program that `forward=` names. link: None while it cannot
-    be opened."""
+    """The side of a ground station, or of another program that `forward=` names. link: None while the
+    endpoint is closed."""
 
     side: int
     text: str
@@ -94,10 +94,10 @@ class _Endpoint:
 
 
 async def run_hub(spec: LinkSpec) -> None:
-    """Take a port over from the program that has it, and serve until the hub is not needed any more.
+    """Take a port over from the program that has it, and serve until nobody needs the hub.
 
     Raises:
-        LinkClosed: the port cannot be opened. The program that had it is told, too.
+        LinkClosed: the port cannot be opened. The hub reports this to the program that had it, too.
     """
     name = port_name(spec)
     first = call(name, spec)
@@ -106,13 +106,13 @@ async def run_hub(spec: LinkSpec) -> None:
     with first:
         set_buffers(first)
         tell(first, {"protocol": PROTOCOL, "hub": os.getpid()})
-        hello = await hear(first, HELLO_PATIENCE)  # with it, port and name are free
+        hello = await hear(first, HELLO_PATIENCE)  # by then port and name are free
         listening = take_name(name) if hello else None
         if not hello or listening is None:
             return
         with listening:
             try:
-                # Patient: a device or a peer may be away just now.
+                # Patient, because a device or a peer may be away for a moment.
                 async with open_link(spec, patient=True, source_port=source_port(spec)) as port:
                     await Hub(spec, port).run(listening, first, hello)
             except LinkClosed as exc:
@@ -121,7 +121,7 @@ async def run_hub(spec: LinkSpec) -> None:
 
 
 class Hub:
-    """Owns the port that a SOURCE names."""
+    """The owner of the port that a SOURCE names."""
 
     def __init__(self, spec: LinkSpec, port: Link) -> None:
         self.spec = spec
@@ -134,16 +134,16 @@ class Hub:
         self._ended = trio.Event()
         self._work = trio.lowlevel.ParkingLot()
         serial = spec.kind is LinkKind.SERIAL
-        # The baud rate of a USB port means nothing; its symbolic links are under /dev/serial.
+        # The baud rate of a USB port has no effect; its symbolic links are under /dev/serial.
         is_line = serial and not os.path.realpath(spec.device).startswith(_USB)
-        self._line = Line(spec.baud if is_line else None)
+        self._line = LinePace(spec.baud if is_line else None)
         self._outbox = Outbox(max(_LEAST_OUTBOX, spec.baud // 10) if serial else _OUTBOX)
         self._said_doubles: set[Address] = set()
         self.router.add(PORT, Kind.PORT, fixed=spec.kind is not LinkKind.UDP_IN)
 
     async def run(self, name: socket.socket, first: socket.socket, hello: Facts) -> None:
-        """Serve until the hub is not needed any more. name: where programs call; first: the connection of the
-        first client, which said hello."""
+        """Serve until nobody needs the hub. name: where programs call; first: the first client's connection;
+        hello: its request."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self._answer, first, hello, nursery)
             nursery.start_soon(self._accept, name, nursery)
@@ -160,7 +160,7 @@ class Hub:
             nursery.start_soon(self._receive, await next_caller(name), nursery)
 
     async def _receive(self, sock: socket.socket, nursery: trio.Nursery) -> None:
-        """Serve one connection: of a client, or of a program that asks for the status or the end."""
+        """Serve a connection: of a client, or of a program that asks for the status or the hub's end."""
         with sock:
             set_buffers(sock)
             await self._answer(sock, await hear(sock, HELLO_PATIENCE) or {}, nursery)
@@ -178,9 +178,9 @@ class Hub:
                 self._ended.set()
 
     async def _join(self, sock: socket.socket, hello: Facts, nursery: trio.Nursery) -> _Client | None:
-        """Let a program in, or tell it why not."""
+        """Accept a program, or send it the reason why not."""
         try:
-            async with self._one_by_one:  # an endpoint that two want is opened once, or each is told
+            async with self._one_by_one:  # opens an endpoint once, even if two programs want it
                 client = self._admitted(sock, hello)
                 try:
                     await self._open_endpoints(client.forward, nursery, patient=bool(hello.get("again")))
@@ -196,10 +196,10 @@ class Hub:
         return client
 
     def _admitted(self, sock: socket.socket, hello: Facts) -> _Client:
-        """Return a new client, which counts from now on.
+        """Return a new client, already counted.
 
         Raises:
-            MavftpfsError: it is of another version, wants another port, or one too many.
+            MavftpfsError: the client has another version, wants another port, or is one too many.
             KeyError, TypeError, ValueError: its request makes no sense.
         """
         if hello.get("protocol") != PROTOCOL:
@@ -221,8 +221,8 @@ class Hub:
         return client
 
     def _granted(self, wanted: Address, number: int | None) -> tuple[Address, int]:
-        """Return the address that a client gets, and the link id of its signatures: those that it asks for,
-        unless another program has them.
+        """Return a client's address and the link id of its signatures: those that it asks for, unless another
+        program has them.
 
         Raises:
             LinkClosed: all addresses are in use.
@@ -232,7 +232,7 @@ class Hub:
         choice = [wanted, *(Address(wanted.system, turn % _COMPONENTS + 1) for turn in turns)]
         own = next((one for one in choice if one not in owns and one not in self.router.senders), None)
         if own is None:
-            raise LinkClosed(f"{len(owns)} programs share this port already, and no more can")
+            raise LinkClosed(f"{len(owns)} programs share this port, which is the limit; end one of them")
         numbers = {client.number for client in self._clients.values()}
         if number is None or number in numbers:
             number = min(set(range(len(numbers) + 1)) - numbers)
@@ -244,7 +244,7 @@ class Hub:
         self._end_if_done()
 
     async def _serve(self, client: _Client) -> None:
-        """Pass on what comes from a client until it leaves."""
+        """Pass on a client's frames until it leaves."""
         try:
             with suppress(LinkClosed):
                 await self._read(client.side, client.link)
@@ -276,7 +276,7 @@ class Hub:
         patient: bool,
         task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED,
     ) -> None:
-        """Open an endpoint, and pass on what comes from it. patient: if it cannot be opened, try again."""
+        """Open an endpoint, and pass on its frames. patient: retry if it cannot be opened."""
         may_come_later = endpoint.spec.kind is LinkKind.TCP_OUT
         try:
             with endpoint.scope:
@@ -294,7 +294,7 @@ class Hub:
                         endpoint.problem = str(exc)
                     await trio.sleep(_RETRY)
         finally:
-            self.router.remove(endpoint.side)  # only now: until it ended the task may pass on a last frame
+            self.router.remove(endpoint.side)  # only now: until its end the task may pass on a frame
 
     def _drop_endpoint(self, endpoint: _Endpoint) -> None:
         del self._endpoints[endpoint.text]
@@ -303,7 +303,7 @@ class Hub:
     # -- frames
 
     async def _read(self, side: int, link: Link) -> None:
-        """Pass on what comes from one side.
+        """Pass on one side's frames.
 
         Raises:
             LinkClosed: the other end is gone.
@@ -331,7 +331,7 @@ class Hub:
             client.link.send(())
 
     def _pass_on(self, frames: Sequence[Sent]) -> None:
-        """Route frames that came together, and send each destination its share at once."""
+        """Route frames that arrived together, and send each destination its share at once."""
         now = trio.current_time()
         shares: dict[tuple[Place, NetAddress | None], list[bytes]] = {}
         route, push, waiting = self.router.route, self._outbox.push, False
@@ -359,7 +359,7 @@ class Hub:
     # -- out over the port
 
     def _flush(self, now: float) -> None:
-        """Hand the kernel what it takes now."""
+        """Hand the kernel all frames that it accepts now."""
         outbox, port, line = self._outbox, self._port, self._line
         batch: list[bytes] = []
         address: NetAddress | None = None
@@ -377,7 +377,7 @@ class Hub:
             self._work.unpark_all()
 
     async def _write(self) -> None:
-        """Send what had to wait for the line."""
+        """Send the frames that wait for the line."""
         while True:
             if not self._outbox:
                 await self._work.park()
@@ -387,7 +387,7 @@ class Hub:
     # -- the end
 
     async def _watch(self) -> None:
-        """Check each second whether the hub is still needed, and warn of second vehicles."""
+        """Check each second whether somebody needs the hub, and warn of second vehicles."""
         while True:
             await trio.sleep(_LOOK)
             self._end_if_done()
@@ -414,7 +414,7 @@ class Hub:
         return any(self.router.armed.values()) and any(map(self._is_active, self._endpoints.values()))
 
     def status(self) -> dict[str, Any]:
-        """Return facts, JSON-able."""
+        """Return the hub's facts, JSON-able."""
         now = trio.current_time()
         endpoints = []
         for endpoint in self._endpoints.values():

@@ -1,4 +1,4 @@
-"""The frames in what a side brings, each with its place. Layer: hub; pure."""
+"""The frames in the bytes of a side, each with its place. Layer: hub; pure."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _MOST_SPLITTERS = 64
 
 
 class Inlet:
-    """Finds the frames of one side. stream: it brings a stream, else datagrams, of which each address has its
-    own."""
+    """Finds the frames of one side. stream: the side is a stream; otherwise it receives datagrams, and each
+    address has frames of its own."""
 
     def __init__(self, side: int, *, stream: bool) -> None:
         self._side = side
@@ -20,21 +20,21 @@ class Inlet:
 
     @property
     def waiting(self) -> bool:
-        """Whether a stream ended in what may be the beginning of a frame."""
+        """Whether a stream ended in a possible beginning of a frame."""
         return self._stream is not None and self._stream.waiting
 
     def feed(self, piece: bytes, address: NetAddress | None) -> list[tuple[Place, Frame]]:
-        """Take a piece that came from an address."""
+        """Take a piece that arrived from an address; return the frames that it completes."""
         place = Place(self._side, address)
         return [(place, frame) for frame in self._splitter(address).feed(piece)]
 
     def on_silence(self, address: NetAddress | None) -> list[tuple[Place, Frame]]:
-        """The stream fell silent within a frame. Return what is found in the rest."""
+        """Note that the stream fell silent within a frame. Return the frames that the rest holds."""
         place = Place(self._side, address)
         return [(place, frame) for frame in self._splitter(address).on_silence()]
 
     def reset(self) -> None:
-        """Forget half frames: the link was reopened."""
+        """Drop half frames, because the link was reopened."""
         self._splitters.clear()
         if self._stream is not None:
             self._stream.reset()

@@ -12,7 +12,7 @@ from mavftpfs.link.uri import LinkSpec, parse_source
 
 
 def serve(source: str) -> None:
-    """Be the hub of a port until it is not needed any more, or a signal ends it.
+    """Be the hub of a port until nobody needs it, or a signal ends it.
 
     Raises:
         LinkClosed: the port cannot be used.

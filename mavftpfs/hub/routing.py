@@ -1,14 +1,14 @@
-"""Where each frame goes. Layer: hub; pure.
+"""The destinations of each frame. Layer: hub; pure.
 
 Frames come from *sides* and go to sides: the port that SOURCE names, endpoints, and clients, which are
 mavftpfs programs. Only a frame that `senders` believes goes anywhere.
 
-- A frame with a target goes where the target is. A frame for all, or for a target that was never heard, goes
-  to all places of the port and of the endpoints. No frame goes to a side where its sender is.
-- A client's frames go to the address that it names, if somebody was heard there. Else they go by the same
-  rule, but to the port alone.
-- The vehicle of a client is the target that its frames named last. A client gets all of its vehicle, FTP with
-  its vehicle, and the heartbeats of others. `_concerns` says it.
+- A frame with a target goes to the target. A frame for all, or for a target that was never heard, goes to all
+  places of the port and of the endpoints. No frame goes to a side where its sender is.
+- A client's frames go to the address that it names, if a sender was heard there. Otherwise they follow the
+  same rule, but go to the port alone.
+- A client's vehicle is the target that its frames named last. A client receives all frames of its vehicle,
+  FTP with its vehicle, and the heartbeats of other vehicles. `_concerns` decides.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mavftpfs.link.frames import EVERYBODY, HEARTBEAT_ID, Frame, armed_by
 from mavftpfs.link.messages import Address
 
 ALL = 0
-"""The focus of a client that named no vehicle yet."""
+"""The focus of a client that has not named a vehicle."""
 BEATS = -1
 """The focus of a client that wants only heartbeats."""
 
@@ -41,7 +41,7 @@ class Kind(Enum):
 
 @dataclass(slots=True)
 class _Side:
-    """fixed: all frames go there to one address. focus: the system that concerns a client."""
+    """fixed: every frame for this side goes to one address. focus: the system that concerns a client."""
 
     kind: Kind
     fixed: bool
@@ -49,10 +49,10 @@ class _Side:
 
 
 class Router:
-    """Knows the sides, and where a frame goes.
+    """Knows the sides, and the destinations of a frame.
 
     Attributes:
-        senders: what was heard where.
+        senders: the senders that were heard, with their places.
         armed: system -> whether its autopilot's last heartbeat said that it is armed.
     """
 
@@ -65,12 +65,12 @@ class Router:
     # -- sides
 
     def add(self, side: int, kind: Kind, *, fixed: bool = True, focus: int = ALL) -> None:
-        """Add a side. fixed: its frames have one way out, whatever the address. focus: ALL, or BEATS."""
+        """Add a side. fixed: its frames have one way out, for every address. focus: ALL, or BEATS."""
         self._sides[side] = _Side(kind, fixed, focus)
         self._plans.clear()
 
     def remove(self, side: int) -> None:
-        """Forget a side, if it is known, and what was heard there."""
+        """Forget a side and its senders; harmless if the side is unknown."""
         self._sides.pop(side, None)
         self.senders.remove(side)
         self._plans.clear()
@@ -80,8 +80,8 @@ class Router:
     def route(
         self, frame: Frame, place: Place, now: float, to: NetAddress | None = None
     ) -> tuple[Place, ...]:
-        """Return where a frame goes that came from a place; nowhere if it is not believed. to: the address of
-        the port that a client named."""
+        """Return the destinations of a frame that arrived at a place; none if the frame is refused. to: the
+        address of the port that a client named."""
         belief = self.senders.judge(frame.source, place, now, proven=frame.crc_fits)
         if belief is Belief.REFUSED:
             return ()
@@ -90,7 +90,7 @@ class Router:
             return tuple(self._to_clients(frame, place))
         if belief is Belief.NEW:
             self._plans.clear()
-        if frame.id == HEARTBEAT_ID:  # where it goes depends on what it says
+        if frame.id == HEARTBEAT_ID:  # noted first, because its destinations depend on its content
             self._note_armed(frame, place)
             return (*self._out(frame, place, to), *self._to_clients(frame, place))
         self._note_focus(frame, place)
@@ -114,7 +114,7 @@ class Router:
             self.armed[frame.source.system] = armed
 
     def _out(self, frame: Frame, place: Place, to: NetAddress | None) -> list[Place]:
-        """Return the places on the port and at endpoints that a frame goes to."""
+        """Return the frame's destinations on the port and at endpoints."""
         origin = self._sides[place.side]
         if to is not None and Place(PORT, to) in self.senders.places_at(PORT):
             return [self._way_to(Place(PORT, to))]
@@ -148,13 +148,13 @@ class Router:
 
 
 def _is_for_all_clients(beat: Frame, origin: Kind) -> bool:
-    """Return whether a heartbeat is told to all clients: they hear of vehicles, which are on the port, and of
-    ground stations. Not of each other."""
+    """Return whether every client receives a heartbeat. Clients hear vehicles, which are on the port, and
+    ground stations, but not one another."""
     return origin is Kind.PORT or (origin is Kind.ENDPOINT and armed_by(beat) is None)
 
 
 def _concerns(focus: int, frame: Frame, origin: Kind) -> bool:
-    """Return whether a frame goes to a client with that focus."""
+    """Return whether a client with that focus receives a frame."""
     if focus == BEATS:
         return False
     of_vehicle = origin is Kind.PORT and focus in (ALL, frame.source.system)

@@ -1,8 +1,8 @@
-"""Where each sender is, and whether a frame of it is believed. Layer: hub; pure.
+"""Where each sender is, and whether the hub believes a frame of it. Layer: hub; pure.
 
 A *place* is a side of the hub, and a network address there. A sender is at one place of the port, or at
-places elsewhere: at endpoints and clients, where two ground stations may have one id. Neither a fake nor a
-frame that comes back through a loop of cables and forwards may move it:
+several places elsewhere: at endpoints and clients, where two ground stations may have one id. Neither a fake
+nor a frame that returns through a loop of cables and forwards may move a sender:
 
 | the sender is | a frame comes from | and it was silent for 5 s | the frame is | then the sender is |
 |---|---|---|---|---|
@@ -14,7 +14,7 @@ frame that comes back through a loop of cables and forwards may move it:
 | on the port | another address of the port | no | SECOND | where it was |
 | on the port or elsewhere | any of these three | yes | NEW | only there |
 
-A frame without a right CRC teaches nothing: it is KNOWN where its sender is, and else REFUSED.
+The hub learns nothing from a frame with a wrong CRC: it is KNOWN where its sender is, and otherwise REFUSED.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ PORT = 0
 """The side that SOURCE names."""
 
 MEMORY = 60.0
-"""Seconds of silence after which a sender is forgotten, once a new one comes on its side."""
+"""Seconds of silence after which a sender is forgotten, once a new sender appears on its side."""
 MOST_SENDERS = 512
-"""Of one side. If more are heard within 5 s, because a program makes them up, only the first ones count."""
+"""The most senders of one side. If a program makes up more within 5 s, only the first ones count."""
 _SWEEP = 1.0
 
 
 class Place(NamedTuple):
-    """A side, and an address there; None where the side has only one, or chooses it itself."""
+    """A side, and an address there; None where the side has only one address, or chooses it itself."""
 
     side: int
     address: NetAddress | None
 
 
 class Belief(Enum):
-    """Verdict on a frame, by its sender and the place that it comes from."""
+    """Verdict on a frame, by its sender and its place."""
 
     KNOWN = "believed"
     NEW = "believed, and its sender is at a new place"
     SECOND = "of a second vehicle on the port with the same id, or of a fake"
-    REFUSED = "not believed: it comes back, or is a fake"
+    REFUSED = "not believed: it returns through a loop, or is a fake"
 
 
 class Senders:
-    """The senders that were heard lately, with their places."""
+    """The recently heard senders, with their places."""
 
     def __init__(self) -> None:
         self._heard: dict[Address, dict[Place, float]] = {}
@@ -66,7 +66,7 @@ class Senders:
         return sender in self._heard
 
     def judge(self, sender: Address, place: Place, now: float, *, proven: bool) -> Belief:
-        """Return what a frame is, and note where its sender is. proven: its CRC is right."""
+        """Return the verdict on a frame, and note its sender's place. proven: its CRC is right."""
         known = self._heard.get(sender, {})
         if place in known:
             if proven:
@@ -81,7 +81,7 @@ class Senders:
                     return Belief.REFUSED
                 self._seconds.setdefault(sender, (place.address or (), now))
                 return Belief.SECOND
-            for heard in list(known):  # it moved
+            for heard in list(known):  # the sender moved
                 self._forget(sender, heard)
         if not self._has_room(place.side, now):
             return Belief.REFUSED
@@ -90,8 +90,8 @@ class Senders:
         return Belief.NEW
 
     def doubles(self) -> dict[Address, NetAddress]:
-        """Return the senders of the port that were also heard at a second address, and where. It did not just
-        move there: it was heard at the first one afterwards."""
+        """Return the senders of the port that were also heard at a second address, and that address. A sender
+        that moved is not among them: a double was heard at the first address again."""
         return {
             sender: address
             for sender, (address, since) in self._seconds.items()
@@ -99,7 +99,8 @@ class Senders:
         }
 
     def places_of(self, target: Address) -> list[Place]:
-        """Return where a component was heard, or else its system; none for a target that means everybody."""
+        """Return the places of a component, or otherwise of its system; none for a target that means
+        everybody."""
         if target in self._heard:
             return list(self._heard[target])
         if not target.system:
@@ -112,30 +113,30 @@ class Senders:
         ]
 
     def places_at(self, side: int) -> list[Place]:
-        """Return the places of a side where senders are."""
+        """Return the places of a side that have senders."""
         return list(dict.fromkeys(place for _, place, _ in self._at(side)))
 
     def heard_at(self, side: int) -> float | None:
-        """Return when something was heard from a side last."""
+        """Return the time when a side was last heard."""
         return max((at for _, _, at in self._at(side)), default=None)
 
     def remove(self, side: int) -> None:
-        """Forget what was heard from a side."""
+        """Forget the senders of a side."""
         for sender, place, _ in list(self._at(side)):
             self._forget(sender, place)
         del self._counts[side]
         self._swept.pop(side, None)
 
     def _at(self, side: int) -> Iterator[tuple[Address, Place, float]]:
-        """Yield each sender of a side, its place there, and when it was heard last."""
+        """Yield each sender of a side, its place there, and when it was last heard."""
         for sender, places in self._heard.items():
             for place, at in places.items():
                 if place.side == side:
                     yield sender, place, at
 
     def _has_room(self, side: int, now: float) -> bool:
-        """Return whether one more sender of a side may be noted. Forget those that fell silent, but look for
-        them once a second at most: a program may make up thousands."""
+        """Return whether one more sender of a side may be noted. Forget silent senders, but search for them
+        at most once a second, because a program may make up thousands."""
         if now - self._swept.get(side, float("-inf")) >= _SWEEP:
             self._swept[side] = now
             patience = MEMORY if self._counts[side] < MOST_SENDERS else PATIENCE

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fastcrc import crc16
 
-from mavftpfs.hub.outbox import LINE_TIME, Line, Outbox, Waiting
+from mavftpfs.hub.outbox import LINE_TIME, LinePace, Outbox, Waiting
 from mavftpfs.hub.routing import BEATS, Kind, Router
 from mavftpfs.hub.senders import MEMORY, MOST_SENDERS, PORT, Place
 from mavftpfs.link.addresses import PATIENCE, NetAddress
@@ -278,11 +278,11 @@ def test_a_side_that_floods_loses_its_own_frames() -> None:
 
 
 def test_a_serial_line_is_given_50_ms_ahead() -> None:
-    line = Line(57600)
+    line = LinePace(57600)
     now, given = 10.0, 0
     while line.ready_at() <= now:
         line.sent(266, now)
         given += 266
     assert LINE_TIME * 5760 <= given <= LINE_TIME * 5760 + 266
     assert line.ready_at() == pytest.approx(now + given / 5760 - LINE_TIME)
-    assert Line(None).ready_at() <= 0
+    assert LinePace(None).ready_at() <= 0
