@@ -100,8 +100,8 @@ async def connect(status: Status, mountpoint: str) -> Connection:
     gone = f"the mount on {mountpoint} is gone"
     try:
         stream = await trio.open_unix_socket(status["socket"])
-    except OSError as exc:
-        raise LinkClosed(gone) from exc
+    except OSError:
+        raise LinkClosed(gone) from None  # its number is of the socket, and would pass for one of a file
     try:
         request = {"command": "files", "version": wire.VERSION}
         await stream.send_all(json.dumps(request).encode() + b"\n")

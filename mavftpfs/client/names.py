@@ -304,7 +304,7 @@ async def move(files: Files, old: bytes, new: bytes) -> None:
     Raises:
         InvalidMove: the root. Else as Files.rename and copy.
     """
-    if old == ROOT:  # the kernel calls a mountpoint another device
+    if old == ROOT:  # else it would be copied into itself where the server cannot rename
         raise InvalidMove("the root itself cannot be moved")
     try:
         await files.rename(old, new)

@@ -220,7 +220,6 @@ async def test_mv_copies_where_the_server_cannot_rename() -> None:
 @pytest.mark.holds("promise 3")
 @pytest.mark.parametrize("renames", [True, False])
 async def test_the_root_is_not_moved_into_a_part_of_itself(renames: bool) -> None:
-    """The kernel says of a mountpoint what it says where a server cannot rename."""
     tree = Card({b"/d/a": b"1", b"/e/b": b"2"})
     tree.renames = renames
     with pytest.raises(InvalidMove, match="root"):
