@@ -14,7 +14,7 @@ __all__ = ["Drone", "Entry", "NotDelivered", "UsageError", "__version__", "conne
 
 
 def __getattr__(name: str) -> object:
-    """Load the library when it is used first: the program `mavftpfs` is to start quickly."""
+    """Load the library when it is used first, because the program `mavftpfs` must start quickly."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from mavftpfs.api import drone

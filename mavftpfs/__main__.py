@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> int:
-    """Run a command; returns the exit code. Ctrl-C ends it without a traceback, also while modules load."""
+    """Run a command; return the exit code. Ctrl-C ends it without a traceback, even while modules load."""
     try:
         from mavftpfs.cli import main as command_line
 

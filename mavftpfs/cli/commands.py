@@ -1,4 +1,4 @@
-"""The commands that make, ask and end mounts: mount, umount, status; `cli` parses the words. Layer: cli."""
+"""The commands that start, query and end mounts; `cli` parses their words. Layer: cli."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from mavftpfs.shared.private import own_directories
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
-"""Seconds for `umount`: held bytes have to be sent first, perhaps over a radio."""
+"""Seconds for `umount`: mavftpfs has to upload pending changes first, perhaps over a radio."""
 END_PATIENCE = 5.0
-"""Seconds for a mount's process to end after its last word."""
+"""Seconds for a mount's process to end after its last reply."""
 SAY_AGAIN = 10.0
-"""Seconds between two lines about a delivery, where these go to a file."""
+"""Seconds between two lines about uploads, if the lines go to a file."""
 
 
 # -- mount ----------------------------------------------------------------------------------------
 
 
 def mount(args: argparse.Namespace) -> int:
-    """Mount; in the background unless told otherwise."""
+    """Mount a vehicle; in the background unless the user asks for the foreground."""
     place = canonical(args.mountpoint)
     options, spec = connection_of(args)
     options = absolute_paths(options)
@@ -47,7 +47,7 @@ def mount(args: argparse.Namespace) -> int:
     try:
         mountpoint.check_mountpoint(place)
     except DeadMount as exc:
-        if not args.member:  # else the mount takes the dead one away when it is ready itself
+        if not args.member:  # a member's mount removes the dead one when it is ready itself
             raise DeadMount(_with_what_is_left(str(exc))) from exc
     inside = mountpoint.enclosing_mount(os.path.dirname(place))
     if inside is not None:
@@ -57,7 +57,7 @@ def mount(args: argparse.Namespace) -> int:
         return work(_report_failure)
     if args.foreground or args.debug:
         return work(_report_in_foreground)
-    for line in options.gone:  # in the background only the log would have it
+    for line in options.gone:  # printed, because in the background only the log would show them
         say(line)
     return daemon.in_background(work)
 
@@ -76,7 +76,7 @@ def connection_of(args: argparse.Namespace) -> tuple[Options, LinkSpec]:
 
 
 def absolute_paths(options: Options) -> Options:
-    """Return the options with local paths absolute: the background process works in `/`."""
+    """Return the options with absolute local paths, because the background process works in `/`."""
     found = {name: getattr(options, name) for name in TABLE.local_files}
     return replace(options, **{name: os.path.abspath(path) for name, path in found.items() if path})
 
@@ -89,7 +89,7 @@ def _serve(
     try:
         from mavftpfs.mount.life import MountRequest
         from mavftpfs.mount.single import run_mount
-    except ImportError as exc:  # libfuse3 went away, or another version of it came, since pyfuse3 was built
+    except ImportError as exc:  # libfuse3 was removed or replaced since pyfuse3 was built
         raise MountFailed(f"{exc}; install libfuse3 and mavftpfs anew (pipx reinstall mavftpfs)") from exc
 
     foreground = args.foreground or args.debug
@@ -102,12 +102,12 @@ def _serve(
             places.check(place)
             return run_all(request, _member_command(args, place), report)
         if not args.member and os.listdir(place):
-            say(f"{place} is not empty: what is in it is hidden until it is unmounted")
+            say(f"{place} is not empty: its files are hidden until the vehicle is unmounted")
         return run_mount(request, report)
 
 
 def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], list[str]]:
-    """Return a function that returns the command for mounting one vehicle of several.
+    """Return a function that returns the command for mounting one of several vehicles.
 
     The hub has the endpoints already. Each vehicle's mount writes a raw log of its own.
     """
@@ -115,7 +115,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
     for word in split_words(args.options):
         option, equals, value = word.partition("=")
         if equals and option in TABLE.local_files:
-            word = f"{option}={os.path.abspath(value)}"  # now: a process in the background works in `/`
+            word = f"{option}={os.path.abspath(value)}"  # now, because a background process works in `/`
         if option not in ("all", "forward"):
             escaped = word.replace("\\", "\\\\").replace(",", "\\,")
             own.append((f"-o{escaped}", option == "tlog"))
@@ -131,7 +131,7 @@ def _member_command(args: argparse.Namespace, place: str) -> Callable[[Member], 
 
 
 def say(line: str) -> None:
-    """Say a line to the person at the terminal."""
+    """Print a line for the person at the terminal."""
     print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
@@ -142,7 +142,7 @@ def _report_failure(code: int, message: str) -> None:
 
 def _report_in_foreground(code: int, message: str) -> None:
     if code == 0:
-        logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")  # a message is in the log, too
+        logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")  # the log has the line, too
     _report_failure(code, message)
 
 
@@ -171,7 +171,8 @@ def _control_path(place: str) -> Path | None:
 
 
 def umount(args: argparse.Namespace) -> int:
-    """Make a mount's process deliver and unmount. A mount whose process is gone is only removed."""
+    """Make a mount's process upload pending changes and unmount. If the process is gone, remove the dead
+    mount."""
     return _umount(canonical(args.mountpoint), lazy=args.lazy)
 
 
@@ -188,7 +189,7 @@ def _umount(place: str, *, lazy: bool) -> int:
             raise MountFailed(_with_what_is_left(f"no vehicle is mounted on {place}")) from exc
         return _umount_all(place, vehicles, lazy=lazy) if vehicles else _umount_unasked(place, lazy=lazy)
     except KeyboardInterrupt:
-        say("the mount goes on delivering, and then ends; see: mavftpfs status")
+        say("the mount keeps uploading pending changes, and then ends; see: mavftpfs status")
         return ExitCode.INTERRUPTED
     _wait_for_end(int(reply["pid"]))
     if reply.get("message"):
@@ -204,12 +205,12 @@ def _umount_all(place: str, vehicles: list[str], *, lazy: bool) -> int:
 
 
 def _umount_unasked(place: str, *, lazy: bool) -> int:
-    """Unmount where the mount's process was killed, or has no socket because no directory can hold it."""
+    """Unmount where the mount's process was killed, or has no socket because no directory can contain one."""
     alive = not mountpoint.is_dead(place)
     mountpoint.unmount(place, lazy=lazy)
     if not alive:
         return _after_a_killed_mount()
-    say("the mount cannot be asked: it delivers by itself what is held, and its log says what becomes of it")
+    say("the mount cannot be asked; it uploads pending changes by itself, and its log says how that ends")
     return ExitCode.UNDELIVERED
 
 
@@ -222,15 +223,15 @@ class _Delivery:
         self._explained = False
 
     def look(self) -> None:
-        """Ask the mount what it delivers, and show it; called about each second."""
+        """Ask the mount about its uploads, and show the answer; called about each second."""
         try:
             status = control.ask(self._socket, {"command": "status"}, timeout=PATIENCE)["status"]
         except control.NobodyThere:
-            return  # it ends just now
+            return  # the mount is just ending
         except control.ControlError as exc:
             self._show(f"{exc}; if it is stopped, `fg` continues it; fusermount3 -uz unmounts without it")
             return
-        # A mount that is still in use has held bytes, too, but does not end.
+        # A mount that is still in use has pending changes, too, but does not end.
         line = report.delivery_line(status) if status["state"] == "unmounting" else ""
         if line and not self._explained:
             self._explain(status["pid"])
@@ -246,11 +247,11 @@ class _Delivery:
             f"uploading pending changes for up to {readable_time(DRAIN_LIMIT)}; files not uploaded by then "
             f"are saved in {recovered_directory()}"
         )
-        say(f"Ctrl-C ends only the waiting; to keep the rest now: kill {pid}")
+        say(f"Ctrl-C only stops this command; to save the remaining files here now: kill {pid}")
 
 
 def _after_a_killed_mount() -> int:
-    """Say that what a killed mount held is not delivered."""
+    """Print a line if a killed mount left files that did not reach the vehicle."""
     line = left_by_killed_mounts_line()
     if not line:
         return ExitCode.OK
@@ -259,12 +260,12 @@ def _after_a_killed_mount() -> int:
 
 
 def _with_what_is_left(line: str) -> str:
-    """Return a line, and behind it what killed mounts held."""
+    """Return a line, followed by the files that killed mounts left."""
     return "; ".join(filter(None, (line, left_by_killed_mounts_line())))
 
 
 def left_by_killed_mounts_line() -> str:
-    """Return a line about what killed mounts held, or ""."""
+    """Return a line about the files that killed mounts left, or ""."""
     from mavftpfs.client.undelivered import left_by_killed_mounts
 
     left = left_by_killed_mounts()
@@ -284,7 +285,7 @@ def _wait_for_end(pid: int) -> None:
     except ProcessLookupError:
         return
     try:
-        # Readable when it ended, even before it was reaped.
+        # Readable once the process has ended, even before it is reaped.
         select.select([process], [], [], END_PATIENCE)
     finally:
         os.close(process)
@@ -294,7 +295,7 @@ def _wait_for_end(pid: int) -> None:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Show what one mount, or all mounts that this user may ask, are doing."""
+    """Show the state of one mount, or of all mounts that this user may ask."""
     if args.mountpoint is None:
         fetch = all_statuses
     else:

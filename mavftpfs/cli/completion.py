@@ -19,7 +19,7 @@ _PLACES = {
     **dict.fromkeys(("mountpoint", "local", "to", "directory"), shtab.DIRECTORY),
     "options": _LIST,
 }
-"""How arguments are completed by name, if they are not paths on the vehicle."""
+"""Kinds of completion for arguments that are not paths on the vehicle, by name."""
 
 _OPTIONS = {
     "bash": """_mavftpfs_options() { compgen -P "${1%%"${1##*,}"}" -W '@WORDS@' -- "${1##*,}"; }""",
@@ -39,8 +39,8 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
     function = _OPTIONS[shell].replace("@WORDS@", " ".join(_words()))
     function = function.replace("@DESCRIBED@", " ".join(map(shlex.quote, _described())))
     script: str = shtab.complete(parser, shell, preamble=function)
-    # Where shtab has nothing to offer there are files: `SOURCE MOUNTPOINT` needs no command, and bash cuts
-    # a SOURCE at its colons, so that shtab loses count.
+    # Where shtab has no answer, files are offered: `SOURCE MOUNTPOINT` needs no command, and bash cuts a
+    # SOURCE at its colons, so that shtab loses count.
     match shell:
         case "bash":
             return f"{script}\ncomplete -o bashdefault -o default -F _shtab_mavftpfs mavftpfs\n"
@@ -59,7 +59,7 @@ def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.Argume
 
 
 def _words() -> Iterator[str]:
-    """Yield the words that may stand in the list behind `-o`, with their values if these are few words."""
+    """Yield the words of the list behind `-o`, with their values if those are few words."""
     yield from TABLE.words
     for name, row in TABLE.values.items():
         values = row.type.words if row.type is not None else ()
@@ -67,7 +67,7 @@ def _words() -> Iterator[str]:
 
 
 def _described() -> Iterator[str]:
-    """Yield the options for zsh's _values, which may name what follows an option."""
+    """Yield the options for zsh's _values, with the kind of value that follows each."""
     helps = {name: text for names, text in option_help().items() for name in names.split(", ")}
     for name in TABLE.words:
         yield f"{name}[{_plain(helps[name])}]"

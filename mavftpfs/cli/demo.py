@@ -1,9 +1,9 @@
 """`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: cli.
 
-It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, sed,
-diff, `mavftpfs status`), each as its own process, in one temporary directory, and leaves nothing behind: no
-process, no mount, no file, also after Ctrl-C or an error. Exit code 0 only if every byte that arrived is the
-one on the vehicle's card.
+The tour runs the same commands as a user (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, sed,
+diff, `mavftpfs status`), each as its own process, in one temporary directory. Even after Ctrl-C or an error,
+no process, mount or file is left behind. The exit code is 0 only if every byte that arrived equals the one on
+the vehicle's card.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class DemoFailed(Exception):
 
 @dataclass
 class Tour:
-    """State that the steps share. `proofs`: one entry for each comparison that was made."""
+    """State that the steps share. `proofs`: one entry for each comparison."""
 
     console: Console
     folder: Path
@@ -71,12 +71,12 @@ class Tour:
 
     @property
     def card(self) -> Path:
-        """Content of the vehicle's memory card."""
+        """The content of the vehicle's memory card."""
         return self.folder / "card"
 
     @property
     def drone(self) -> Path:
-        """Where the vehicle is mounted."""
+        """The directory where the vehicle is mounted."""
         return self.folder / "drone"
 
     def say(self, text: str) -> None:
@@ -105,7 +105,7 @@ class Tour:
         return text
 
     def verdict(self, same: bool) -> None:
-        """Record a comparison, and say how it went."""
+        """Record a comparison, and print its result."""
         self.proofs.append(same)
         self.console.print("[bold green]Right, byte for byte.[/]" if same else "[bold red]It differs.[/]")
 
@@ -114,13 +114,13 @@ class Tour:
 def running(
     words: Sequence[str], folder: Path, *, output: int | BinaryIO = subprocess.PIPE, apart: bool = False
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command in the temporary directory; it is ended with the body, gently first.
+    """Run a command in the temporary directory, and end it with the body, gently first.
 
-    It is not waited for long: a reader inside a mount ends only when the mount answers, and ending the mount
-    is another step's business. apart: Ctrl-C reaches only the tour, which then ends things in order.
+    The wait for its end is short, because a reader inside a mount ends only when the mount answers, and
+    another step ends the mount. apart: Ctrl-C reaches only the tour, which then ends everything in order.
     """
     child = None
-    state = {"XDG_STATE_HOME": str(folder / "state")}  # what a mount keeps goes with it
+    state = {"XDG_STATE_HOME": str(folder / "state")}  # the files that a mount keeps go with the directory
     try:
         with signals_held():
             child = subprocess.Popen(
@@ -161,7 +161,7 @@ def free_port() -> int:
 
 
 def fill_card(card: Path) -> None:
-    """Write what the vehicle has: two flight logs, a start script, a note."""
+    """Write the vehicle's files: two flight logs, a start script, a note."""
     rng = random.Random(1)
     (card / LOG).parent.mkdir(parents=True)
     (card / SCRIPT).parent.mkdir(parents=True)
@@ -173,7 +173,7 @@ def fill_card(card: Path) -> None:
 
 
 def introduce(tour: Tour) -> None:
-    """Say what this is about."""
+    """Introduce the tour."""
     tour.console.print(
         Panel(
             "A drone keeps its flight logs, scripts and settings on a memory card. Over the air the only way "
@@ -199,7 +199,8 @@ def mount(tour: Tour, stack: ExitStack) -> None:
 
 
 def release(path: Path) -> None:
-    """End a mount that was not unmounted. Undelivered bytes are given up: the drone is only simulated."""
+    """End a mount that was not unmounted, and discard pending changes, because the drone is only
+    simulated."""
     if str(path) not in mounts():
         return
     with suppress(control.ControlError, ProcessLookupError):
@@ -208,7 +209,7 @@ def release(path: Path) -> None:
 
 
 def look_around(tour: Tour) -> None:
-    """ls and cat."""
+    """Run ls and cat."""
     tour.say("It looks like any other directory:")
     tour.command("ls", "-l", f"drone/{Path(LOG).parent}")
     tour.say("Reading a file needs nothing special either:")
@@ -219,7 +220,7 @@ def look_around(tour: Tour) -> None:
 def copy_log(tour: Tour) -> None:
     """Copy a log with a progress bar, then compare checksums."""
     tour.say(
-        "Copying a flight log over the bad radio. Lost packets are asked for again while the rest flows:"
+        "Copying a flight log over the bad radio. Lost packets are requested again while the rest flows:"
     )
     words = ("cp", f"drone/{LOG}", "flight.ulg")
     tour.show_command(*words)
@@ -228,7 +229,7 @@ def copy_log(tour: Tour) -> None:
     with Progress(*columns, console=tour.console) as progress, running(words, tour.folder) as child:
         bar = progress.add_task("", total=LOG_SIZE)
         while child.poll() is None and time.monotonic() < deadline:
-            # Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
+            # The bar does not show the copy's size, which jumps, because cp asks for 256 KiB at a time.
             transfers = status_of(str(tour.drone))["transfers"]
             progress.update(bar, completed=sum(transfer["done"] for transfer in transfers))
             time.sleep(0.1)
@@ -252,19 +253,19 @@ def edit_script(tour: Tour) -> None:
 
 
 def show_status(tour: Tour) -> None:
-    """Have the mount tell how the drone and the radio are."""
+    """Show the mount's report about the drone and the radio."""
     tour.say("How the drone, the radio and all transfers are doing, at any time:")
     tour.command("mavftpfs", "status", "drone")
 
 
 def compare_all(tour: Tour) -> None:
-    """diff the whole mount with the card."""
-    tour.say("And the whole drone compared with what is on its card (silence means: no difference):")
+    """Compare the whole mount with the card, by diff."""
+    tour.say("And the whole drone compared with its card (silence means: no difference):")
     tour.proofs.append(tour.command("diff", "-r", "card", "drone") == "")
 
 
 def conclude(tour: Tour) -> int:
-    """Give the verdict and the way to a real vehicle; return the exit code."""
+    """Print the verdict and the way to a real vehicle; return the exit code."""
     good = len(tour.proofs) == 4 and all(tour.proofs)
     program = "mavftpfs" if shutil.which("mavftpfs") else os.path.relpath(sys.argv[0])
     verdict = (
@@ -286,7 +287,7 @@ def conclude(tour: Tour) -> int:
 
 
 def take_tour(tour: Tour, stack: ExitStack) -> None:
-    """Go through all steps; `stack` ends everything that was started."""
+    """Take all steps; `stack` ends everything that was started."""
     tour.card.mkdir()
     tour.drone.mkdir()
     fill_card(tour.card)
@@ -305,11 +306,11 @@ def take_tour(tour: Tour, stack: ExitStack) -> None:
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Run the demo and return its exit code: 0 only if all comparisons held."""
+    """Run the demo and return its exit code: 0 only if all comparisons agreed."""
     console = Console()
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
-    # The kernel's table and the mount's socket know the place by its real name.
+    # The kernel's table and the mount's socket name the place by its real path.
     tour = Tour(console, Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")).resolve())
     try:
         with ExitStack() as stack:

@@ -20,14 +20,15 @@ if TYPE_CHECKING:
 
 _REFRESH = 5
 _ROOM = 4
-"""Columns that stay free: else the terminal's ^C would begin a line that rich does not know of."""
+"""Columns that stay free, because the terminal's ^C would otherwise begin a line that rich does not
+expect."""
 _BAR = 40
 _LINE = len("999.9 MB of 999.9 MB, 999.9 kB/s, 59 min 59 s left")
-"""Columns of the longest total, for which there is room from the start: the bar keeps its width."""
+"""Columns of the longest total, reserved from the start, so that the bar keeps its width."""
 
 
 def totals(progress: Progress) -> str:
-    """Return the line of the total."""
+    """Return the line with the totals."""
     parts = [f"{progress.files_done}/{progress.files} files"] if progress.files > 1 else []
     parts.append(f"{readable_size(progress.done)} of {readable_size(progress.total)}")
     if progress.lost:
@@ -40,10 +41,10 @@ def totals(progress: Progress) -> str:
 
 
 def current(progress: Progress, width: int) -> str:
-    """Return the line of the file at work, cut to a width: the end of a name tells more than its start."""
+    """Return the line of the current file, cut to a width at its start, because a name's end says more."""
     if not progress.name:
         return ""
-    state = "" if progress.lost else progress.state  # the total says it
+    state = "" if progress.lost else progress.state  # the line with the totals says so
     if not state and progress.files > 1:
         state = f"{readable_size(progress.here)} of {readable_size(progress.size)}"
     name, room = printable(progress.name), width - len(state) - 2
@@ -53,13 +54,13 @@ def current(progress: Progress, width: int) -> str:
 
 
 def bar_width(progress: Progress, width: int) -> int:
-    """Return the columns of the bar on a terminal of that width; the same from the first byte to the last."""
+    """Return the bar's columns on a terminal of that width; they stay the same from first to last byte."""
     counts = len(f"{progress.files}/{progress.files} files, ") if progress.files > 1 else 0
     return max(8, min(_BAR, width - counts - _LINE - 8))
 
 
 def _picture(progress: Progress, idle: str, width: int) -> RenderableType:
-    """Return one total, and the file at work."""
+    """Return the totals and the current file."""
     from rich.console import Group
     from rich.progress_bar import ProgressBar
     from rich.table import Table
@@ -75,10 +76,10 @@ def _picture(progress: Progress, idle: str, width: int) -> RenderableType:
 
 
 @contextmanager
-def shown(progress: Progress, idle: str = "looking at what is there") -> Iterator[Progress]:
-    """Draw progress on stderr during the body, if that is a terminal; nothing of it stays at the end.
+def shown(progress: Progress, idle: str = "looking for files") -> Iterator[Progress]:
+    """Draw progress on stderr during the body, if stderr is a terminal, and erase it at the end.
 
-    idle: what is drawn while nothing is planned.
+    idle: the line while nothing is planned.
     """
     if not sys.stderr.isatty():
         yield progress
@@ -87,7 +88,7 @@ def shown(progress: Progress, idle: str = "looking at what is there") -> Iterato
     from rich.live import Live
 
     console = Console(stderr=True)
-    # What goes to stdout would come out on stderr if rich took it; only on one terminal are they the same.
+    # rich would print stdout's lines on stderr; that is right only if both are the same terminal.
     with Live(
         get_renderable=lambda: _picture(progress, idle, console.width),
         console=console,
@@ -109,8 +110,8 @@ def print_styled(lines: Iterable[tuple[str, str, str, str]]) -> None:
 
 
 def watch(lines: Callable[[], Sequence[str]], period: float) -> NoReturn:
-    """Draw lines on stdout, and anew each `period` seconds, until interrupted; the last picture stays. Lines
-    that are not indented are bold."""
+    """Draw lines on stdout, and redraw them each `period` seconds, until interrupted; the last picture stays.
+    Lines that are not indented are bold."""
     from rich.console import Group
     from rich.live import Live
     from rich.text import Text
@@ -124,7 +125,7 @@ def watch(lines: Callable[[], Sequence[str]], period: float) -> NoReturn:
 
 @contextmanager
 def changing_line(say: Callable[[str], None], pause: float) -> Iterator[Callable[[str], None]]:
-    """Return a function that shows a line on stderr, in place of the last one.
+    """Return a function that shows a line on stderr, in place of its previous line.
 
     If stderr is no terminal, the function calls `say` with the line, at most each `pause` seconds.
     """

@@ -1,8 +1,8 @@
-"""`mavftpfs install`: puts man pages, completions, the systemd unit and the udev rule into place. Layer: cli.
+"""`mavftpfs install`: installs man pages, completions, the systemd unit and the udev rule. Layer: cli.
 
-For one user, or as root for all users. Nothing else is touched: `--print` shows what would be written, and
-`--remove` removes the same files. The man page and the completions are made from the command line's own
-parsers.
+The command installs for one user, or as root for all users, and touches nothing else: `--print` shows the
+files, and `--remove` removes the same ones. The man page and the completions are made from the command line's
+own parsers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 HELPER = "mount.mavftpfs"
 """The program that mount(8) runs for `-t mavftpfs`."""
 MAN_WIDTH = 72
-"""Columns of what a man page shows as it is."""
+"""Columns of preformatted text in a man page."""
 
 
 def man_page(parser: argparse.ArgumentParser) -> str:
@@ -64,18 +64,18 @@ SYSTEMD_RUNS = Path("/run/systemd/system")
 
 
 FOR_ALL = "sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
-"""Makes a copy of the program that is root's, and that all can run."""
+"""Makes a copy of the program that belongs to root, and that all users can run."""
 NOBODY = 65534
 """A user id without any rights of its own."""
 
 MARK = "# Made by mavftpfs install."
-"""In our programs, which tells them from those of others with the same name."""
+"""A line in installed programs, which distinguishes them from other programs of the same name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One file to install. text: its content; link: what it points to, for a symbolic link. program: it is a
-    program, and one that others put there stays."""
+    """One file to install. text: its content; link: the target of a symbolic link. program: the file is a
+    program, and another one's program of that name stays."""
 
     path: Path
     text: str = ""
@@ -89,7 +89,7 @@ class Piece:
         return f"# {self.path}\n{self.text}"
 
     def put(self) -> None:
-        """Write it, in place of an older one."""
+        """Write the file, replacing an older one."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.link is None:
             self.path.write_text(self.text)
@@ -100,11 +100,11 @@ class Piece:
             self.path.symlink_to(self.link)
 
     def is_there(self) -> bool:
-        """Return whether something has its path; a symbolic link that leads nowhere counts."""
+        """Return whether the path exists; a dangling symbolic link counts."""
         return os.path.lexists(self.path)
 
     def is_others(self) -> bool:
-        """Return whether others, such as pipx or a package, put a file at its path."""
+        """Return whether somebody else, such as pipx or a package, put a file at the path."""
         if self.link is not None:
             return self.is_there() and not self.path.is_symlink()
         return self.program and self.is_there() and (self.path.is_symlink() or MARK not in _text(self.path))
@@ -115,10 +115,10 @@ def _text(path: Path) -> str:
 
 
 def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
-    """Install, show or remove, for this user; as root, for everybody.
+    """Install, show or remove the files, for this user; as root, for everybody.
 
     Raises:
-        UsageError: a file cannot be written or removed, or other users than root could change the program
+        UsageError: a file cannot be written or removed, or users other than root could change the program
             that all run, or could not run it.
     """
     program = own_program()
@@ -145,7 +145,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
 
 def own_program() -> Path:
-    """Return this program itself, not a link to it: the link may be one of ours, which is removed again."""
+    """Return this program itself, not a link to it, because `--remove` may delete the link."""
     name = sys.argv[0]
     found = name if os.sep in name else shutil.which(name)
     if found is None or not os.access(found, os.X_OK):
@@ -157,7 +157,7 @@ def check_program(program: Path) -> None:
     """Check that only root can change the program that root and all users run.
 
     Raises:
-        UsageError: another user can, or there is no mount.mavftpfs beside the program.
+        UsageError: another user can, or the program has no mount.mavftpfs beside it.
     """
     if not program.with_name(HELPER).exists():
         raise UsageError(f"there is no {HELPER} beside {program}; run the mavftpfs of an installation")
@@ -176,7 +176,7 @@ def check_others(program: Path) -> None:
     """Check that other users can run the program, by running it as `nobody`.
 
     Raises:
-        UsageError: they cannot; the text says why, if a mode tells.
+        UsageError: they cannot; the text gives the reason, if a mode explains it.
     """
     words = [str(program), "--version"]
     try:
@@ -191,7 +191,7 @@ def check_others(program: Path) -> None:
             timeout=60,
         )
     except OSError as exc:
-        if exc.errno != errno.EACCES:  # nobody is no user of this container
+        if exc.errno != errno.EACCES:  # this container has no user `nobody`
             return
         said = exc.strerror or ""
     else:
@@ -204,7 +204,7 @@ def check_others(program: Path) -> None:
 
 
 def _closed_to_others(program: Path) -> Path | None:
-    """Return the first file or directory that other users need for a program and may not use."""
+    """Return the first file or directory that a program needs and other users may not use."""
     python = _interpreter(program)
     for place in (program, python, Path(os.path.realpath(python)), Path(mavftpfs.__file__)):
         for path in (*reversed(place.parents), place):
@@ -215,7 +215,7 @@ def _closed_to_others(program: Path) -> Path | None:
 
 
 def _interpreter(program: Path) -> Path:
-    """Return what the first line of a script names; our own Python, if there is no such line."""
+    """Return the interpreter in a script's first line; without such a line this program's own Python."""
     with program.open("rb") as file:
         mark, words = file.read(2), file.readline().split()
     return Path(os.fsdecode(words[0])) if mark == b"#!" and words else Path(sys.executable)
@@ -228,7 +228,7 @@ def _mode(path: Path) -> str:
 def for_user(
     parser: argparse.ArgumentParser, program: Path, environment: Mapping[str, str]
 ) -> Iterator[Piece]:
-    """Yield what one user gets."""
+    """Yield the files for one user."""
     home = Path(environment.get("HOME") or os.path.expanduser("~"))
     data = Path(environment.get("XDG_DATA_HOME") or home / ".local/share")
     config = Path(environment.get("XDG_CONFIG_HOME") or home / ".config")
@@ -239,7 +239,7 @@ def for_user(
 
 
 def for_everybody(parser: argparse.ArgumentParser, program: Path) -> Iterator[Piece]:
-    """Yield what root installs."""
+    """Yield the files that root installs."""
     data = Path("/usr/local/share")
     yield Piece(data / "man/man1/mavftpfs.1", man_page(parser))
     yield Piece(data / "man/man8/mount.mavftpfs.8", _data("mount.mavftpfs.8"))
@@ -267,13 +267,13 @@ def _data(name: str) -> str:
 
 
 def _unit(program: Path, name: str) -> str:
-    """Return a unit; systemd reads % as a specifier, and takes quotes around blanks."""
+    """Return a unit's text; systemd reads % as a specifier, and needs quotes around blanks."""
     command = str(program).replace("%", "%%")
     return _data(name).replace("@MAVFTPFS@", f'"{command}"' if " " in command else command)
 
 
 def _tell_systemd(everybody: bool) -> None:
-    """Make systemd and udev read what changed, if they are there."""
+    """Make systemd and udev read the changed files, if these programs are installed."""
     if not SYSTEMD_RUNS.is_dir():
         return
     manager = () if everybody else ("--user",)
@@ -287,11 +287,11 @@ def _tell_systemd(everybody: bool) -> None:
 
 def _hints(everybody: bool) -> Iterator[str]:
     yield "systemctl --user start mavftpfs@ttyACM0 mounts /dev/ttyACM0 on ~/drone-ttyACM0"
-    yield "systemctl --user start mavftpfs-sync@udpin:0.0.0.0:14550 brings logs into ~/drone-logs"
+    yield "systemctl --user start mavftpfs-sync@udpin:0.0.0.0:14550 downloads logs into ~/drone-logs"
     yield "at boot, without a login: `enable` in place of `start`, and sudo loginctl enable-linger $USER"
-    yield "bash completes in new shells, if the package bash-completion is installed"
+    yield "bash completes commands in new shells, if the package bash-completion is installed"
     if everybody:
-        yield "an autopilot that is plugged in is mounted there by itself"
+        yield "udev mounts an autopilot that is plugged in there"
     else:
         yield "zsh looks for completions in $fpath: add ~/.local/share/zsh/site-functions"
         yield "as root: a udev rule that mounts what is plugged in, and mount -t mavftpfs"

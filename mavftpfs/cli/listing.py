@@ -14,7 +14,7 @@ from mavftpfs.shared.readable import printable, readable_size
 _LOGS = (".ulg", ".bin", ".tlog", ".log")
 
 
-class Line(NamedTuple):
+class NameLine(NamedTuple):
     """A line with a name in it, and the name's style on a terminal."""
 
     before: str = ""
@@ -24,8 +24,8 @@ class Line(NamedTuple):
 
 
 def show(listings: Sequence[Listing], *, detailed: bool, units: bool) -> None:
-    """Print entries. On a terminal directories and logs stand out, and control characters in names become
-    `?`. Elsewhere names are printed byte for byte.
+    """Print entries. On a terminal directories and logs are highlighted, and control characters in names
+    become `?`. Elsewhere names are printed byte for byte.
 
     detailed: with size and time; units: sizes as 1.2 MB.
     """
@@ -41,7 +41,7 @@ def show(listings: Sequence[Listing], *, detailed: bool, units: bool) -> None:
     print_styled((line.before, printable(line.name), line.style, line.after) for line in found)
 
 
-def lines(listings: Sequence[Listing], *, detailed: bool, units: bool) -> Iterator[Line]:
+def lines(listings: Sequence[Listing], *, detailed: bool, units: bool) -> Iterator[NameLine]:
     """Yield the lines of several paths as ls prints them: paths of files, then directories with headings."""
     files = [entry for directory, entries in listings if directory is None for entry in entries]
     yield from (_line(entry, entry["path"], detailed, units) for entry in files)
@@ -51,22 +51,22 @@ def lines(listings: Sequence[Listing], *, detailed: bool, units: bool) -> Iterat
             continue
         if len(listings) > 1:
             if apart:
-                yield Line()
-            yield Line(name=directory, after=":")
+                yield NameLine()
+            yield NameLine(name=directory, after=":")
         yield from (_line(entry, entry["name"], detailed, units) for entry in entries)
         apart = True
 
 
-def _line(entry: Entry, called: str, detailed: bool, units: bool) -> Line:
+def _line(entry: Entry, called: str, detailed: bool, units: bool) -> NameLine:
     size = readable_size(entry["size"]) if units else str(entry["size"])
     before = f"{size:>12} {_when(entry['mtime'])} " if detailed else ""
     if entry["kind"] == "directory":
-        return Line(before, called, "/", "bold blue")
-    return Line(before, called, "", "green" if called.lower().endswith(_LOGS) else "")
+        return NameLine(before, called, "/", "bold blue")
+    return NameLine(before, called, "", "green" if called.lower().endswith(_LOGS) else "")
 
 
 def _when(mtime: int) -> str:
-    """Return a time in UTC, or a dash if it is not known."""
+    """Return a time in UTC, or a dash for an unknown one."""
     if known_time(mtime) is None:
         return f"{'-':<16}"
     return datetime.fromtimestamp(mtime, UTC).strftime("%Y-%m-%d %H:%M")

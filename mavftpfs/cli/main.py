@@ -29,10 +29,10 @@ _DESCRIPTION = "Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a
 _FIRST_STEPS = """\
 mavftpfs shows the files of a drone (MAVLink FTP) as a directory:
 
-  mavftpfs scan udpin:0.0.0.0:14550             show what answers on a link
+  mavftpfs scan udpin:0.0.0.0:14550             list vehicles on a link
   mavftpfs /dev/ttyACM0 ~/drone                 mount; ls, cp, rsync, vim work
   mavftpfs status ~/drone                       show vehicle, link, transfers
-  mavftpfs umount ~/drone                       unmount, and upload what is left
+  mavftpfs umount ~/drone                       unmount, upload pending changes
   mavftpfs sync /dev/ttyACM0 ~/logs             download the new logs
   mavftpfs ls -lh /dev/ttyACM0 /APM/LOGS        list, without a mount
   mavftpfs get ~/drone /APM/LOGS/7.BIN          download files, and verify them
@@ -60,7 +60,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code and prints errors as one line."""
+    """Run a command; return the exit code, and print errors as one line."""
     _open_closed_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "-d" in words or "--debug" in words
@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
         # `mavftpfs ls ... | head`: the reader is gone, and the interpreter must not try to flush again.
-        # Not all was done: a `put` ends here, too.
+        # The exit code reports a failure, because the command, perhaps a `put`, stopped early.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return SIGNALLED + signal.SIGPIPE
     except Exception as exc:
@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _open_closed_streams() -> None:
-    """Open standard streams that the caller closed (`>&-`). Else sockets would get their numbers."""
+    """Open standard streams that the caller closed (`>&-`). Otherwise sockets would get their numbers."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_RDWR)
@@ -100,8 +100,8 @@ def _complain(message: str, code: int) -> int:
 
 
 def mount_helper() -> int:
-    """Entry point of mount.mavftpfs, which mount(8) runs for `-t mavftpfs`; returns the exit code."""
-    parser = Parser("mount.mavftpfs", description="What mount(8) runs; see mavftpfs --help.")
+    """Run mount.mavftpfs, which mount(8) starts for `-t mavftpfs`; return the exit code."""
+    parser = Parser("mount.mavftpfs", description="Mount a vehicle for mount(8); see mavftpfs --help.")
     parser.add_argument("source")
     parser.add_argument("mountpoint")
     _add_options(parser)
@@ -114,8 +114,8 @@ def mount_helper() -> int:
         options, _ = commands.connection_of(args)
         if options.all:
             raise UsageError(
-                "option all cannot be used in /etc/fstab, because the directory itself is no mount; start it "
-                "by a systemd service, or have a line with target_system= for each vehicle"
+                "option all cannot be used in /etc/fstab, because the directory is not a mount itself; start "
+                "it by a systemd service, or have a line with target_system= for each vehicle"
             )
         if args.f:
             return ExitCode.OK
@@ -131,7 +131,7 @@ def _run(words: list[str]) -> int:
     name = words[0] if words else ""
     if name in _COMMANDS:
         make_parser, run = _COMMANDS[name]
-        # also `ls SOURCE -l PATH`: parse_args takes no PATH... after an option that follows SOURCE
+        # allows `ls SOURCE -l PATH`: parse_args takes no PATH... after an option behind SOURCE
         return run(_parsed(make_parser(name), name, _without_gone_flags(name, words[1:])))
     parser = _top_parser()
     if not words:
@@ -156,7 +156,7 @@ def _parsed(parser: Parser, name: str, words: list[str]) -> argparse.Namespace:
     """Return a command's parsed words.
 
     Raises:
-        UsageError: they are wrong. One path inside a mount, without SOURCE, is told what does that.
+        UsageError: the words are wrong. For a path inside a mount, the text names the system's command.
     """
     try:
         return parser.parse_intermixed_args(words)
@@ -173,11 +173,11 @@ _GONE_FLAGS = {
     ("sync", "--again"): "to fetch a log again, delete LOCAL/.mavftpfs-logs",
     ("get", "--no-resume"): "to fetch a file anew, delete it here first",
 }
-"""Flags that are gone, and harmless: scripts that have them go on to run. Drop the table after 1.0."""
+"""Removed flags that are ignored, so that scripts with them still run. Drop the table after 1.0."""
 
 
 def _without_gone_flags(command: str, words: list[str]) -> list[str]:
-    """Return a command's words without flags that are gone; say so for each."""
+    """Return a command's words without removed flags; print a line for each of these."""
     for word in words:
         if (command, word) in _GONE_FLAGS:
             commands.say(f"{word} is gone, and is ignored: {_GONE_FLAGS[command, word]}")
@@ -187,7 +187,7 @@ def _without_gone_flags(command: str, words: list[str]) -> list[str]:
 def _no_command(word: str) -> UsageError:
     near = difflib.get_close_matches(word, _COMMANDS, 1)
     hint = f"did you mean {near[0]}?" if near else "try: mavftpfs --help"
-    return UsageError(f"{word!r} is no command and no SOURCE; {hint}")
+    return UsageError(f"{word!r} is neither a command nor a SOURCE; {hint}")
 
 
 # -- parsers --------------------------------------------------------------------------------------
@@ -278,7 +278,7 @@ def _paths_parser(
 
 
 def _scan_parser(name: str) -> Parser:
-    parser = _source_parser(name, "Show what answers on a link.")
+    parser = _source_parser(name, "Show the components that answer on a link.")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
@@ -297,37 +297,37 @@ def _sync_parser(name: str) -> Parser:
     parser = _source_parser(name, "Download the vehicle's new logs, the newest first.")
     parser.add_argument("local", metavar="LOCAL", help="local directory, made if it is missing")
     parser.add_argument(
-        "--from", dest="place", metavar="PATH", help="log directory of the vehicle (default: found by itself)"
+        "--from", dest="place", metavar="PATH", help="log directory of the vehicle (default: search for it)"
     )
     parser.add_argument(
-        "--newest", metavar="N", type=_count, help="fetch only the N newest logs (default: all)"
+        "--newest", metavar="N", type=_count, help="download only the N newest logs (default: all)"
     )
     parser.add_argument(
         "--since",
         metavar="DATE",
-        help="fetch only logs since DATE: 2026-05-01, 2026-05-01T14:30, today, yesterday, 2h, 3d "
+        help="download only logs since DATE: 2026-05-01, 2026-05-01T14:30, today, yesterday, 2h, 3d "
         "(default: all)",
     )
     _add_patterns(parser, "the log directory")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
-        "-n", "--dry-run", action="store_true", help="say what would be fetched, and fetch nothing"
+        "-n", "--dry-run", action="store_true", help="print the logs to download, and download nothing"
     )
     instead.add_argument(
         "--check",
         action="store_true",
-        help="compare what is here by CRC32, and fetch nothing; exit code 1 if something differs",
+        help="compare local logs with the vehicle by CRC32, and download nothing; exit code 1 if one differs",
     )
     instead.add_argument(
         "--watch",
         action="store_true",
-        help="stay, and fetch the new logs of each vehicle after each flight",
+        help="keep running, and download the new logs of each vehicle after each flight",
     )
     parser.add_argument(
         "--exec",
         dest="command",
         metavar="COMMAND",
-        help="run COMMAND for each log that was fetched, with the file as its last argument (with --watch)",
+        help="run COMMAND for each downloaded log, with the file as its last argument (with --watch)",
     )
     _add_verify(parser)
     return parser
@@ -335,18 +335,18 @@ def _sync_parser(name: str) -> Parser:
 
 def _count(text: str) -> int:
     if not text.isascii() or not text.isdigit() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of logs")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of logs")
     return int(text)
 
 
 def _add_patterns(parser: Parser, source: str) -> None:
-    """Add the patterns that choose files; source: the directory below which they see paths."""
+    """Add the patterns that choose files; source: the directory at which their paths begin."""
     parser.add_argument(
         "--include",
         metavar="PATTERN",
         action="append",
         default=[],
-        help=f"fetch only files whose name, or path below {source}, matches; * also matches /; may be "
+        help=f"download only files whose name, or path below {source}, matches; * also matches /; may be "
         "repeated (default: all)",
     )
     parser.add_argument(
@@ -363,8 +363,8 @@ def _add_verify(parser: Parser) -> None:
         "--verify",
         choices=("auto", "all", "none"),
         default="auto",
-        help="compare with the vehicle's CRC32: auto is up to 16 MB; all: in sync also what is here already; "
-        "what was resumed is always compared (default: auto)",
+        help="compare with the vehicle's CRC32: auto: files up to 16 MB and resumed ones; all: all files, in "
+        "sync also those that are here already; none: resumed files only (default: auto)",
     )
 
 
@@ -449,7 +449,7 @@ def _param_parser(name: str) -> Parser:
         default=[],
         help="name to print, or a pattern, as 'BATT*' (default: all); NAME=VALUE: set it",
     )
-    parser.add_argument("--changed", action="store_true", help="print only what differs from its default")
+    parser.add_argument("--changed", action="store_true", help="print only values that are no defaults")
     parser.add_argument("--load", metavar="FILE", help="set the parameters that differ from FILE")
     parser.add_argument(
         "--skip-unknown",
@@ -462,8 +462,8 @@ def _param_parser(name: str) -> Parser:
         metavar="FILE",
         nargs="?",
         const="",
-        help="show what differs from FILE, or without FILE between the vehicles of a mount with -o all; exit "
-        "code 1 if something differs",
+        help="show differences from FILE, or without FILE between the vehicles of a mount with -o all; exit "
+        "code 1 if there are any",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("-y", "--yes", action="store_true", help="set without asking")
@@ -471,14 +471,14 @@ def _param_parser(name: str) -> Parser:
 
 
 def _umount_parser(name: str) -> Parser:
-    parser = Parser(f"mavftpfs {name}", description="Unmount, upload what is pending, close the session.")
+    parser = Parser(f"mavftpfs {name}", description="Unmount, upload pending changes, close the session.")
     parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="directory where a vehicle is mounted")
-    parser.add_argument("-l", "--lazy", action="store_true", help="unmount even if it is in use")
+    parser.add_argument("-l", "--lazy", action="store_true", help="unmount even if programs use the mount")
     return parser
 
 
 def _status_parser(name: str) -> Parser:
-    parser = Parser(f"mavftpfs {name}", description="Show what mounts are doing.")
+    parser = Parser(f"mavftpfs {name}", description="Show the state of mounts.")
     parser.add_argument(
         "mountpoint",
         metavar="MOUNTPOINT",
@@ -486,16 +486,16 @@ def _status_parser(name: str) -> Parser:
         help="mountpoint, or a path inside (default: all mounts that you may ask)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--watch", action="store_true", help="show it again each second")
+    parser.add_argument("--watch", action="store_true", help="repeat each second")
     parser.add_argument("-v", "--verbose", action="store_true", help="show everything that the mount reports")
     return parser
 
 
 def _hub_parser(name: str) -> Parser:
-    parser = Parser(f"mavftpfs {name}", description="Show what shares a port, or stop that.", epilog=_SOURCES)
+    parser = Parser(f"mavftpfs {name}", description="Show shared ports, or stop sharing.", epilog=_SOURCES)
     parser.add_argument("source", metavar="SOURCE", nargs="?", help="port to show (default: all)")
-    parser.add_argument("--stop", action="store_true", help="end the hub, or say what that would cut")
-    parser.add_argument("--force", action="store_true", help="end it even if it is in use (with --stop)")
+    parser.add_argument("--stop", action="store_true", help="end the hub, unless programs use it")
+    parser.add_argument("--force", action="store_true", help="end even a hub in use (with --stop)")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     return parser
 
@@ -503,14 +503,14 @@ def _hub_parser(name: str) -> Parser:
 def _recover_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
-        description="List what mounts could not deliver, or put it back on the vehicle.",
+        description="List files that did not reach a vehicle, or upload them.",
         epilog=_SOURCES,
     )
     parser.add_argument(
-        "source", metavar="SOURCE", nargs="?", help="vehicle to put the files back on (default: list them)"
+        "source", metavar="SOURCE", nargs="?", help="vehicle to upload the files to (default: list them)"
     )
     parser.add_argument("names", metavar="FILE", nargs="*", help="file or directory of the list")
-    parser.add_argument("--all", action="store_true", help="put back all files of the list")
+    parser.add_argument("--all", action="store_true", help="upload all files of the list")
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
@@ -526,7 +526,7 @@ def _install_parser(name: str) -> Parser:
         description="Install man pages, completions, units and the udev rule.",
     )
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--print", action="store_true", help="show what would be written, and write nothing")
+    what.add_argument("--print", action="store_true", help="show the files, and write nothing")
     what.add_argument("--remove", action="store_true", help="remove these files")
     return parser
 
@@ -559,7 +559,7 @@ def _install(args: argparse.Namespace) -> int:
 
 
 def _later(module: str, name: str) -> Run:
-    """Return a command of a module that is imported when the command runs."""
+    """Return a command that imports its module when it runs."""
 
     def run(args: argparse.Namespace) -> int:
         command: Run = getattr(importlib.import_module(f"mavftpfs.{module}"), name)

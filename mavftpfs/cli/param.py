@@ -75,9 +75,9 @@ def _require_one_job(args: Args, setting: Sequence[str]) -> None:
     if setting and len(setting) < len(args.names):
         raise UsageError("set parameters (NAME=VALUE) or print them (NAME), not both")
     if args.changed and (setting or (jobs and jobs != ["--save"])):
-        raise UsageError("--changed is for what is printed or saved")
+        raise UsageError("--changed goes with printing or with --save; leave it out")
     if args.skip_unknown and args.load is None:
-        raise UsageError("--skip-unknown is for --load")
+        raise UsageError("--skip-unknown goes with --load; leave it out")
 
 
 def _with_session(args: Args, function: Any, *, writing: bool = False) -> int:
@@ -95,7 +95,7 @@ async def _print(args: Args, session: Session) -> int:
     if args.changed or args.json:
         found = await client.read_with_defaults(session)
         if args.changed:
-            await client.read_text(session, client.CHANGED)  # or says that no defaults are told
+            await client.read_text(session, client.CHANGED)  # raises if the vehicle has no defaults
             found = [one for one in found if one.changed]
     else:
         found = await client.read_parameters(session)
@@ -121,7 +121,7 @@ def _facts(one: Parameter) -> dict[str, Any]:
 
 
 def _number(one: Parameter) -> int | float | str:
-    """Return a value as a number if JSON has it, else its text; floats as the shortest decimal."""
+    """Return a value as a number if JSON has it, otherwise its text; floats as the shortest decimal."""
     text = client.value_text(one)
     if one.kind is not Kind.FLOAT:
         return int(text)
@@ -249,7 +249,7 @@ def _change(args: Args, read: Callable[[], Sequence[Line]], name: str, *, meant:
 @dataclass(slots=True)
 class _Setting:
     """One run that sets parameters. name: the file of the lines. meant: see make_plan. done: the parameters
-    that were set and read back; announced: the changes were printed before.
+    that were set and read back. announced: the changes were printed before.
     """
 
     args: Args
@@ -261,7 +261,8 @@ class _Setting:
     announced: bool = False
 
     async def run(self, session: Session) -> int:
-        """Set the values that differ; in two steps if some parameters may only appear when others are set."""
+        """Set the values that differ; in two steps if some parameters may appear only after others are
+        set."""
         plan = await self._compare(session)
         first = client.enabling(plan.changes) if plan.unknown else []
         if plan.unknown and not first:
@@ -290,10 +291,10 @@ class _Setting:
         return client.plan_changes(lines, current, self.name, meant=self.meant)
 
     def _require_known(self, plan: ChangePlan) -> None:
-        """Name the parameters that the vehicle does not have.
+        """Print the names of parameters that the vehicle does not have.
 
         Raises:
-            InvalidText: there are some, and the user did not allow to leave them out.
+            InvalidText: there are some, and the user did not allow leaving them out.
         """
         names = ", ".join(line.name for line in plan.unknown)
         if plan.unknown and not self.args.skip_unknown:

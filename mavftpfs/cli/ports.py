@@ -40,7 +40,7 @@ def hub(args: argparse.Namespace) -> int:
 
 
 def statuses(source: str | None) -> list[Status]:
-    """Return the status of each hub; only that of SOURCE, if it is given."""
+    """Return the status of each hub; with SOURCE only of that one."""
     replies = [_ask(name, {"status": True}) for name in _names(source)]
     return [facts for facts in replies if facts is not None]
 
@@ -55,10 +55,10 @@ def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    """Stop hubs, after saying what that cuts off; leave those of other users, and say so.
+    """Stop hubs, after printing what that cuts off; skip those of other users, and print their names.
 
     Raises:
-        UsageError: programs would be cut off, or all hubs are those of other users.
+        UsageError: stopping would cut programs off, or all hubs are those of other users.
     """
     found, refused = _ours(args.source)
     if refused and not found:
@@ -70,7 +70,7 @@ def _stop(args: argparse.Namespace) -> int:
         for line in status_lines(facts):
             print(printable(line))
     if cut and not args.force:
-        raise UsageError("that would be cut (mounts open the port again); --force does it")
+        raise UsageError("stopping would cut these off (mounts open the port again); to stop anyway: --force")
     for name, _ in found:
         _ask(name, {"stop": True})
     if not found:
@@ -92,7 +92,7 @@ def _ours(source: str | None) -> tuple[list[tuple[str, Status]], list[UsageError
 
 
 def _live(facts: Status) -> list[Status]:
-    """Return the endpoints that are heard."""
+    """Return the endpoints that were heard."""
     return [
         known for known in facts["endpoints"] if known["heard_ago"] is not None and known["heard_ago"] < 10
     ]
@@ -117,15 +117,15 @@ def status_lines(facts: Status) -> Iterator[str]:
 
 
 def _names(source: str | None) -> list[str]:
-    """Return the name of the port of one SOURCE, or of all ports that programs of ours have."""
+    """Return the port name of one SOURCE, or the names of all ports that this user's programs have."""
     return names_in_use() if source is None else [port_name(parse_source(source))]
 
 
 def _ask(name: str, request: Facts) -> Status | None:
-    """Return the reply of the hub that has a port; None if there is none, but perhaps a program alone.
+    """Return the reply of the hub that has a port; None without a hub, though one program may have the port.
 
     Raises:
-        UsageError: the hub refuses that.
+        UsageError: the hub refuses the request.
     """
     with suppress(OSError), connect(name) as sock:
         sock.settimeout(PATIENCE)

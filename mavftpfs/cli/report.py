@@ -1,6 +1,6 @@
-"""The lines that people read of mounts. Layer: cli.
+"""The lines about mounts, for people. Layer: cli.
 
-Names come from the vehicle, so nothing reaches the terminal that could be an escape sequence.
+Names come from the vehicle, so these functions remove everything that could be an escape sequence.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _IN_THE_LINES = {"mountpoint", "problem", "transfers"}
 
 
 def status_lines(status: Status, *, verbose: bool = False) -> list[str]:
-    """Return a mount's lines: one for a pilot, what moves, what is held back; verbose: the rest, too."""
+    """Return a mount's lines: one for a pilot, transfers, pending changes; verbose: the rest, too."""
     lines = [f"{status.get('mountpoint', '?')}: {_headline(status)}"]
     if not status.get("problem"):
         lines += _member_lines(status) if "members" in status else _vehicle_lines(status, verbose=verbose)
@@ -43,14 +43,14 @@ def _vehicle_lines(status: Status, *, verbose: bool) -> Iterator[str]:
 
 
 def _member_lines(status: Status) -> Iterator[str]:
-    """Yield a line for each vehicle whose own mount is not up."""
+    """Yield a line for each vehicle whose own mount is down."""
     for member in status["members"]:
         if member["state"] != "mounted":
             yield f"  vehicle {member['name']}: {member['problem'] or member['state']}"
 
 
 def _rows(facts: Mapping[str, Any], before: str) -> Iterator[str]:
-    """Yield nested facts as `--json` has them, a line for each that says something."""
+    """Yield nested facts as in `--json`, one line for each that is set."""
     for key, value in facts.items():
         name = before + key.replace("_", " ")
         if isinstance(value, Mapping):
@@ -60,7 +60,7 @@ def _rows(facts: Mapping[str, Any], before: str) -> Iterator[str]:
 
 
 def _fact(value: object) -> str:
-    """Return a value as people write it: yes and no, and only the digits that matter."""
+    """Return a value as people write it: yes and no, and only the significant digits."""
     match value:
         case bool():
             return "yes" if value else "no"
@@ -126,9 +126,9 @@ def _held_lines(status: Status) -> Iterator[str]:
         yield f"  write failed {path}: {error}; copy the file again ({_part_goes()})"
     if not files:
         if not (status.get("read_only") or held.get("broken")):
-            yield "  nothing is held back: all that was written is on the vehicle"
+            yield "  nothing is pending: the vehicle has all that was written"
         return
-    yield f"  held back: {count_files(files)}, {readable_size(held['bytes'])}{_waits_for(status)}"
+    yield f"  pending: {count_files(files)}, {readable_size(held['bytes'])}{_waits_for(status)}"
     shown = {transfer["path"] for transfer in status["transfers"]}
     for path, error in held["errors"].items():
         if path not in shown:
@@ -136,7 +136,7 @@ def _held_lines(status: Status) -> Iterator[str]:
 
 
 def _part_goes() -> str:
-    """Return where the part of a file goes of which a write failed."""
+    """Return the words about the part of a file whose write failed."""
     from mavftpfs.client.undelivered import recovered_directory
 
     return f"umount moves the part that was written to {recovered_directory()}"
@@ -151,7 +151,7 @@ def _waits_for(status: Status) -> str:
 
 
 def delivery_line(status: Status) -> str:
-    """Return a line on what a mount that is being unmounted waits for; "" for nothing."""
+    """Return a line about the uploads of a mount that is being unmounted; "" without uploads."""
     held = status.get("held")
     if held is None or not held["files"]:
         return ""
@@ -161,7 +161,7 @@ def delivery_line(status: Status) -> str:
     left = "" if eta is None or not sending else f", {time_left(eta)}"
     done, size = (sum(t[key] for t in status["transfers"]) for key in ("done", "size"))
     amount = f"{readable_size(done)} of {readable_size(size)}"
-    return f"delivering {count_files(held['files'])}, {amount}{rate}{left}{_waits_for(status)}"
+    return f"uploading {count_files(held['files'])}, {amount}{rate}{left}{_waits_for(status)}"
 
 
 # -- printing ---------------------------------------------------------------------------------------
@@ -184,9 +184,9 @@ def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> Non
 
 
 def print_json(fetch: Callable[[], Sequence[Status]], *, single: bool, watch: bool) -> None:
-    """Print the status as JSON: once to be read, or with `watch` one line each second until interrupted.
+    """Print the status as JSON: once, indented, or with `watch` one line each second until interrupted.
 
-    single: the only status is the whole answer, not a list of one.
+    single: print the only status itself, not a list of one.
     """
     while True:
         facts = fetch()

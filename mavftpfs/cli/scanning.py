@@ -1,4 +1,4 @@
-"""`mavftpfs scan`: prints what is on a link. Layer: cli."""
+"""`mavftpfs scan`: prints the components on a link. Layer: cli."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEADER = "SYSTEM/COMPONENT", "WHAT", "FIRMWARE", "UNIQUE ID", "FTP"
 
 
 def scan(args: argparse.Namespace) -> int:
-    """Show what answers on a link, each as soon as it is known."""
+    """Print the components that answer on a link, each as soon as it is known."""
     if args.json:
         print(json.dumps(run(args, partial(find, show=lambda entry: None)), indent=2, default=str))
         return ExitCode.OK
@@ -38,7 +38,7 @@ def scan(args: argparse.Namespace) -> int:
 
 
 def lines_of(entry: Entry, *, tabs: bool) -> Iterator[str]:
-    """Yield the lines of a component; in a pipe its parts stand between tabs, `-` for what is not known."""
+    """Yield the lines of a component; in a pipe tabs separate its parts, with `-` for an unknown one."""
     address = f"{entry['system']}/{entry['component']}"
     ftp = ", ".join([entry["ftp"], *entry["seen"]])
     facts = (address, entry["what"], entry["firmware"], entry["uid"], ftp)

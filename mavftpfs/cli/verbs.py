@@ -65,10 +65,10 @@ def _target(args: Args, component: int | None) -> Target:
 
 
 def _paths_of(args: Args, default: Sequence[str] = ()) -> tuple[list[bytes], int | None]:
-    """Return the paths to read, and the component that they name. SOURCE may be the first file itself.
+    """Return the paths to read, and the component that they name. SOURCE itself may be the first file.
 
     Raises:
-        UsageError: there is none, or it is malformed.
+        UsageError: there is no path, or one is malformed.
     """
     inside = files_in_mount(args.source, args.paths, lists=bool(default))
     if inside is not None:
@@ -83,11 +83,11 @@ def run(
     function: Callable[[Target], Coroutine[Any, Any, ResultT]],
     component: int | None = None,
 ) -> ResultT:
-    """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
+    """Run a verb; Ctrl-C cancels it, so that the vehicle's session is still closed."""
     target = _target(args, component)
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
     daemon.warn_of_gone(target.options)
-    if not args.debug:  # the caches' warnings are raised as errors, too, in one line
+    if not args.debug:  # because the caches' warnings are raised as errors, too, in one line
         logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
     with open_sinks(target.options, debug=args.debug, tell=say) as sinks:
         return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
@@ -111,10 +111,10 @@ def with_session(
 
 @asynccontextmanager
 async def one_vehicle(target: Target, *, writing: bool) -> AsyncIterator[Session]:
-    """Give the vehicle's files to a command; say whether other vehicles may have been meant.
+    """Give the vehicle's files to a command; print a note if the user may have meant another vehicle.
 
     Raises:
-        UsageError: with `writing`, if they may. Else as Target.session.
+        UsageError: with `writing`, if the user may have. Also as Target.session.
     """
     async with target.session(writing=writing) as session:
         if writing:
@@ -129,7 +129,7 @@ async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]
     """Return the function's result.
 
     Raises:
-        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
+        KeyboardInterrupt: SIGINT or SIGTERM arrived first; the function was cancelled and has cleaned up.
         MavftpfsError, OSError: the function's own.
     """
     results: list[ResultT] = []
@@ -152,7 +152,7 @@ STDIN = STDOUT = "-"
 
 @contextmanager
 def _on_interrupt(line: Callable[[], str]) -> Iterator[None]:
-    """Say in one line what was done, when Ctrl-C ends the body."""
+    """Print a line about the finished part when Ctrl-C ends the body."""
     try:
         yield
     except KeyboardInterrupt:
@@ -168,7 +168,7 @@ def _name(path: bytes) -> str:
 
 
 def sync(args: Args) -> int:
-    """Bring the vehicle's logs into a local directory, or compare those that are there."""
+    """Download the vehicle's logs into a local directory, or compare those that are there."""
     component, place = None, None
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
@@ -211,7 +211,7 @@ def _print_outcome(args: Args, outcome: download.Outcome) -> None:
 
 
 def get(args: Args) -> int:
-    """Fetch files."""
+    """Download files."""
     if args.to == STDOUT:
         if args.recursive:
             raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
@@ -241,7 +241,7 @@ def cat(args: Args) -> int:
         sys.stdout.buffer.flush()
 
     async def take(data: bytes | memoryview) -> None:
-        # In a thread: the reader may be slow, and the vehicle has to hear of us meanwhile.
+        # In a thread, because the reader may be slow, and heartbeats must go on meanwhile.
         await trio.to_thread.run_sync(write, bytes(data), abandon_on_cancel=True)
 
     async def work(session: Session) -> None:
@@ -253,13 +253,13 @@ def cat(args: Args) -> int:
 
 
 def _exit_code(outcome: download.Outcome) -> int:
-    """Return the exit code for what failed. A missing path has the same code, however many paths were
+    """Return the exit code for the failures. A missing path has the same code, however many paths were
     given."""
     return max(map(exit_code_for, outcome.failed.values()), default=ExitCode.OK)
 
 
 class _Printed(download.Reports):
-    """Prints a line for each file that is here, and says on stderr why another one is not."""
+    """Prints a line for each downloaded file, and on stderr the reason why another one is missing."""
 
     def arrived(self, fetched: Fetched) -> None:
         """See Reports."""
@@ -285,7 +285,7 @@ def _download(
     function: Callable[[download.Downloads], Coroutine[Any, Any, None]],
     component: int | None,
 ) -> None:
-    """Bring files with progress on the screen; Ctrl-C says how many are here."""
+    """Download files with progress on the screen; Ctrl-C prints how many are here."""
     bar = Progress()
 
     async def work(session: Session) -> None:
@@ -300,8 +300,8 @@ def _download(
 def _here(outcome: download.Outcome) -> str:
     wanted, here = len(outcome.wanted) + len(outcome.here), len(outcome.fetched) + len(outcome.here)
     if not wanted:
-        return "nothing was fetched yet"
-    return f"{here} of {wanted} files are here; the next run goes on where this one stopped"
+        return "nothing was downloaded yet"
+    return f"{here} of {wanted} files are here; the next run resumes where this one stopped"
 
 
 def _sync_summary(outcome: download.Outcome) -> str:
@@ -313,7 +313,7 @@ def _sync_summary(outcome: download.Outcome) -> str:
     line += f", from {_name(outcome.place)}"
     missing = sum(wanted.remote in outcome.failed for wanted in outcome.wanted)
     if missing:
-        line += f"; {missing} not here, the next run goes on"
+        line += f"; {missing} not here, the next run resumes"
     return line
 
 
@@ -344,12 +344,12 @@ def _print_comparison(outcome: download.Outcome) -> None:
 
 
 def put(args: Args) -> int:
-    """Put files on the vehicle."""
+    """Upload files to the vehicle."""
     (path,), component = names.parse_paths([args.path])
     into = args.path.endswith("/")
     if Path(STDIN) in args.locals:
         if len(args.locals) > 1 or args.recursive:
-            raise UsageError("what comes from stdin is put alone; leave out -r and the other files")
+            raise UsageError("stdin (-) is uploaded alone; leave out -r and the other files")
         with _spooled_stdin() as local:
             return _put(args, component, partial(upload.put_alone, local=local, path=path, into=into))
     batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
@@ -358,9 +358,9 @@ def put(args: Args) -> int:
 
 @contextmanager
 def _spooled_stdin() -> Iterator[Path]:
-    """Copy stdin to a file: its size has to be known before, and it may be sent twice.
+    """Copy stdin to a file, because its size must be known first, and it may be sent twice.
 
-    If the body fails the bytes are nowhere else. So they are kept, and the text of its error says where.
+    If the body fails, no other copy of the bytes exists. So the file stays, and the error's text names it.
     """
     with NamedTemporaryFile(prefix="mavftpfs-") as file:
         shutil.copyfileobj(sys.stdin.buffer, file)
@@ -371,7 +371,7 @@ def _spooled_stdin() -> Iterator[Path]:
             directory = recovery_directory("stdin")
             make_private_directory(directory)
             kept = Path(shutil.copy(file.name, directory / "stdin"))
-            exc.args = (f"{exc}; what came from stdin is kept in {kept}",)
+            exc.args = (f"{exc}; the bytes from stdin are kept in {kept}",)
             raise
 
 
@@ -390,29 +390,29 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"
         if not bar.name:
             return line
-        return f"{line}; {bar.name} was on its way: {_left_there(untouched=bar.untouched)}"
+        return f"{line}; {bar.name} was being uploaded: {_left_there(untouched=bar.untouched)}"
 
     try:
         with _on_interrupt(stopped), shown(bar):
             with_session(args, work, component, writing=True)
     except NotDelivered as exc:
         if not _link_failed(exc):
-            raise  # a refusal says enough
+            raise  # a refusal explains itself
         exc.args = (f"{exc}; {_left_there(untouched=exc.there is False)}",)
         raise
     return ExitCode.OK
 
 
 def _link_failed(error: BaseException | None) -> bool:
-    """Return whether an error comes from a link or vehicle that did not answer."""
+    """Return whether the reason of an error is a link or vehicle that did not answer."""
     return error is not None and (
         isinstance(error, LinkError | RequestTimeout) or _link_failed(error.__cause__)
     )
 
 
 def _left_there(*, untouched: bool) -> str:
-    """Return the words about the place of a file that was not put."""
-    return "the vehicle has what it had" if untouched else "look what is there before you use it"
+    """Return the words about the path of a file that was not uploaded."""
+    return "the vehicle keeps what it had" if untouched else "look at the vehicle's file before you use it"
 
 
 def rm(args: Args) -> int:
@@ -459,7 +459,7 @@ def mv(args: Args) -> int:
 
 
 def recover(args: Args) -> int:
-    """List what did not reach a vehicle, or put it where it belonged."""
+    """List the files that did not reach a vehicle, or upload them to their paths."""
     base = recovered_directory()
     if args.source is None:
         _list_recovered(recovered_below(base))
@@ -469,7 +469,7 @@ def recover(args: Args) -> int:
         _list_recovered(wanted)
         return ExitCode.OK
     if not wanted:
-        raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
+        raise UsageError("which files? Name them, or give --all; list them with: mavftpfs recover")
     bar = Progress()
 
     def tell(copy: Recovered, there_already: bool) -> None:
@@ -491,7 +491,7 @@ def recover(args: Args) -> int:
 
 
 def _list_recovered(found: Sequence[Recovered]) -> None:
-    """Print the recovered files by directory, and what still lies where a killed mount left it."""
+    """Print the recovered files by directory, and the files that a killed mount left in its own directory."""
     directory = None
     for copy in found:
         if copy.file.parent != directory:
@@ -508,7 +508,7 @@ def _list_recovered(found: Sequence[Recovered]) -> None:
     if left:
         print(left)
     elif not found:
-        print("nothing was kept")
+        print("no recovered files")
 
 
 # -- looking --------------------------------------------------------------------------------------
@@ -531,7 +531,7 @@ def ls(args: Args) -> int:
 
 
 def crc(args: Args) -> int:
-    """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
+    """Print checksums that the vehicle computed, in cksum's format: number, two blanks, name."""
     wanted, component = _paths_of(args)
 
     def tell(path: bytes, number: int) -> None:

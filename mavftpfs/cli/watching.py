@@ -27,7 +27,7 @@ from mavftpfs.shared.readable import readable, readable_time
 EXEC_LIMIT = 600.0
 """Seconds for the command of --exec."""
 _LAST_WORDS = 1.0
-"""Seconds to read the command's last output, after it ended."""
+"""Seconds to read the command's last output after its end."""
 _KILL_AFTER = 5.0
 """Seconds between SIGTERM and SIGKILL."""
 
@@ -52,20 +52,20 @@ def watch(args: argparse.Namespace, request: SyncRequest, run: Callable[[Work], 
             say(f"waiting for vehicles on {args.source}; Ctrl-C ends it")
             run(work)
     except KeyboardInterrupt:
-        say("ended; the next run goes on")
+        say("ended; the next run continues")
     return ExitCode.OK
 
 
 def say(line: str) -> None:
-    """Print a line; with the time, unless the journal adds it."""
+    """Print a line, with the time unless the journal adds it."""
     when = f"{time.strftime('%H:%M:%S')} " if sys.stdout.isatty() else ""
     print(f"{when}{readable(line)}", flush=True)
 
 
 async def run_command(command: str, file: Path, *, limit: float) -> str:
-    """Run a command of the shell for a file, which is its last argument; return why it did not work, or "".
+    """Run a shell command with a file as its last argument; return why it failed, or "".
 
-    limit: seconds after which it is ended, with all that it started.
+    limit: seconds after which the command is ended, with all processes that it started.
     """
     words = ["/bin/sh", "-c", f'{command} "$@"', "sh", os.fspath(file)]
     try:
@@ -104,7 +104,7 @@ async def _pass_on(process: trio.Process) -> None:
 
 
 async def _end(process: trio.Process) -> None:
-    """End a command and what it started."""
+    """End a command and the processes that it started."""
     if process.returncode is None:
         _signal(process, signal.SIGTERM)
         with trio.move_on_after(_KILL_AFTER):

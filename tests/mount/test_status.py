@@ -81,7 +81,7 @@ def test_status_is_for_programs_too(field: Field, small_tree: Path) -> None:
     shown = command("status", mount.path)[0]
     assert re.sub(r"RTT \d+ ms|loss [0-9<]+ %|, [0-9.]+ k?B/s", "", shown).splitlines() == [
         f"{mount.path}: PX4 1/1, disarmed, link fine: , ",
-        "  nothing is held back: all that was written is on the vehicle",
+        "  nothing is pending: the vehicle has all that was written",
     ]
     for text in (shown, command("status", "--verbose", mount.path)[0]):
         assert text.isascii(), text  # no boxes, no colours

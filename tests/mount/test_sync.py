@@ -163,7 +163,7 @@ def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: P
         child.send_signal(signal.SIGINT)
         out, err = child.communicate(timeout=COMMAND_TIMEOUT)
     assert (child.returncode, out) == (130, "")
-    told = "0 of 1 files are here; the next run goes on where this one stopped"
+    told = "0 of 1 files are here; the next run resumes where this one stopped"
     assert err == f"mavftpfs: interrupted: {told}\n"
     assert local_files(local) == {"big.bin.part"}
     came = part.read_bytes()
@@ -348,7 +348,7 @@ def test_logs_come_home_by_themselves(field: Field, tmp_path: Path) -> None:
     wait_until("the second, too", lambda: handed.read_text() == "1.BIN\n2.BIN\n")
     assert watch.stop() == 0
     out = watch.text()
-    assert out.splitlines()[-1] == "ended; the next run goes on"
+    assert out.splitlines()[-1] == "ended; the next run continues"
     assert out.count("is here, verified by size and CRC32") == 2
     assert "a mount has this vehicle now" in out
     (home,) = (path for path in local.iterdir() if path.is_dir())

@@ -177,6 +177,8 @@ def test_a_put_that_is_interrupted_says_that_the_old_file_is_there(field: Field,
         wait_until("it is being sent", lambda: any(path.stat().st_size > 10_000 for path in card.iterdir()))
         put.send_signal(signal.SIGINT)
         said = put.communicate(timeout=60)[1]
-    assert said.endswith("0 of 1 files are on the vehicle; /f was on its way: the vehicle has what it had\n")
+    assert said.endswith(
+        "0 of 1 files are on the vehicle; /f was being uploaded: the vehicle keeps what it had\n"
+    )
     assert put.returncode == 130
     assert [path.read_bytes() for path in card.iterdir()] == [b"old"]

@@ -297,14 +297,16 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
             f"are saved in {state}\n"
         )
         assert second == (
-            f"mavftpfs: Ctrl-C ends only the waiting; to keep the rest now: kill {process.popen.pid}\n"
+            "mavftpfs: Ctrl-C only stops this command; to save the remaining files here now: "
+            f"kill {process.popen.pid}\n"
         )
         assert third == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
         assert not mounted_at(mount.path)
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
         assert child.returncode == ExitCode.INTERRUPTED
-    assert errors == "mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status\n"
+    said = "the mount keeps uploading pending changes, and then ends; see: mavftpfs status"
+    assert errors == f"mavftpfs: {said}\n"
     assert f"{mount.path}: being unmounted, PX4 1/1, disarmed, LOST" in command("status")[0]
     mount.process = None
     vehicle.resume()
@@ -337,7 +339,7 @@ def test_what_came_from_stdin_and_was_not_delivered_is_kept(field: Field, data: 
     vehicle.resume()
     assert done.returncode == ExitCode.UNDELIVERED, done.stderr
     (kept,) = state.glob("*/stdin")
-    assert f"what came from stdin is kept in {kept}" in done.stderr
+    assert f"the bytes from stdin are kept in {kept}" in done.stderr
     assert kept.read_bytes() == data.read_bytes()
 
 
@@ -357,7 +359,7 @@ def left_behind(field: Field, data: Path) -> tuple[SimVehicle, Path]:
 
 @pytest.mark.holds("promise 3")
 def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path, state: Path) -> None:
-    assert command("recover")[0] == "nothing was kept\n"
+    assert command("recover")[0] == "no recovered files\n"
     vehicle, card = left_behind(field, data)
     (directory,) = state.iterdir()
     assert (directory / "lost.bin").read_bytes() == data.read_bytes()

@@ -77,7 +77,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
     ("words", "named"),
     [
         ((SOURCE,), "MOUNTPOINT"),
-        (("lss", SOURCE, "/"), "'lss' is no command"),
+        (("lss", SOURCE, "/"), "'lss' is neither a command"),
         (("lss", "/tmp"), "did you mean ls?"),
         ((SOURCE, "/mnt", "-o", "dir_timout=3"), "did you mean dir_timeout?"),
         (("lss", SOURCE), "did you mean ls?"),
@@ -111,7 +111,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("ls", "-t", SOURCE), "-t"),
         (("install", "--root", "/x"), "--root"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
-        (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
+        (("sync", SOURCE, "/tmp", "--newest", "0"), "not a number"),
         (("get", SOURCE, "/a*", "--to", "-", "--include", "*.ulg"), "leave out --include"),
         (("sim", "/proc/none/a b"), "mkdir -p '/proc/none/a b/fs/microsd/log'"),
         (("sim", "/proc/none/a", "--profile", "ardupilot"), "mkdir -p /proc/none/a/APM/LOGS"),
@@ -308,7 +308,7 @@ def test_what_came_from_stdin_is_kept_if_there_is_no_vehicle(tmp_path: Path) -> 
     )
     assert done.returncode == ExitCode.NO_VEHICLE
     (kept,) = tmp_path.rglob("stdin")
-    assert done.stderr.rstrip().endswith(f"what came from stdin is kept in {kept}")
+    assert done.stderr.rstrip().endswith(f"the bytes from stdin are kept in {kept}")
     assert kept.read_text() == "made by a long computation\n"
 
 

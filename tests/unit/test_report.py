@@ -90,14 +90,14 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
         "  sending /a: 75 % of 4.1 kB, 300 B/s, 3.4 s left",
         "  waiting /b: empty, the card is full",
         "  sending /e: empty",
-        "  held back: 3 files, 4.1 kB",
+        "  pending: 3 files, 4.1 kB",
         "  failed /c: no",
     ]
     assert lines({"armed": True}, {**cache, "reads": []})[1:5] == [
         "  waiting /a: 75 % of 4.1 kB",
         "  waiting /b: empty, the card is full",
         "  waiting /e: empty",
-        "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
+        "  pending: 3 files, 4.1 kB, until the vehicle is disarmed",
     ]
 
 
@@ -115,7 +115,7 @@ def test_a_status_of_many_files_fits_an_extended_attribute() -> None:
 
 
 def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
-    assert lines()[1:] == ["  nothing is held back: all that was written is on the vehicle"]
+    assert lines()[1:] == ["  nothing is pending: the vehicle has all that was written"]
     assert lines(read_only=True)[1:] == []
 
 
@@ -142,9 +142,9 @@ def test_the_traffic_is_told_when_it_was_seen_for_some_seconds() -> None:
 
 def test_a_delivery_says_what_it_waits_for() -> None:
     cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_undelivered": 4096}
-    assert delivery_line(status(None, cache)) == "delivering 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
+    assert delivery_line(status(None, cache)) == "uploading 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
     lost = delivery_line(status({"state": "lost"}, {**cache, "transfers": [{**WRITE, "sending": False}]}))
-    assert lost == "delivering 1 file, 3.1 kB of 4.1 kB, until the vehicle is back"
+    assert lost == "uploading 1 file, 3.1 kB of 4.1 kB, until the vehicle is back"
     assert delivery_line(status()) == ""
 
 
