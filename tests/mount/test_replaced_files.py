@@ -39,6 +39,9 @@ while True:
     os.close(new)
     time.sleep(0.2)
 require_stale(old)
+assert os.fstat(old).st_nlink == 0
+assert os.fstat(old).st_size == len(old_bytes)
+assert os.fstat(old).st_ino != os.fstat(new).st_ino == os.stat(path).st_ino
 with open(path, "r+b", 0) as writer:
     require_stale(old)
     writer.write(b"mid")
@@ -59,3 +62,27 @@ def test_who_has_the_old_file_open_gets_nothing_of_the_new_one(field: Field) -> 
     mount = field.mount(field.sim(card, "ardupilot5").source, "dir_timeout=0.1")
     mount.python(PROGRAM, mount.path / "file.bin", file, timeout=60)
     assert file.read_bytes() == b"mid" + b"NEW" * 299
+
+
+GROWING = """
+import os, sys, time
+path, card = sys.argv[1:]
+old = os.open(path, os.O_RDONLY)
+with open(card, "ab") as file:
+    file.write(b"more")
+while True:
+    new = os.open(path, os.O_RDONLY)
+    if os.pread(new, 900, 900) == b"more":
+        break
+    os.close(new)
+    time.sleep(0.2)
+assert os.pread(old, 904, 0) == os.pread(new, 904, 0) == b"old" * 300 + b"more"
+assert os.fstat(old).st_ino == os.fstat(new).st_ino
+"""
+
+
+def test_a_file_that_grew_is_the_same_file(field: Field) -> None:
+    card = field.local("card")
+    (card / "file.bin").write_bytes(b"old" * 300)
+    mount = field.mount(field.sim(card, "ardupilot5").source, "dir_timeout=0.1")
+    mount.python(GROWING, mount.path / "file.bin", card / "file.bin", timeout=60)
