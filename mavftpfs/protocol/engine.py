@@ -268,7 +268,7 @@ class Engine:
     def _lose(self, request: Request, now: float) -> None:
         """Give up a request. Its operation asks again, unless it is not there any more."""
         op = request.op
-        self.flow.on_loss(request.order)
+        self.flow.on_loss()
         self._ledger.lose(request)
         if op is not self._ledger.ghost:
             self.stats.lost += 1

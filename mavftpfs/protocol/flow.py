@@ -19,8 +19,13 @@ silently. So at a serial port the window is 16 at most, and two requests go out 
 One token bucket in bytes holds back what goes out: its rate is the pace, at most the user's `bwlimit=`. A
 request is charged with its own bytes and those of the reply that it expects.
 
+ArduPilot queues five requests for all clients, and drops the rest silently, but it empties that queue every
+few milliseconds (servers.md 3, 15). So reads may fill the path there, too, because they go out evenly, also
+at the start. Writes stay within the queue, because their losses would leave holes for a while, and so does
+everything beside another client, which sends as it likes.
+
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
-stand `pauses`, for cards that pause, and `pacing`, for servers that queue five requests."""
+stand `pauses`, for cards that pause."""
 
 from __future__ import annotations
 
@@ -29,7 +34,6 @@ from dataclasses import dataclass
 from math import inf, sqrt
 
 from mavftpfs.protocol.bucket import Bucket
-from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.pauses import KNOWN, Pauses
 from mavftpfs.protocol.payload import MAX_DATA
 
@@ -70,6 +74,10 @@ start goes on while the rate grows by a quarter."""
 START = 4.0
 """At the start the window grows by one with each answer, to at most four times what fills the path as far as
 it is known."""
+
+START_PACE = 3.0
+"""At the start requests go out at so many times the known rate to a server that queues few, because more at
+once would overflow its queue."""
 
 TICK = 0.005
 """Seconds: a shorter delay is no queue, and no round is shorter. Timers and batches on both ends are not more
@@ -154,7 +162,8 @@ class Flow:
         bwlimit: bytes per second that requests and answers may take together, about.
 
     Attributes:
-        window: requests that may be in flight. cap: the widest window now.
+        window: requests that may be in flight, as far as the path decides.
+        cap: how many may be in flight where the server's queue decides: of writes, and beside another client.
         loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
             server that pauses, does not count.
         alone: no other FTP client was heard lately.
@@ -170,11 +179,10 @@ class Flow:
         self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
         self.window = min(FIRST, self.cap)
-        self._pacer: Pacer | None = None
         self._bucket = Bucket((DEPTH_SERIAL if serial else DEPTH) * FULL, TICK)
         self._bucket.rate = self._bwlimit
         self._cost = float(FULL)  # bytes that a usual request and its answer take on the link
-        self._hurried, self._ready_at = False, inf
+        self._hurried, self._ready_at, self._sent_at = False, inf, -inf
         self._starting, self._flat = True, 0
         self._before_silence = 0
         # What is known of the path.
@@ -196,17 +204,17 @@ class Flow:
     @property
     def pause(self) -> float:
         """Seconds without an answer that prove no loss, because the server pauses; not while `starved`."""
-        return 0.0 if self._pacer is not None else self._pauses.length
+        return self._pauses.length
 
     def set_queue_limit(self, limit: int | None) -> None:
-        """Never have more in flight than the server queues; None if it is not known to be limited."""
+        """Note how many requests the server queues, None if that is not known to be limited."""
         self.cap = self._limit if limit is None else max(1, min(limit, self._limit))
-        self.window = min(self.window, self.cap)
-        if limit is None or self.cap == self._limit:
-            self._pacer = None
-        elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer = Pacer(self.cap, self._limit)
-            self._bucket.rate = self._bwlimit
+        if self._starting:
+            self.window = min(self.window, self.cap)
+
+    @property
+    def _queues_few(self) -> bool:
+        return self.cap < self._limit
 
     # --- what may go out
 
@@ -214,52 +222,48 @@ class Flow:
         """Begin to look at all operations: `room` is called for each that has something to send."""
         self._hurried = self.limited = False
         self._ready_at = inf
-        if self._pacer is not None:
-            self._pacer.begin()
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
-        room = self.window - in_flight
+        capped = self._queues_few and not (paced and self.alone)
+        window = self.cap if capped and not self._before_silence else self.window
+        room = window - in_flight
+        if capped and self.alone and not self._hurried:
+            room += 1  # one more fits a short queue of our own (servers.md 3)
         if urgent:
             self._hurried = True
         elif self._hurried:  # an urgent answer should not queue behind our slack
-            room -= min(SLACK + 1, self.window // 2)
-        elif self.pause:
-            room += int(
-                self._pauses.beyond(now, self._shortest, self._reserve() if paced else 0.0) * self._rate
-            )
-            if self._pauses.grows(now, self._shortest):
-                self._ready_at = min(self._ready_at, now + FIRST / self._rate)
-        if self._pacer is not None:
-            room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
-        if room > 0:
-            # What is urgent may overdraw: a little of it is no load.
-            cost, level = (
-                (FULL, self._bucket.level(now) + DEPTH * FULL)
-                if urgent
-                else (self._cost, self._bucket.level(now))
-            )
-            if level < room * cost:
-                room = max(0, int(level / cost))
-                self._ready_at = min(
-                    self._ready_at, self._bucket.holds_at((room + 1) * cost - DEPTH * FULL * urgent)
-                )
-                self.limited = self._bucket.rate == self._bwlimit
-                self._round.starved |= self.limited
+            room -= min(SLACK + 1, window // 2)
+        elif self.pause and not capped:
+            room += self._beyond(now, self._reserve() if paced else 0.0)
+        if urgent and self._queues_few and in_flight >= self.cap and self._rate > 0.0:
+            # The queue, which is full of what was sent last, would drop it. Nothing else goes out before.
+            due = self._sent_at + self.cap / self._rate
+            if now < due:
+                self._ready_at = due
+                return 0
+        if room > 0 and (not capped or self._bwlimit < inf):
+            room = self._held_back(room, now, urgent)
         return room
 
-    def _set_rate(self, pace: float) -> None:
-        """Let so many chunks go out in a second, if `bwlimit=` allows that. A Pacer has a pace of its own."""
-        self._bucket.rate = min(self._bwlimit, pace * self._cost if self._pacer is None else inf)
+    def _beyond(self, now: float, reserve: float) -> int:
+        """Return for how many requests there is room beyond the window because a server pauses."""
+        if self._pauses.grows(now, self._shortest):
+            self._ready_at = min(self._ready_at, now + FIRST / self._rate)
+        return int(self._pauses.beyond(now, self._shortest, reserve) * self._rate)
 
-    def _room_beside_pacer(
-        self, pacer: Pacer, room: int, in_flight: int, now: float, paced: bool, urgent: bool
-    ) -> int:
-        room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
-        pacer.blocked = False
-        # Others send as they like: beside them no more may be sent than the queue takes.
-        beyond = pacer.room_for_urgent if urgent else pacer.room
-        return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
+    def _held_back(self, room: int, now: float, urgent: bool) -> int:
+        """Return for how many of so many requests there are tokens. What is urgent may overdraw: a little of
+        it is no load."""
+        cost, overdraft = (FULL, DEPTH * FULL) if urgent else (self._cost, 0)
+        level = self._bucket.level(now) + overdraft
+        if level >= room * cost:
+            return room
+        room = max(0, int(level / cost))
+        self._ready_at = min(self._ready_at, self._bucket.holds_at((room + 1) * cost - overdraft))
+        self.limited = self._bucket.rate == self._bwlimit
+        self._round.starved |= self.limited
+        return room
 
     def _reserve(self) -> float:
         """Return for how many seconds answers should wait in the link's queue."""
@@ -267,23 +271,20 @@ class Flow:
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
-        return self._ready_at if self._pacer is None else min(self._ready_at, self._pacer.next_at())
+        return self._ready_at
 
     # --- what happens
 
     def on_sent(self, count: int, size: int, now: float) -> None:
         """Note that so many requests, at least one, go out. There was room for them. size: bytes of data that
         they and their answers carry, at most."""
-        if self._pacer is not None:
-            self._pacer.on_sent(count, now)
         self._bucket.charge(count * OVERHEAD + size)
+        self._sent_at = now
 
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""
         self._round.starved = True
         self._pauses.on_starved()
-        if self._pacer is not None:
-            self._pacer.on_starved()
 
     def on_replies(
         self,
@@ -311,12 +312,10 @@ class Flow:
             this.total += rtt * count
             this.timed += count
         if self._before_silence:
-            self.window, self._before_silence = min(self.cap, self._before_silence), 0
+            self.window, self._before_silence = min(self._limit, self._before_silence), 0
         elif self._starting and not this.starved:
             most = max(2 * FIRST, START * self._to_fill())
-            self.window = max(self.window, min(self.cap, self.window + count, int(most)))
-        if self._pacer is not None:
-            self._pacer.on_replies(now, rtt, count, newest, next_order)
+            self.window = max(self.window, min(self._limit, self.window + count, int(most)))
         over = newest >= this.end and (this.end < 0 or now >= this.began + TICK)
         enough = this.answered >= ROUNDS or self._starting or this.starved
         # At the start a queue grows fast: a few answers that waited in one are enough.
@@ -330,14 +329,14 @@ class Flow:
         pace = inf
         if not self._starting and self._rate > 0.0 and self._shortest >= LEAST_TRIP:
             pace = self._rate * (1.0 if self._rounds % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
-        self._set_rate(pace)
+        elif self._starting and self._rate > 0.0 and self._queues_few:
+            pace = START_PACE * self._rate
+        self._bucket.rate = min(self._bwlimit, pace * self._cost)
         self._round = Round(now, next_order)
 
-    def on_loss(self, order: int) -> None:
-        """Note that the transmission numbered `order` is taken to be lost."""
+    def on_loss(self) -> None:
+        """Note that a request is taken to be lost."""
         self._round.lost += 1
-        if self._pacer is not None:
-            self._pacer.on_loss(order)
 
     def on_spurious(self) -> None:
         """Note that a transmission which was taken to be lost was answered after all."""
@@ -350,8 +349,6 @@ class Flow:
         if not self._before_silence:
             self._before_silence = max(1, self.window // 2)
             self.window = min(PROBE, self.window)
-        if self._pacer is not None:
-            self._pacer.on_silence()
 
     # --- rounds
 
@@ -391,7 +388,7 @@ class Flow:
             spread = min(self._rate * self._spread, to_fill)
             step = STEP * (to_fill + spread) if self._rounds % CYCLE == 0 or rate > before else 0.0
             window = max(LEAST, round(to_fill + SLACK + self._bold * (spread + step)))
-        self.window = min(self.cap, window)
+        self.window = min(self._limit, window)
 
     def _learn_loss(self, this: Round, *, losses: bool) -> None:
         """Average the share of losses. losses: those of this round are the link's."""
@@ -410,7 +407,7 @@ class Flow:
             return
         if self._probing:
             self._probing -= 1
-        elif now >= self._shortest_seen + KNOWN and not (self._starting or self._pacer):
+        elif now >= self._shortest_seen + KNOWN and not self._starting:
             self._probing = 3
         if self._probing == 1:
             self._shortest, self._shortest_seen = this.least, now

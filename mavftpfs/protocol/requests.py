@@ -180,7 +180,7 @@ class Operation:
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
 
     paced = True
-    """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
+    """Whether more may be on the way than a server queues, evenly spread (see `flow`)."""
 
     exclusive = False
     """Whether nothing else goes out until it is answered: the server remembers only its last reply, so it

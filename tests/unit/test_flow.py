@@ -37,7 +37,7 @@ class Path:
         for index in range(window):
             self.now += rtt / window
             if index < lost:
-                self.flow.on_loss(first + index)
+                self.flow.on_loss()
             else:
                 self.flow.on_replies(self.now, rtt, 1, first + index, self.order)
 
@@ -95,10 +95,19 @@ def test_silence_probes_with_two_until_something_is_heard() -> None:
     assert path.window == 2
     path.flow.on_replies(path.now + 5.0, None, 1, 0, path.order)
     assert path.window == before // 2
-    path.flow.on_silence()
+
+
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("paced", [True, False])
+def test_only_reads_of_a_lone_client_go_beyond_a_short_queue(alone: bool, paced: bool) -> None:
+    path = Path(rate=100.0, base=0.1)
     path.flow.set_queue_limit(4)
-    path.flow.on_replies(path.now + 6.0, None, 1, 0, path.order)
-    assert path.window <= 4
+    path.flow.alone = alone
+    path.rounds(60)
+    path.flow.begin()
+    assert (path.flow.room(6, path.now, paced=paced) > 0) is (alone and paced)
+    assert (path.flow.room(4, path.now, paced=paced) > 0) is alone
+    assert path.flow.room(3, path.now, paced=paced) > 0
 
 
 def test_a_longer_way_is_noticed() -> None:
