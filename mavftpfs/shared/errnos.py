@@ -1,12 +1,11 @@
 """The kernel's number for every error. Layer: shared; pure, one total table.
 
-A NAK means different things by request (servers.md 12 and 14.35): FileExists on a read from PX4 is a
-leftover of an older request, FileNotFound on a read from ArduPilot means that the session is gone. So
-the key is (opcode, NAK code), then the code alone, then EIO. Numbers behind FailErrno are those of the
-drone's OS, and some are left from an older failure. So only numbers that make sense for the request are
-passed on.
+A NAK means different things by request (servers.md 12 and 14.35): FileExists on a read from PX4 is left over
+from an older request, FileNotFound on a read from ArduPilot means that the session is gone. So the key is
+(opcode, NAK code), then the code alone, then EIO. Numbers behind FailErrno are those of the drone's OS, and
+some are left over from an older failure. So only numbers that make sense for the request are passed on.
 
-Opcodes and codes are plain numbers here because their enums live one layer up; a test holds them equal.
+Opcodes and codes are plain numbers here, because their enums live one layer up; a test compares them.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _READ, _WRITE, _BURST = 5, 7, 15
 PATH_OPCODES = frozenset(
     {_LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO, _REMOVE, _MKDIR, _RMDIR, _RENAME, _CRC}
 )
-"""Requests that carry a path: only for these can a NAK say something about a name."""
+"""Requests that carry a path, and whose NAK can therefore be about a name."""
 
 _FAIL, _FAIL_ERRNO, _DATA_SIZE, _SESSION, _NO_SESSIONS, _UNKNOWN = 1, 2, 3, 4, 5, 7
 _EXISTS, _PROTECTED, _NOT_FOUND = 8, 9, 10
@@ -38,11 +37,11 @@ _BY_CODE: dict[int, int] = {
 _BY_REQUEST: dict[tuple[int, int], int] = {
     **{(opcode, _DATA_SIZE): errno.ENAMETOOLONG for opcode in PATH_OPCODES},
     **{(opcode, _NOT_FOUND): errno.ENOENT for opcode in PATH_OPCODES},
-    # Elsewhere FileExists is PX4's sticky EEXIST and says nothing (servers.md 12).
+    # Elsewhere FileExists is PX4's sticky EEXIST, and proves nothing (servers.md 12).
     **{(opcode, _EXISTS): errno.EEXIST for opcode in (_CREATE, _MKDIR, _RENAME, _OPEN_WO)},
     # ArduPilot without this opcode answers plain Fail (servers.md 6).
     (_LIST_WITH_TIME, _FAIL): errno.EOPNOTSUPP,
-    # Not the caller's fault: our own request was wrong.
+    # A fault of mavftpfs, not of the caller: its own request was wrong.
     (_READ, _DATA_SIZE): errno.EIO,
     (_BURST, _DATA_SIZE): errno.EIO,
     (_WRITE, _DATA_SIZE): errno.EIO,
@@ -73,7 +72,7 @@ _SAME_ON_ALL = (
 _DRONE_ERRNO: dict[int, int] = {
     **{number: number for number in _SAME_ON_ALL},
     36: errno.ENAMETOOLONG,
-    38: errno.EOPNOTSUPP,  # ENOSYS itself would keep the kernel from ever asking again
+    38: errno.EOPNOTSUPP,  # after ENOSYS itself the kernel would never ask again
     39: errno.ENOTEMPTY,
     40: errno.ELOOP,
     # newlib (ChibiOS, ESP32); on Linux these are socket errors, which no file request can mean
@@ -85,8 +84,8 @@ _DRONE_ERRNO: dict[int, int] = {
 }
 
 _SESSION_ERRNO = frozenset({errno.EIO, errno.EFBIG, errno.ENOSPC, errno.EROFS, errno.ENXIO})
-"""Numbers that a request on an open file may have. It names no path, so numbers about names are left from an
-older failure."""
+"""Numbers that a request on an open file may have. Such a request names no path, so numbers about names are
+left over from an older failure."""
 
 _RMDIR_NOT_EMPTY = frozenset({errno.EEXIST, errno.EISDIR, errno.ENOTEMPTY})
 """RemoveDirectory of a full directory: unlink's EISDIR shows on POSIX ArduPilot (servers.md 9)."""
@@ -133,7 +132,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
 
 
 def errno_for(error: BaseException) -> int:
-    """Return the errno a system call ends with; total: anything unknown is EIO."""
+    """Return the errno with which a system call ends; EIO for every unknown error."""
     if isinstance(error, errors.FtpNak):
         return _errno_of_nak(error.opcode, error.code, error.server_errno)
     for cls in type(error).__mro__:

@@ -47,26 +47,26 @@ class RemoteProtocolError(ProtocolError):
 
 
 class RequestTimeout(MavftpfsError):
-    """No answer, or no progress, within the deadline."""
+    """The vehicle did not answer, or made no progress, within the deadline."""
 
 
 class OutcomeUnknown(RequestTimeout):
-    """A change of the card was not answered, and no listing could tell whether it happened."""
+    """A change of the card was not answered, and a listing could not show whether it happened."""
 
 
 class NotFound(MavftpfsError):
-    """No such name, by a fresh and complete listing (ENOENT)."""
+    """A fresh and complete listing does not have the name (ENOENT)."""
 
 
 class NotADirectory(MavftpfsError):
-    """A directory was needed and the path is a file, or runs through one (ENOTDIR)."""
+    """The call needs a directory, and the path is a file, or leads through one (ENOTDIR)."""
 
 
 class ListingIncomplete(MavftpfsError):
     """The vehicle did not list a directory to its end (EIO).
 
     Attributes:
-        entries: (name, attributes) of what is known to be in it.
+        entries: (name, attributes) of the known entries.
     """
 
     def __init__(self, reason: str, entries: Sequence[tuple[bytes, Any]]) -> None:
@@ -75,7 +75,7 @@ class ListingIncomplete(MavftpfsError):
 
 
 class IsADirectory(MavftpfsError):
-    """A file was needed and the path is a directory (EISDIR)."""
+    """The call needs a file, and the path is a directory (EISDIR)."""
 
 
 class FileChanged(MavftpfsError):
@@ -83,14 +83,14 @@ class FileChanged(MavftpfsError):
 
 
 class DataUnproven(MavftpfsError):
-    """Bytes arrived but could not be proven to belong to the file; they are dropped (EIO)."""
+    """Bytes arrived but cannot be proven to belong to the file; they are dropped (EIO)."""
 
 
 class SessionLost(MavftpfsError):
-    """The server's session is gone, or may be gone: reopen the file and go on at the same offset.
+    """The server's session is gone, or may be gone: reopen the file and continue at the same offset.
 
     Attributes:
-        by_server: an answer said so; else the server was silent.
+        by_server: a reply said so; otherwise the server was silent.
     """
 
     def __init__(self, reason: str, *, by_server: bool = False) -> None:
@@ -99,19 +99,19 @@ class SessionLost(MavftpfsError):
 
 
 class SessionBusy(MavftpfsError):
-    """The server's session stayed taken by someone else (EBUSY)."""
+    """Another client kept the server's session (EBUSY)."""
 
 
 class SessionTaken(SessionBusy):
-    """Another client has a file open in the server's session, and was heard: try again once it is closed."""
+    """Another client that was heard has a file open in the server's session: try again once it is closed."""
 
 
 class Armed(MavftpfsError):
-    """The vehicle is armed (or was never heard), and the request is not carried out in flight."""
+    """The vehicle is armed (or was never heard), and the request must wait for the end of the flight."""
 
 
 class NotDeliveredYet(MavftpfsError):
-    """The vehicle does not have all bytes of the file yet, so it cannot say their checksum (EAGAIN)."""
+    """The vehicle does not have all bytes of the file yet, so it cannot compute their checksum (EAGAIN)."""
 
 
 class ReadOnly(MavftpfsError):
@@ -143,11 +143,11 @@ class InvalidText(MavftpfsError):
 
 
 class NotTaken(MavftpfsError):
-    """The vehicle does not have what a saved text asked for (EIO)."""
+    """The vehicle did not accept all values of a saved text (EIO)."""
 
 
 class NotSupported(MavftpfsError):
-    """This server offers no safe way to do it (EOPNOTSUPP)."""
+    """This server offers no safe way to do this (EOPNOTSUPP)."""
 
 
 class FileTooLarge(MavftpfsError):
@@ -155,11 +155,11 @@ class FileTooLarge(MavftpfsError):
 
 
 class NoSpace(MavftpfsError):
-    """The spool, which keeps what the vehicle does not have yet, is full (ENOSPC)."""
+    """The spool, which keeps pending changes, is full (ENOSPC)."""
 
 
 class SpoolFailed(MavftpfsError):
-    """The local disk that keeps undelivered bytes failed (EIO)."""
+    """The local disk that keeps pending changes failed (EIO)."""
 
 
 class WriteFailed(MavftpfsError):
@@ -167,15 +167,16 @@ class WriteFailed(MavftpfsError):
 
 
 class VerificationFailed(MavftpfsError):
-    """The card has other bytes than were written, and sending them again did not help (EIO)."""
+    """The card has other bytes than those written, and sending them again did not help (EIO)."""
 
 
 class NotVerified(MavftpfsError):
-    """The bytes on the card are in doubt, and the vehicle told no checksum (EIO); they are compared later."""
+    """The bytes on the card are suspect, and the vehicle reported no checksum (EIO); they are compared
+    later."""
 
 
 class MountFailed(MavftpfsError):
-    """The kernel side cannot be set up or taken down."""
+    """The kernel's mount cannot be made or removed."""
 
 
 class NoFtp(MavftpfsError):
@@ -183,11 +184,11 @@ class NoFtp(MavftpfsError):
 
 
 class NotDelivered(MavftpfsError):
-    """No answer proves that the vehicle has the bytes that were written.
+    """No answer proves that the vehicle has the written bytes.
 
     Attributes:
-        there: whether the file is there as it was written. False: it is not, and nothing of it is sent from
-            now on. None: that is not known.
+        there: whether the vehicle has the file as it was written. False: it has the old file, or none, and
+            nothing is sent later. None: unknown.
     """
 
     def __init__(self, reason: str, *, there: bool | None = None) -> None:
@@ -230,8 +231,8 @@ _ERRNOS = {
     28: "the card is full",
     30: "it is read-only",
 }
-"""Words for people, by opcode, NAK code and errno. These errnos are the same on all systems. A message ends
-with the numbers."""
+"""Words for people, by opcode, NAK code and errno. The errnos are those that all systems share. A message
+ends with the numbers."""
 
 
 class FtpNak(MavftpfsError):
@@ -267,7 +268,7 @@ class ExitCode(IntEnum):
     OK = 0
     USAGE = 1
     NO_VEHICLE = 2
-    INCOMPLETE = 2  # of several things some failed
+    INCOMPLETE = 2  # some of several files failed
     MOUNT_FAILED = 3
     UNDELIVERED = 4
     BUG = 70
@@ -283,10 +284,10 @@ EXIT_CODES = {
     ExitCode.BUG: "a bug in mavftpfs",
     ExitCode.INTERRUPTED: "interrupted; 128 and the number of the signal for others",
 }
-"""The meaning of each, for the man page."""
+"""The meaning of each code, for the man page."""
 
 SIGNALLED = 128
-"""This plus a signal's number is the exit code of a command that the signal ended, as in shells."""
+"""A command that a signal ended exits with this plus the signal's number, as in shells."""
 
 
 _NOT_POSSIBLE = (
@@ -294,18 +295,18 @@ _NOT_POSSIBLE = (
     *(NotFound, NotADirectory, IsADirectory, AlreadyExists, DirectoryNotEmpty, InvalidMove, CrossDevice),
     *(ReadOnly, Armed, FileBusy, NotSupported, InvalidText, LocalProtocolError),
 )
-"""The vehicle is there, but cannot do what was asked with the files as they are."""
+"""The vehicle answers, but cannot do the request with the files as they are."""
 
 _CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
     *((cls, ExitCode.USAGE) for cls in _NOT_POSSIBLE),
     (NotDelivered, ExitCode.UNDELIVERED),
     (MountFailed, ExitCode.MOUNT_FAILED),
 )
-"""All others: NO_VEHICLE, no right answer came from it."""
+"""All other errors: NO_VEHICLE, because no right answer arrived."""
 
 
 def exit_code_for(error: MavftpfsError) -> ExitCode:
-    """Return the exit code an error ends a command with."""
+    """Return the exit code of a command that an error ends."""
     for cls, code in _CODES:
         if isinstance(error, cls):
             return code

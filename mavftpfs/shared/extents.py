@@ -22,7 +22,7 @@ class ExtentSet:
             self.add(start, stop)
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Yield the present (start, stop) in ascending order; the set may be changed meanwhile."""
+        """Yield the present (start, stop) in ascending order; the caller may change the set meanwhile."""
         return iter(list(zip(self._starts, self._stops, strict=True)))
 
     def __len__(self) -> int:
@@ -45,7 +45,7 @@ class ExtentSet:
 
     @property
     def empty(self) -> bool:
-        """True if no byte is in the set."""
+        """Whether no byte is in the set."""
         return not self._starts
 
     @property
@@ -63,7 +63,7 @@ class ExtentSet:
         if start >= stop:
             return
         starts, stops = self._starts, self._stops
-        if starts and starts[-1] <= start <= stops[-1]:  # how a file grows, chunk by chunk
+        if starts and starts[-1] <= start <= stops[-1]:  # a file that grows chunk by chunk
             if stop > stops[-1]:
                 stops[-1] = stop
             return
@@ -79,7 +79,7 @@ class ExtentSet:
         """Remove [start, stop) where present."""
         if start >= stop or not self._starts:
             return
-        if start <= self._starts[0] and stop < self._stops[0]:  # how a file is sent, chunk by chunk
+        if start <= self._starts[0] and stop < self._stops[0]:  # a file that is sent chunk by chunk
             self._starts[0] = max(stop, self._starts[0])
             return
         first = bisect_right(self._stops, start)

@@ -33,7 +33,8 @@ class EntryKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class DirEntry:
-    """One listed name. size: bytes, 0 for directories. mtime: seconds UTC, None if the server told none."""
+    """One listed name. size: bytes, 0 for directories. mtime: seconds UTC, None if the server reports no
+    times."""
 
     name: bytes
     kind: EntryKind
@@ -43,10 +44,10 @@ class DirEntry:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """A whole directory, duplicates and unusable names removed.
+    """A whole directory, without duplicates and unusable names.
 
-    took: seconds the sweep needed. complete: False when the vehicle did not show all (absence then proves
-    nothing). unshown: how many names could not be shown. end: see ListDirectory.
+    took: seconds that the sweep needed. complete: False if the vehicle did not show everything, so that
+    absence proves nothing. unshown: number of names that could not be shown. end: see ListDirectory.
     """
 
     entries: tuple[DirEntry, ...]
@@ -84,19 +85,19 @@ def normalise(path: bytes) -> bytes:
     """Return the absolute path without empty and `.` parts.
 
     Raises:
-        LocalProtocolError: `..` or a NUL occurs (servers do not jail paths, servers.md 13).
+        LocalProtocolError: the path contains `..` or a NUL (servers do not jail paths, servers.md 13).
     """
     parts = [part for part in path.split(b"/") if part not in (b"", b".")]
     if b".." in parts or b"\0" in path:
-        raise LocalProtocolError(f"path {path!r} may hold neither '..' nor NUL")
+        raise LocalProtocolError(f"path {path!r} may contain neither '..' nor NUL")
     return b"/" + b"/".join(parts)
 
 
 def is_virtual(path: bytes) -> bool:
     """Return whether the path lies in an `@` tree.
 
-    Only the prefix decides (servers.md 14.13). A server without such trees may have an ordinary file `/@x`.
-    No listing tells the two apart, and a write to `@PARAM` would change the vehicle.
+    Only the prefix decides (servers.md 14.13). A server without such trees may have an ordinary file `/@x`,
+    but no listing distinguishes the two, and a write to `@PARAM` would change the vehicle.
     """
     return path.startswith(b"/@")
 
@@ -108,8 +109,8 @@ def is_on_nuttx(path: bytes) -> bool:
 
 def is_snapshot(path: bytes) -> bool:
     """Return whether the vehicle generates the `@` file at each opening, so that a client must read it whole.
-    The logs below `@MAV_LOG` are real files, and those of `@ROMFS` are like them: they have true sizes and do
-    not change."""
+    The logs below `@MAV_LOG` are real files. Those of `@ROMFS` resemble real files: their sizes are true, and
+    they do not change."""
     return is_virtual(path) and path.split(b"/", 2)[1] not in (b"@MAV_LOG", b"@ROMFS")
 
 
@@ -117,7 +118,7 @@ def wire_path(path: bytes) -> bytes:
     """Return the server's spelling of a normalised path.
 
     Raises:
-        PathTooLong: the path does not fit (servers cut silently, servers.md 13).
+        PathTooLong: the path does not fit (servers cut it silently, servers.md 13).
     """
     wire = path[1:] if is_virtual(path) else path
     if len(wire) > MAX_WIRE_PATH:
@@ -126,15 +127,15 @@ def wire_path(path: bytes) -> bytes:
 
 
 def require_listable(path: bytes) -> None:
-    """Check that a listing could show a new name. A file that no listing shows can be neither found nor
+    """Check that a listing could show a new name, because a file without a listing can be neither found nor
     removed.
 
     Raises:
-        LocalProtocolError: the name holds a tab, which ends a name in a listing (servers.md 6, 14.33).
+        LocalProtocolError: the name contains a tab, which ends a name in a listing (servers.md 6, 14.33).
     """
     name = split(path)[1]
     if b"\t" in name:
-        raise LocalProtocolError(f"{name!r} holds a tab, so no listing could show it")
+        raise LocalProtocolError(f"{name!r} contains a tab, so no listing could show it")
 
 
 def usable_name(name: bytes) -> bool:
@@ -144,28 +145,29 @@ def usable_name(name: bytes) -> bool:
 
 # -- traits of a server ------------------------------------------------------------------------------
 #
-# None means "not seen yet". Nothing here is derived from a name or a version: the engine fills a field when
-# an answer proves it, and forgets all of them when the vehicle restarts.
+# None means "not seen yet". No trait is derived from a name or a version: the engine sets a field when a
+# reply proves it, and forgets all of them when the vehicle restarts.
 
 SHARED_QUEUE_WINDOW = 4
-"""Requests in flight where the server has a queue of five for all clients (servers.md 3, ArduPilot)."""
+"""Requests in flight if the server has a queue of five for all clients (servers.md 3, ArduPilot)."""
 
 
 @dataclass(slots=True)
 class Traits:
-    """Observed facts about one server; dropped when the vehicle reboots.
+    """Observed facts about one server; forgotten when the vehicle reboots.
 
     Attributes:
-        ack_carries_own_session: an Open ACK carried the non-zero id we had asked for (servers.md 14.6);
-            then every reply echoes the request's session, and it is checked.
-        several_sessions: the server answered us while another client had a session (ArduPilot, generation B).
+        ack_carries_own_session: an Open ACK carried the non-zero id that the request asked for (servers.md
+            14.6); then every reply echoes the request's session, and the engine checks it.
+        several_sessions: the server answered mavftpfs while another client had a session (ArduPilot,
+            generation B).
         queue_limit: the most requests that may be in flight; None where no limit is known.
-        write_ack_offset: WriteFile ACKs say where bytes were written (MAVSDK's say 0), and are believed only
-            if that is the place.
+        write_ack_offset: WriteFile ACKs give the offset of the written bytes (MAVSDK's give 0), so an ACK
+            counts only for that offset.
         paths_block_writes: a path operation made the server refuse the next write (PX4 on NuttX, servers.md
             8).
-        lists_times: the server answers opcode 16. time_silences: how often the server did not answer that,
-            and then answered opcode 3.
+        lists_times: the server answers opcode 16. time_silences: how often the server did not answer opcode
+            16, and then answered opcode 3.
         wo_truncates: OpenFileWO empties the file (servers.md 8).
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
@@ -183,6 +185,6 @@ class Traits:
     rename_replaces: bool | None = None
 
     def forget(self) -> None:
-        """Forget all: the server restarted, perhaps as another one."""
+        """Forget all traits, because the server restarted, perhaps as another one."""
         for fact in fields(self):
             setattr(self, fact.name, fact.default)

@@ -24,11 +24,11 @@ NumberT = TypeVar("NumberT", int, float)
 # -- types ----------------------------------------------------------------------------------------
 
 Parser = Callable[[str], Any]
-"""Parses the text of a value; raises ValueError, which says what it should have been."""
+"""Parses the text of a value; raises ValueError, which says what the text should be."""
 
 
 class Type(NamedTuple):
-    """Type of an option's values. written: returns a value as `parse` takes it.
+    """Type of an option's values. written: returns a value in the spelling that `parse` accepts.
 
     words: the only texts that are values, if there are few. is_file: values are paths on this computer.
     """
@@ -44,7 +44,7 @@ def _is_number(text: str) -> bool:
 
 
 def _with_unit(value: float) -> str:
-    """Return a size as it may be written."""
+    """Return a size in the spelling of the command line."""
     units = [(unit, factor) for unit, factor in _UNITS.items() if value and value % factor == 0]
     unit, factor = max(units, key=lambda pair: pair[1], default=("", 1))
     return f"{value // factor:.0f}{unit}"
@@ -143,10 +143,10 @@ _ID = number(0, 2**32 - 2)
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A row of the table. default: as people read it. type: None for an option without a value.
+    """A row of the table. default: in words. type: None for an option without a value.
 
-    words: the words of an option without a value, and what each sets the field to. many: the option may be
-    given several times, and all values count. of_kernel: it means nothing without a mount.
+    words: the words of an option without a value, and the field's value for each. many: the option may be
+    given several times, and all values count. of_kernel: the option has no effect without a mount.
     """
 
     field: str
@@ -159,13 +159,13 @@ class Option:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """How the option is written: `ro` and `rw`, or `chunk=`."""
+        """The option's spellings: `ro` and `rw`, or `chunk=`."""
         return (f"{self.field}=",) if self.type is not None else tuple(word for word, _ in self.words)
 
 
 def valued(default: Any, kind: Type, help: str, *, shown: str = "", **more: bool) -> Any:
-    """Return the field of an option with a value. shown: the default as people read it, if `kind` cannot
-    write it; more: as in Option."""
+    """Return the field of an option with a value. shown: the default in words, if `kind` cannot write it;
+    more: as in Option."""
     row = {"type": kind, "help": help, "default": shown or kind.written(default), **more}
     return field(default=default, metadata=row)
 
@@ -179,10 +179,10 @@ def switch(words: Mapping[str, bool], help: str, **more: bool) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to reach a vehicle and how to treat its files.
+    """The way to reach a vehicle and to treat its files.
 
-    Seconds, bytes, bytes per second and permission bits; None = found out, or not wanted. SOURCE sets root;
-    baud overrides that of SOURCE. kernel_words: words of `-o` that libfuse takes. local: files of
+    Seconds, bytes, bytes per second and permission bits; None = determined at run time, or unset. SOURCE sets
+    root; baud overrides that of SOURCE. kernel_words: words of `-o` for libfuse. local: files of
     `cache.localfiles` never reach the vehicle.
     """
 
@@ -207,7 +207,7 @@ class Options:
     )
     all: bool = switch(
         {"all": True},
-        "mount each vehicle that is heard, below the mountpoint by its system id",
+        "mount each vehicle that sends heartbeats, below the mountpoint by its system id",
         of_kernel=True,
     )
     kernel_words: tuple[str, ...] = ()
@@ -219,7 +219,7 @@ class Options:
     forward: tuple[str, ...] = valued(
         (),
         Type(_not_empty),
-        "endpoint to pass all frames to and from, written like SOURCE; may be repeated",
+        "endpoint to exchange all frames with, written like SOURCE; may be repeated",
         shown="none",
         many=True,
     )
@@ -267,7 +267,7 @@ class Options:
     local: bool = True
     tlog: str | None = valued(None, LOCAL_FILE, "file for a raw MAVLink log of the link", shown="none")
     gone: tuple[str, ...] = field(default=(), compare=False)
-    """A line for people about each word of 0.2 that was given and is gone."""
+    """A line for people about each removed word of 0.2 that was given."""
 
 
 def parsed_by(parse: Parser, name: str, text: str) -> Any:

@@ -17,7 +17,7 @@ _MAX_SOCKET_PATH = 107
 def open_private(path: str | Path, flags: int) -> int:
     """Open a file for writing, and make it with mode 0600 if it is missing; return its descriptor.
 
-    flags: of os.open, O_CREAT and O_CLOEXEC are added.
+    flags: of os.open; the function adds O_CREAT and O_CLOEXEC.
 
     Raises:
         OSError: among others if the path is a symbolic link, which is not followed (ELOOP).
@@ -31,7 +31,7 @@ def open_private(path: str | Path, flags: int) -> int:
 
 
 def make_private_directory(path: Path) -> None:
-    """Make a directory with mode 0700, and the missing ones above it; an existing one stays as it is.
+    """Make a directory with mode 0700, and the missing ones above it; an existing one keeps its mode.
 
     Raises:
         OSError.
@@ -45,9 +45,9 @@ def make_private_directory(path: Path) -> None:
 
 
 def own_directories() -> list[Path]:
-    """Return where this user's sockets may lie, the preferred place first.
+    """Return the directories for this user's sockets, the preferred one first.
 
-    A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
+    A mount from fstab has no XDG_RUNTIME_DIR, but a shell of the same user has one, so programs search all.
     """
     runtime, home = os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("HOME")
     with suppress(KeyError):
@@ -58,8 +58,8 @@ def own_directories() -> list[Path]:
 
 
 def private_directory(directories: list[Path], *, longest_name: int) -> Path | None:
-    """Return the first directory that belongs to this user alone, or can be made so, and in which the path of
-    a socket with such a long name fits; None if there is none."""
+    """Return the first directory that belongs to this user alone, or can be made so, and that is short enough
+    for the path of a socket with such a long name; None if there is none."""
     for directory in directories:
         try:
             # Not parents=True for a runtime directory: only the system creates /run/user/UID.

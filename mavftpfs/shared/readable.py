@@ -1,4 +1,4 @@
-"""Names and numbers of the vehicle as a person reads them. Layer: shared; pure."""
+"""The vehicle's names and numbers in text for people. Layer: shared; pure."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 """All control characters but tabs and line ends."""
 
 _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
-"""MAV_AUTOPILOT values people meet."""
+"""Common MAV_AUTOPILOT values."""
 
 
 def readable(message: str) -> str:
-    """Return a message in which names, which are bytes, are text: `b'/Fl\\xc3\\xbcge'` is `'/Flüge'`.
+    """Return a message in which byte strings, such as names, are text: `b'/Fl\\xc3\\xbcge'` is `'/Flüge'`.
 
-    Bytes that are no UTF-8 stay escaped. A character that a terminal would obey becomes `?`.
+    Bytes that are not UTF-8 stay escaped. A character that a terminal would obey becomes `?`.
     """
     return _CONTROL.sub("?", _BYTES.sub(_as_text, message))
 
 
 def name_text(name: bytes) -> str:
-    """Return a name or path as text, with escapes for bytes that are no UTF-8."""
+    """Return a name or path as text, with escapes for bytes that are not UTF-8."""
     return name.decode("utf-8", "backslashreplace")
 
 
@@ -38,7 +38,7 @@ def autopilot_name(number: int) -> str:
 
 
 def readable_size(count: float) -> str:
-    """Return a number of bytes with a unit; kB = 1000 bytes, everywhere that people read."""
+    """Return a number of bytes with a unit; kB = 1000 bytes in all texts for people."""
     for unit in ("B", "kB", "MB"):
         if round(count, 0 if unit == "B" else 1) < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -52,7 +52,7 @@ def count_files(count: int) -> str:
 
 
 def readable_time(seconds: float) -> str:
-    """Return a duration as people say it: 40 ms, 12 s, 3 min 20 s, 2 h 5 min."""
+    """Return a duration in words: 40 ms, 12 s, 3 min 20 s, 2 h 5 min."""
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
     whole = round(seconds)
@@ -65,7 +65,7 @@ def readable_time(seconds: float) -> str:
 
 
 def time_left(seconds: float) -> str:
-    """Return how much longer it takes, at least a second."""
+    """Return the remaining time in words, at least a second."""
     return f"{readable_time(max(1.0, seconds))} left"
 
 

@@ -1,4 +1,4 @@
-"""Why a change is refused as read-only (EROFS), in words. Layer: shared; pure."""
+"""The reasons why a change is refused as read-only (EROFS), in words. Layer: shared; pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from mavftpfs.shared.readable import name_text
 ARMED = "the vehicle is armed: nothing is written in flight (when_armed=ro)"
 
 WAS_ARMED = "the vehicle was armed (when_armed=ro)"
-"""The same words once they are told later, of a write that failed."""
+"""The same words for a write that failed earlier."""
 
 NOTHING_BY_OPTION = "nothing is changed, because the option ro was given"
 
@@ -19,4 +19,4 @@ def by_option(path: bytes) -> str:
 
 def virtual(path: bytes) -> str:
     """Return the words for a path below an `@` directory."""
-    return f"'{name_text(path)}' is not changed: what the vehicle shows below @ can only be read"
+    return f"'{name_text(path)}' is not changed: the vehicle's @ directories are read-only"

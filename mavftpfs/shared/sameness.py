@@ -1,9 +1,9 @@
-"""Is it still the same file? Layer: shared; pure.
+"""Revalidation: is it still the same file? Layer: shared; pure.
 
-A version of a file is its size, and its modification time where listings tell one. The vehicle shows a file
+A version of a file is its size, and its modification time where listings report one. The vehicle shows a file
 in three ways: the reply to an open has a size; a listing has a size and perhaps a time; and there is the
-CRC32. `compare` compares what was seen with what is known. Whether that is the same file is decided here for
-readers, and for drafts and their deliveries. What follows is the callers' business.
+CRC32. `compare` compares an observation with the known version. The decision is made here, for readers as
+well as for pending changes and their uploads. The callers decide about the consequences.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ class Sameness(Enum):
     """An answer of `compare`."""
 
     SAME = "same"
-    """All that was told agrees."""
+    """All reported facts agree."""
     GREW = "grew"
-    """It is the same file, and bytes were appended to it: logs grow."""
+    """The file is the same, and bytes were appended to it, as to a log."""
     UNDECIDED = "undecided"
-    """Nothing contradicts, but nothing proves it. The caller asks for more, or trusts what it knew before."""
+    """Nothing contradicts, but nothing proves it. The caller asks for more, or trusts the version known so
+    far."""
     OTHER = "other"
-    """Another file has the name, or none has it."""
+    """Another file has the name, or no file has it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known of a file.
+    """The known version of a file: a validator.
 
-    size: in bytes. mtime: in seconds UTC, None if none was told of that size. crc32: None if it is not known.
-    restarted: the vehicle restarted since the last proof. After a restart no program goes on writing an old
-    file.
-    at_open: a program opens it now. Then equal sizes are no proof where no time is told.
+    size: in bytes. mtime: in seconds UTC, None if the vehicle reported none for that size. crc32: None if
+    unknown. restarted: the vehicle restarted since the last proof. After a restart no program continues
+    writing an old file. at_open: a program is opening the file. Then equal sizes prove nothing if the vehicle
+    reports no times.
     """
 
     size: int
@@ -53,7 +54,7 @@ class Opened:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """What a listing shows under the name, None if nothing. complete: the listing came to its end."""
+    """The file in a listing, None if the name is absent. complete: the listing has all names."""
 
     entry: DirEntry | None
     complete: bool = True
@@ -61,7 +62,7 @@ class Listed:
 
 @dataclass(frozen=True, slots=True)
 class Summed:
-    """The CRC32 that the vehicle told."""
+    """The CRC32 that the vehicle reported."""
 
     crc32: int
 
@@ -70,7 +71,7 @@ Seen = Opened | Listed | Summed
 
 
 def compare(known: Known, seen: Seen) -> Sameness:
-    """Return whether what was seen is still the file that is known."""
+    """Return whether an observed file matches the known version."""
     match seen:
         case Opened():
             return _by_open(known, seen)
@@ -84,7 +85,7 @@ def _by_open(known: Known, seen: Opened) -> Sameness:
     if seen.size < known.size:
         return Sameness.OTHER
     if known.restarted or known.mtime is not None:
-        return Sameness.UNDECIDED  # a listing tells more
+        return Sameness.UNDECIDED  # a listing says more
     return Sameness.SAME if seen.size == known.size else Sameness.GREW
 
 

@@ -1,8 +1,8 @@
-"""What of a file is to be sent, is on its way, and is known to be on the card. Layer: shared; pure.
+"""The bytes of a file that are to be sent, in flight, or on the card. Layer: shared; pure.
 
 The cache makes a `SendBuffer` for each attempt to send a file, and reports changes to it. The session takes
-chunks from it, and reports what became of them. Each attempt has its own buffer, so an upload of an earlier
-attempt changes nothing of the present one.
+chunks from the buffer, and reports their fate. Each attempt has its own buffer, so an upload of an earlier
+attempt cannot change the present one.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ FULL = 239
 class SendBuffer:
     """One attempt to send a file of `size` bytes, which `read(start, stop)` returns; it raises MavftpfsError.
 
-    Chunks are handed out from the file's beginning to its end. Bytes that were handed out may not change: two
-    copies of one byte could reach the card in the wrong order.
+    The buffer hands out chunks from the file's beginning to its end. Bytes that were handed out may not
+    change, because two copies of one byte could reach the card in the wrong order.
 
     Attributes:
-        ranges: bytes that are to be sent, and bytes that are on their way. acked: bytes ACKed since the file
-            was last closed. proven: bytes ACKed before it was last closed.
+        ranges: bytes that are to be sent, and bytes in flight. acked: bytes ACKed since the file was last
+            closed. proven: bytes ACKed before the file was last closed.
         has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
-        begun: the file was made, or emptied, for it: CreateFile went out.
+        begun: CreateFile was sent, so the file was made, or emptied, for this attempt.
         handed_out: one past the highest byte that was ever handed out.
-        overtaken: bytes changed, or were cut off, after they were handed out: the file has to be sent again.
+        overtaken: bytes changed, or were cut off, after they were handed out, so the file must be sent again.
         reached: one past the highest byte that was ACKed; after the session was lost, one past the highest
             proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
@@ -40,7 +40,7 @@ class SendBuffer:
     def __init__(
         self, read: Callable[[int, int], bytes], size: int, progress: Callable[[int], None] | None = None
     ) -> None:
-        """`progress(count)` is called for each ACK, with its number of bytes."""
+        """Make a buffer; it calls `progress(count)` for each ACK, with its number of bytes."""
         self.size = size
         self.ranges = Ranges()
         self.ranges.todo.add(0, size)
@@ -59,7 +59,7 @@ class SendBuffer:
         return self.size - self.acked.total - self.proven.total
 
     def on_changed(self, start: int, size: int) -> None:
-        """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
+        """Note that the file changed from `start` on, perhaps to its end, and has `size` bytes now."""
         self.overtaken |= start < self.handed_out
         if size > self.size:
             self.ranges.todo.add(self.size, size)
@@ -70,11 +70,11 @@ class SendBuffer:
             self._ahead = (0, b"")
 
     def has_more(self) -> bool:
-        """Return whether there is something to send now."""
+        """Return whether there are bytes to send now."""
         return self._next(FULL) is not None
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """Return (offset, at most `limit` bytes), which count as on their way; None: nothing for now.
+        """Return (offset, at most `limit` bytes), which count as in flight; None: nothing for now.
 
         Raises:
             MavftpfsError: the bytes could not be read. The next call tries again.
@@ -94,7 +94,7 @@ class SendBuffer:
         return start, ahead[start - at : stop - at]
 
     def on_acked(self, start: int, stop: int) -> None:
-        """These bytes were ACKed as written. Those that were not ACKed before are progress."""
+        """Note that these bytes were ACKed as written. Bytes ACKed for the first time are progress."""
         before = self.acked.total
         self.ranges.on_done(start, stop)
         self.acked.add(start, stop)
@@ -103,14 +103,14 @@ class SendBuffer:
             self._progress(self.acked.total - before)
 
     def check_point(self) -> None:
-        """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
+        """Note that Terminate was ACKed: all bytes ACKed before are proven written (not yet verified)."""
         self.has_checkpoint = True
         for start, stop in self.acked:
             self.proven.add(start, stop)
         self.acked = ExtentSet()
 
     def roll_back(self) -> None:
-        """The session was lost, and all that is not proven with it: that is to be sent again."""
+        """Note that the session was lost: all bytes without proof must be sent again."""
         self.acked = ExtentSet()
         self.reached = self.proven.end
         self.ranges = Ranges()
@@ -118,7 +118,7 @@ class SendBuffer:
             self.ranges.todo.add(start, stop)
 
     def start_over(self) -> None:
-        """The file is made anew, so nothing of it is proven."""
+        """Note that the file is made anew, so no byte is proven."""
         self.begun, self.has_checkpoint, self.proven = True, False, ExtentSet()
         self.roll_back()
 

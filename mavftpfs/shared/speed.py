@@ -1,4 +1,4 @@
-"""The speed of a transfer, as people see it. Layer: shared; pure."""
+"""The speed of a transfer, for people. Layer: shared; pure."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from math import inf
 class Speed:
     """The mean over the last SPAN seconds, pauses included; None before it is known.
 
-    The first bytes of a transfer, and those after a pause, tell nothing: they come at the speed of the
-    buffers on the way. All times in seconds of one clock.
+    The first bytes of a transfer, and those after a pause, do not count, because they arrive at the speed of
+    the buffers on the way. All times in seconds of one clock.
     """
 
     SPAN = 10.0
     KNOWN = 2.0
-    """Seconds over which bytes were seen before a speed is told."""
+    """Seconds with bytes before a speed is reported."""
     SETTLING = 1.0
     """Seconds from the first byte until they count."""
     PAUSE = 5.0
@@ -41,7 +41,7 @@ class Speed:
                 samples.popleft()
 
     def at(self, now: float) -> float | None:
-        """Return bytes per second, None while they are not known."""
+        """Return bytes per second, None while unknown."""
         if not self._samples or now - self._last > self.PAUSE:
             return None
         began, before = self._samples[0]

@@ -171,7 +171,7 @@ REASONS = {
     "ro": ("/d/f", r"because the option ro was given\n"),
     "armed": ("/d/f", r"the vehicle is armed: nothing is written in flight \(when_armed=ro\)\n"),
     "card": ("/d/f", r"it is read-only \(opcode \d+, NAK 2"),
-    "virtual": ("/@SYS/uarts.txt", r"what the vehicle shows below @ can only be read\n"),
+    "virtual": ("/@SYS/uarts.txt", r"the vehicle's @ directories are read-only\n"),
 }
 
 
