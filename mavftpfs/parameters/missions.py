@@ -6,7 +6,7 @@ options, first item, items) and 38 bytes an item, those of MAVLink's MISSION_ITE
 longitude are degrees times ten million, x and y of local frames metres times ten thousand, and plain
 numbers where the command has no place.
 
-A vehicle does not store every field of an item, so some fields read back differently. `differences` tells
+A vehicle does not store every field of an item, so some fields read back differently. `differences` decides
 which differences count.
 """
 
@@ -32,7 +32,7 @@ _MOST = 65535
 
 _DEGREES, _METRES, _PLAIN = 1e7, 1e4, 1.0
 _NO_PLACE = 2**31 - 1
-"""x or y of an item without a place: the vehicle uses its own position (MISSION_ITEM_INT)."""
+"""x or y of an item without a place, for which the vehicle uses its own position (MISSION_ITEM_INT)."""
 
 _GLOBAL = frozenset((0, 3, 5, 6, 10, 11))
 _SAME_FRAME = {5: 0, 6: 3, 11: 10}
@@ -136,8 +136,8 @@ def _place_text(value: int, scale: float) -> str:
 
 
 def parse(text: str) -> tuple[list[Item], list[Problem]]:
-    """Read a file. Items are numbered from 0, in the order of their lines: if the first is missing, the next
-    one would be taken for the vehicle's home.
+    """Read a file. Items are numbered from 0, in the order of their lines, because a vehicle would take the
+    second item for its home if the first one were missing.
     """
     items: list[Item] = []
     problems: list[Problem] = []
@@ -168,9 +168,9 @@ def parse(text: str) -> tuple[list[Item], list[Problem]]:
 def _parse_item(line: str, place: int) -> Item:
     fields = line.split()
     if len(fields) != _FIELDS:
-        raise BadValue(f"an item has {_FIELDS} numbers, and here are {len(fields)}")
+        raise BadValue(f"an item needs {_FIELDS} numbers, but this line has {len(fields)}")
     if _whole(fields[0], _MOST, "the number of an item") != min(place, _MOST):
-        raise BadValue(f"this is item {place}, and its number is {fields[0]}: they count from 0")
+        raise BadValue(f"this is item {place}, but its number is {fields[0]}: items count from 0")
     current, frame = _whole(fields[1], 255, "current"), _whole(fields[2], 255, "the frame")
     command, autocontinue = _whole(fields[3], _MOST, "the command"), _whole(fields[11], 255, "autocontinue")
     one, two, three, four = (_float(field) for field in fields[4:8])
@@ -181,19 +181,19 @@ def _parse_item(line: str, place: int) -> Item:
         _require_degrees(fields[9], y, 180, "longitude")
     z = _float(fields[10])
     if not math.isfinite(z):
-        raise BadValue(f"{fields[10]} is no height")
+        raise BadValue(f"{fields[10]} is not a height")
     return Item(frame, command, bare.parameters, x, y, z, current, autocontinue)
 
 
 def _require_degrees(text: str, scaled: int, most: int, what: str) -> None:
     if abs(scaled) > most * _DEGREES and scaled != _NO_PLACE:
-        raise BadValue(f"{text} is no {what}: from -{most} to {most}")
+        raise BadValue(f"{text} is not a {what}: from -{most} to {most}")
 
 
 def _whole(text: str, most: int, what: str) -> int:
     number = parse_number(text)
     if number != number or not 0 <= number <= most or number != int(number):
-        raise BadValue(f"{what} is no whole number up to {most}: {text}")
+        raise BadValue(f"{what} is not a whole number up to {most}: {text}")
     return int(number)
 
 
@@ -208,7 +208,7 @@ def _scaled(text: str, scale: float) -> int:
     number = parse_number(text)
     scaled = round(number * scale) if abs(number) <= 2**31 else 2**31
     if not -(2**31) <= scaled < 2**31:
-        raise BadValue(f"{text} is no place")
+        raise BadValue(f"{text} is not a place")
     return scaled
 
 

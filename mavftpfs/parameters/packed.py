@@ -41,8 +41,8 @@ _NAME = re.compile(rb"(?![^,#=]*[,#=])[!-~]{1,16}")
 class Download:
     """The content of a packed file.
 
-    total: how many parameters the vehicle has. with_defaults: a parameter without a default has its value as
-    the default.
+    total: the number of the vehicle's parameters. with_defaults: a parameter without a default has its value
+    as the default.
     """
 
     parameters: list[Parameter]

@@ -1,8 +1,9 @@
 """Saving a text of parameters: the changes that it asks for, and their result. Layer: parameters; pure.
 
-A program that saves a text of all parameters means only the lines that it changed: counters, barometers and
-learned values have changed on the vehicle since it read them. So a save has a *base*: the text that the same
-program read before. Lines that equal the base ask for nothing. Without a base (`cp`, `>`) every line counts.
+A program that saves a text of all parameters means only the lines that it changed, because counters,
+barometers and learned values have changed on the vehicle since it read them. So a save has a *base*: the text
+that the same program read before. Lines that equal the base ask for nothing. Without a base (`cp`, `>`) every
+line counts.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Values = Mapping[str, Parameter]
 
 Base = Mapping[str, Parameter | None]
 """The parameters that a program read, by name. None: the program saved another value since, so that its line
-counts in any case."""
+always counts."""
 
 
 def unchanged(line: Line, base: Base) -> bool:
@@ -39,8 +40,8 @@ def pick_base(lines: Sequence[Line], bases: Sequence[Base], *, rereads: bool) ->
     last.
 
     bases: the texts that the program read, the oldest first. rereads: the program reads the file again to
-    make a backup, as vim does. Otherwise a text that equals an older base counts against the last one: the
-    program knew that, and goes back.
+    make a backup, as vim does. Otherwise a text that equals an older base is compared with the last one,
+    because the program knew the last one and now restores the older values.
     """
     if len(bases) < 2:
         return bases[0] if bases else None
@@ -71,8 +72,8 @@ class Plan:
 def make_plan(lines: Sequence[Line], base: Base | None, current: Values, *, meant: bool) -> Plan:
     """Compare a text with the vehicle's parameters.
 
-    meant: the user wrote each line by itself (`>>`), so even a parameter that the vehicle sets by itself is
-    set.
+    meant: the user wrote each line by itself (`>>`), so the plan also sets parameters that the vehicle sets
+    by itself.
     """
     plan = Plan()
     left_alone: list[str] = []
@@ -98,18 +99,18 @@ def make_plan(lines: Sequence[Line], base: Base | None, current: Values, *, mean
         else:
             plan.wanted.append(Parameter(line.name, now.kind, value))
     if left_alone:
-        plan.notes.append(f"left alone, because the vehicle sets them by itself: {', '.join(left_alone)}")
+        plan.notes.append(f"not changed, because the vehicle sets them by itself: {', '.join(left_alone)}")
     return plan
 
 
 def _conflict(now: Parameter, wanted: Number, before: Number) -> str:
     was, has, want = (text_of(now.kind, value) for value in (before, now.value, wanted))
-    return f"{now.name}: it was {was} and has become {has} on the vehicle meanwhile; wanted {want}"
+    return f"{now.name}: it was {was}, and the vehicle changed it to {has} meanwhile; wanted {want}"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The result of a plan: the parameters that the vehicle took, a line for each that it did not, and
+    """The result of a plan: the parameters that the vehicle accepted, a line for each that it did not, and
     notes."""
 
     taken: list[str]
@@ -124,12 +125,12 @@ def judge(wanted: Sequence[Parameter], after: Values) -> Verdict:
         now = after.get(one.name)
         want = text_of(one.kind, one.value)
         if now is None:
-            verdict.missed.append(f"{one.name}: wanted {want}, and it is not there any more")
+            verdict.missed.append(f"{one.name}: wanted {want}, but the vehicle has no such parameter now")
         elif same(now.value, one.value):
             verdict.taken.append(one.name)
         elif is_own(one.name):
             got = text_of(now.kind, now.value)
-            verdict.notes.append(f"{one.name} is the vehicle's own: wanted {want}, it is {got}")
+            verdict.notes.append(f"{one.name} is set by the vehicle itself: wanted {want}, got {got}")
         else:
             verdict.missed.append(f"{one.name}: wanted {want}, got {text_of(now.kind, now.value)}")
     return verdict

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from mavftpfs.parameters.values import BadValue, Number, Parameter, parse_number, same, text_of
 
-CHANGED_HEADER = "# What differs from its default. A line that is deleted here changes nothing.\n"
+CHANGED_HEADER = "# Parameters that differ from their defaults. Deleting a line here changes nothing.\n"
 _QGC_HEADER = """\
 # Onboard parameters for Vehicle {system}
 #
@@ -42,7 +42,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The reason why a line is invalid. number: counts lines from 1; 0 if no single line is the reason."""
+    """The reason why a line is invalid. number: counts lines from 1; 0 if the whole text is the reason."""
 
     number: int
     reason: str

@@ -45,7 +45,7 @@ _to_float = struct.Struct("<f")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter of a vehicle. default: None where it is not known."""
+    """A parameter of a vehicle. default: None if unknown."""
 
     name: str
     kind: Kind
@@ -54,12 +54,12 @@ class Parameter:
 
     @property
     def changed(self) -> bool:
-        """Whether its default is known, and differs."""
+        """Whether its default is known, and differs from its value."""
         return self.default is not None and not same(self.value, self.default)
 
 
 class BadValue(ValueError):
-    """A text is no value for a parameter; the message tells why."""
+    """A text is not a value for a parameter; the message gives the reason."""
 
 
 def same(one: Number, other: Number) -> bool:
@@ -104,7 +104,7 @@ def parse_number(text: str) -> Number:
     """Read a decimal number: an int where it has neither point nor exponent.
 
     Raises:
-        BadValue: the text is no number.
+        BadValue: the text is not a number.
     """
     if not _NUMBER.fullmatch(text.lower()):
         raise BadValue(f"{text!r} is not a number")

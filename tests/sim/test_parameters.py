@@ -475,7 +475,7 @@ async def test_a_line_changed_here_and_there_names_both_values(profile: str) -> 
         editor = await Editor(tree).read()
         table_of(here).set(b"MODE_001", 50, here.server.firmware.now)
         await trio.sleep(2)
-        with pytest.raises(NotTaken, match="MODE_001: it was 1 and has become 50"):
+        with pytest.raises(NotTaken, match="MODE_001: it was 1, and the vehicle changed it to 50"):
             await editor.edit("MODE_001", "9").edit("MODE_002", "9").save()
         assert writes(here) == 0
         assert (number(here, "MODE_001"), number(here, "MODE_002")) == (50, 2)

@@ -188,7 +188,7 @@ PARAMETERS = [
 def test_the_three_spellings() -> None:
     assert render_all(PARAMETERS) == "RTL_ALT,1500\nATC_P,0.135\n"
     assert render_changed(PARAMETERS).splitlines()[1:] == ["ATC_P,0.135 # default 0.1"]
-    assert "deleted" in render_changed(PARAMETERS).splitlines()[0]
+    assert "Deleting" in render_changed(PARAMETERS).splitlines()[0]
     lines = render_qgc(PARAMETERS, 3, 1).splitlines()
     assert lines[-2:] == ["3\t1\tRTL_ALT\t1500\t6", "3\t1\tATC_P\t0.135\t9"]
 
