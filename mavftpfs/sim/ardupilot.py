@@ -31,7 +31,7 @@ from mavftpfs.sim.firmware import (
 )
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import NoErrno, Storage
-from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
+from mavftpfs.sim.tree import Kind, OpenFile, Stat, TreeEntry, fail
 
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
@@ -43,10 +43,10 @@ _STEAL_AFTER = 3.0
 
 @dataclass(slots=True)
 class Session:
-    """A file a client has open, and the id that client chose.
+    """A file that a client has open, and the id that the client chose.
 
-    owner: the client that claimed the session (generations B and C). last_sent: when something was last sent,
-    0 = never.
+    owner: the client that claimed the session (generations B and C). last_sent: time of the last reply, 0 =
+    never. 0 = never.
     """
 
     file: OpenFile | None = None
@@ -57,14 +57,14 @@ class Session:
     number: int = -1
 
     def close(self) -> None:
-        """Close the file. Raises OSError: what was written is not on the card."""
+        """Close the file. Raises OSError: the card does not have the written bytes."""
         opened, self.file = self.file, None
         if opened is not None:
             opened.close()
 
 
 class Operations:
-    """All requests except bursts. Each method fills in the reply and returns how many seconds it took, or
+    """All requests except bursts. Each method fills in the reply and returns the seconds that it took, or
     raises a NAK."""
 
     def __init__(self, storage: Storage, profile: Profile) -> None:
@@ -115,7 +115,7 @@ class Operations:
     # -- the file ----------------------------------------------------------------------------
 
     def _terminate(self, session: Session) -> None:
-        """Close; only generations B and C report a failure."""
+        """Close the file; only generations B and C report a failure."""
         try:
             session.close()
         except OSError:
@@ -126,7 +126,7 @@ class Operations:
         if session.file is not None:
             if now - session.last_sent <= _STEAL_AFTER:
                 raise Refusal(NakCode.FAIL)
-            with contextlib.suppress(OSError):  # the firmware ignores its error
+            with contextlib.suppress(OSError):  # the firmware ignores this error
                 session.close()
         path = _path(self._profile, request)
         stat = self._storage.stat(path)
@@ -166,7 +166,7 @@ class Operations:
         entries = self._storage.entries(path)
         if path == b"/":
             virtual = self._storage.virtual.roots()
-            entries = entries + [Entry(name, Stat(Kind.DIRECTORY, 0, 0)) for name in virtual]
+            entries = entries + [TreeEntry(name, Stat(Kind.DIRECTORY, 0, 0)) for name in virtual]
         with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
         found = (self._entry_text(path, entry, with_time) for entry in entries)
         page = self._page([text for text in found if text is not None], request.offset)
@@ -194,8 +194,8 @@ class Operations:
             page += text + b"\0" if self._profile.double_nul else text
         return bytes(page)
 
-    def _entry_text(self, directory: bytes, entry: Entry, with_time: bool) -> bytes | None:
-        """Format an entry with its NUL; None if unlistable. A symlink is a file, whatever it leads to."""
+    def _entry_text(self, directory: bytes, entry: TreeEntry, with_time: bool) -> bytes | None:
+        """Format an entry with its NUL; None if unlistable. A symlink is a file, whatever its target."""
         name, stat = entry
         if b"\t" in name and self._profile.drop_long_names:
             return b"S\0"
@@ -243,7 +243,7 @@ def check_readable(session: Session) -> OpenFile:
 
 
 def read(session: Session, offset: int, size: int) -> bytes:
-    """Read; offsets are signed 32 bits below the protocol."""
+    """Read; the firmware treats offsets as signed 32-bit numbers."""
     if offset >= _MAX_OFFSET:
         raise fail(errno.EINVAL)
     return check_readable(session).read(offset, min(size, MAX_DATA))
@@ -373,7 +373,7 @@ class ArduPilot(Firmware):
         if request.size > MAX_DATA:
             self._nak(NakCode.INVALID_DATA_SIZE)
         elif ending and request.session != slot.number:
-            self._reply.opcode = ACK  # taken for the end of another session, though there is none
+            self._reply.opcode = ACK  # the server confirms the end of another session, which does not exist
         elif stranger and idle < _STEAL_AFTER:
             self._nak(NakCode.INVALID_SESSION)
         else:
@@ -388,7 +388,7 @@ class ArduPilot(Firmware):
         yield from self._push(slot)
 
     def _run_shared(self, request: Request) -> Iterator[float | None]:
-        """Generations B and C: find the sender's session, or claim one that is idle."""
+        """Generations B and C: find the sender's session, or claim an idle one."""
         if request.opcode == Opcode.RESET_SESSIONS:
             for slot in self._slots:
                 if slot.owner == request.source:
@@ -426,7 +426,7 @@ class ArduPilot(Firmware):
         return oldest
 
     def _is_repeat(self, request: Request) -> bool:
-        """Return whether this seems to be the request that any session of the server answered last."""
+        """Return whether the request seems to repeat the last one that the server answered in any session."""
         reply = self._reply
         return (
             request.source == reply.target
@@ -465,7 +465,7 @@ class ArduPilot(Firmware):
         self._reply.opcode, self._reply.size, self._reply.data = NAK, 1, bytes([code])
 
     def _fail(self, exc: OSError) -> None:
-        """Refuse with errno, or with the errno that an earlier failure left."""
+        """Refuse with errno, or with the errno left over from an earlier failure."""
         if not isinstance(exc, NoErrno) and exc.errno is not None:
             self._errno = exc.errno
         if self._errno == errno.EEXIST:
@@ -482,7 +482,7 @@ class ArduPilot(Firmware):
     def _push(self, slot: Session) -> Iterator[float | None]:
         """Send the reply as soon as the link has room; the server does nothing else until then."""
         while not self._has_room():
-            yield self._horizon + _ROOM_POLL  # room changes between two calls of advance only
+            yield self._horizon + _ROOM_POLL  # the room changes only between two calls of advance
         slot.last_sent = self.now
         self._emit()
 
@@ -501,7 +501,7 @@ class ArduPilot(Firmware):
     # -- bursts ------------------------------------------------------------------------------
 
     def _burst(self, slot: Session, request: Request) -> Iterator[float | None]:
-        """Send up to burst_packets packets; nothing can stop it."""
+        """Send up to burst_packets packets; a burst cannot be stopped."""
         size = request.size or MAX_DATA
         reply = self._reply
         reply.offset = request.offset if self.profile.exact_eof_offset else 0

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         default="px4",
         choices=sorted(PROFILES),
-        help="FTP server to be like, see below (default: px4)",
+        help="FTP server to imitate, see below (default: px4)",
     )
     parser.add_argument(
         "--link", default=DEFAULT_LINK, metavar="URL", help=f"link to serve (default: {DEFAULT_LINK})"
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="tells_storage",
         action="store_const",
         const=False,
-        help="do not tell the size of the card (default: as the profile does)",
+        help="do not report the size of the card (default: as the profile does)",
     )
     parser.add_argument(
         "--clamp",
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"send at most N bytes of a file in a reply, as PX4 may over a radio (default: {MAX_DATA})",
     )
-    parser.add_argument("--armed", action="store_true", help="be armed from the start")
+    parser.add_argument("--armed", action="store_true", help="start armed")
     parser.add_argument(
         "--telemetry", type=_rate, default=0.0, metavar="B/s", help="rate of other messages (default: none)"
     )
@@ -117,7 +117,7 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
         ("--burst-loss", "share of frames lost in runs of about 8"),
         ("--dup", "share of frames doubled"),
         ("--corrupt", "share of frames damaged"),
-        ("--reorder", "share of frames held back"),
+        ("--reorder", "share of frames delayed"),
     ):
         group.add_argument(name, type=_share, default=0.0, metavar="P", help=f"{text}, 0 to 1 (default: 0)")
     group.add_argument(
@@ -134,7 +134,7 @@ def _between(low: float, high: float, what: str) -> Callable[[str], float]:
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is no {what}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {what}")
         return value
 
     return parse
@@ -142,13 +142,13 @@ def _between(low: float, high: float, what: str) -> Callable[[str], float]:
 
 def _data_bytes(text: str) -> int:
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MAX_DATA:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of bytes from 1 to {MAX_DATA}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of bytes from 1 to {MAX_DATA}")
     return int(text)
 
 
 def _system(text: str) -> int:
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 255:
-        raise argparse.ArgumentTypeError(f"{text!r} is no system id (1 to 255)")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a system id (1 to 255)")
     return int(text)
 
 

@@ -1,7 +1,7 @@
 """`mavftpfs sim DIR`: serves a simulated vehicle over UDP, TCP, a serial port or a pty. Layer: sim.
 
-The vehicle and the model of the link are pure; here they get the clock. Without a model, whole batches go in
-and out. With one, each frame goes through the model by itself.
+The vehicle and the model of the link are pure; this module gives them the clock. Without a model, whole
+batches of frames are exchanged. With one, each frame goes through the model by itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mavftpfs.sim.vehicle import AUTOPILOT, SimVehicle
 _PTY_OUTBOX = 16 * 1024
 _FASTEST = 4_000_000
 _SLOWEST = 50
-"""Baud rates that every serial driver takes."""
+"""Baud rates that every serial driver supports."""
 _ANSWER_AT = 16
 """The most replies that wait for others before the endpoint sends all of them."""
 
@@ -76,7 +76,7 @@ class Endpoint:
                 self._exchange_through(self.model, pieces, now)
 
     def kick(self) -> None:
-        """Look at the vehicle again, because something changed it from outside."""
+        """Look at the vehicle again, because it was changed from outside."""
         if self._scope is not None:
             self._scope.cancel()
 
@@ -113,7 +113,9 @@ class Endpoint:
         for piece in pieces:
             self.vehicle.receive(piece, now)
             if self.vehicle.server.firmware.ready >= _ANSWER_AT:
-                self._send(self.vehicle.outgoing(now))  # the client works on it while the next is served
+                self._send(
+                    self.vehicle.outgoing(now)
+                )  # the client handles these while the next ones are served
         self._send(self.vehicle.outgoing(now))
 
     def _send(self, frames: list[bytes]) -> None:
@@ -131,18 +133,18 @@ class Endpoint:
         for frame in self.vehicle.outgoing(now):
             model.push(Direction.TO_CLIENT, frame, now)
         for frame in model.pop(Direction.TO_CLIENT, now):
-            self._send([frame])  # one each: a radio's frames are lost one by one
+            self._send([frame])  # one by one, because a radio loses single frames
 
 
 def open_endpoint(text: str, rate: float | None = None) -> AbstractAsyncContextManager[Link]:
     """Return an async context manager that opens the vehicle's end of a link.
 
-    text: a SOURCE as the vehicle would write it (`udpout:127.0.0.1:14550` pushes to a ground station, as
-    PX4's simulator does), or `pty`. A `tcp:` peer may come later. rate: bytes/s of the link's model, which
-    the baud rate of a pty tells to clients, because programs that share the port pace themselves by it.
+    text: a SOURCE from the vehicle's view (`udpout:127.0.0.1:14550` pushes to a ground station, as PX4's
+    simulator does), or `pty`. A `tcp:` peer may appear later. rate: bytes/s of the link's model; the baud
+    rate of a pty reports it to clients, because programs that share the port pace themselves by that.
 
     Raises:
-        UsageError: at once, if the text cannot be understood.
+        UsageError: at once, if the text is wrong.
     """
     if text == "pty":
         return _open_pty(_FASTEST if rate is None else min(_FASTEST, max(_SLOWEST, round(rate * 10))))
@@ -190,7 +192,7 @@ async def _never() -> Opened:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until one of _ENDING comes; returns the exit code.
+    """Serve until one of _ENDING arrives; return the exit code.
 
     Raises:
         UsageError: DIR or an option is wrong.
@@ -205,7 +207,7 @@ def run(args: argparse.Namespace) -> int:
     storage = os.fsdecode(profile.writable_root.strip(b"/"))
     if not os.path.isdir(os.path.join(args.directory, storage)):
         hint = (
-            f"nothing can be written: this server takes files below /{storage} only, and DIR has no {storage}"
+            f"nothing can be written: this server takes files only below /{storage}, and DIR has no {storage}"
         )
         print(f"mavftpfs: {hint}", file=sys.stderr)
     settings = link_settings(args)
@@ -239,7 +241,7 @@ async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, o
     with trio.open_signal_receiver(*_ENDING, *_REACTING) as arriving:
         rate = None if model is None else model.settings.rate
         async with open_endpoint(link_text, rate) as link:
-            # The vehicle was built before its link. Whether it hears a stream is clear only now.
+            # The vehicle was built before its link, which decides whether it receives a stream.
             vehicle.set_stream(link.is_stream)
             endpoint = Endpoint(vehicle, link, model)
             system = vehicle.address.system

@@ -1,11 +1,10 @@
 """The common part of the simulated firmwares. Layer: sim; pure.
 
-Requests and replies are not those of protocol.payload. Servers echo fields and leave stray bytes behind
-`size`, and this code must be fast.
+This module has requests and replies of its own in place of protocol.payload's, because servers echo fields
+and leave stray bytes behind `size`, and because this code must be fast.
 
 Time: `handle` and `outgoing` first do everything that was due by `now`, in order, each at its own instant.
-Replies leave in the order of their due times: the outbox is a list of those that are due and a queue of the
-others.
+Replies leave in the order of their due times: the outbox is a list of the due ones and a queue of the others.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ def c_string(data: bytes) -> bytes:
 
 
 def frame_size(wire: bytes) -> int:
-    """Return how long a MAVLink 2 frame of this payload is: trailing zeros are not sent."""
+    """Return the size of a MAVLink 2 frame with this payload; trailing zeros are not sent."""
     return FRAME_OVERHEAD + 3 + len(wire.rstrip(b"\0"))
 
 
@@ -113,12 +112,13 @@ class Firmware(ABC):
     """One server's code. Subclasses decide; this class keeps time and the outbox.
 
     Attributes:
-        tx_room: tells how many bytes the link's transmit buffer still takes (PX4 and ArduPilot pace by it);
-            None = as much as the profile's own buffer.
+        tx_room: returns the number of bytes that fit the link's transmit buffer now (PX4 and ArduPilot pace
+            by it); None = as many as the profile's own buffer.
         crashed: the process died (MAVSDK) and is silent until `reboot`.
-        dropped_requests: lost to a full queue or receive buffer. dropped_replies: to a full transmit buffer.
+        dropped_requests: requests lost to a full queue or receive buffer. dropped_replies: to a full transmit
+            buffer.
         replays: requests answered from the replay slot.
-        pauses: seconds for which a slow card made each of the last reads and writes wait, 0 included.
+        pauses: seconds that a slow card added to each of the last reads and writes, 0 included.
     """
 
     def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
@@ -142,7 +142,7 @@ class Firmware(ABC):
         """Take a request of 251 bytes."""
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
-        """Take requests of 251 bytes that came together: the same as one by one."""
+        """Take requests of 251 bytes that arrived together, with the same result as one by one."""
         for wire in wires:
             if self.crashed:
                 return
@@ -154,11 +154,11 @@ class Firmware(ABC):
 
     @abstractmethod
     def next_wake(self) -> float | None:
-        """When `advance` has something to do next."""
+        """Return when `advance` has something to do next."""
 
     @abstractmethod
     def open_paths(self) -> list[bytes]:
-        """Paths of the files that are open, as the client named them."""
+        """Return the paths of the open files, as the client named them."""
 
     @abstractmethod
     def reboot(self, now: float) -> None:
@@ -175,11 +175,12 @@ class Firmware(ABC):
 
     @property
     def ready(self) -> int:
-        """How many replies wait for the next `outgoing`; those that are due only later do not count."""
+        """The number of replies for the next `outgoing`, without those that are due later."""
         return len(self._ready)
 
     def next_deadline(self) -> float | None:
-        """When `outgoing` may have something, or a timer runs; None if only a request can change anything."""
+        """Return when `outgoing` may have a reply, or a timer runs; None if only a request can change
+        anything."""
         if self._ready:
             return self.now
         wake = self.next_wake()
@@ -189,7 +190,7 @@ class Firmware(ABC):
         return wake
 
     def forget_outbox(self) -> None:
-        """Drop the replies that were not sent yet."""
+        """Drop the unsent replies."""
         self._ready = []
         self._ready_bytes = 0
         self._later.clear()
@@ -200,7 +201,7 @@ class Firmware(ABC):
             self._ready.append((target, wire))
 
     def emit(self, target: Address, wire: bytes, due: float, now: float) -> None:
-        """Put a reply into the outbox, to leave at `due` (not before earlier ones)."""
+        """Put a reply into the outbox, to leave at `due` (but after the earlier ones)."""
         if due > now or self._later:
             self._later.append((due, target, wire))
         else:
@@ -209,8 +210,8 @@ class Firmware(ABC):
             self._ready_bytes += frame_size(wire)
 
     def room(self) -> int:
-        """Bytes free in the link's transmit buffer, less what waits in the outbox. Plenty if `tx_room` is
-        None."""
+        """Return the bytes free in the link's transmit buffer, less those that wait in the outbox. Plenty if
+        `tx_room` is None."""
         if self.tx_room is None:
             return 10 * FULL_FRAME + self.profile.tx_buffer
         return self.tx_room() - self._ready_bytes

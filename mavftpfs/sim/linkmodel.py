@@ -19,7 +19,7 @@ _BURST_LENGTH = 8.0
 
 
 class Direction(IntEnum):
-    """Which way a frame goes."""
+    """The direction of a frame."""
 
     TO_VEHICLE = 0
     TO_CLIENT = 1
@@ -75,7 +75,7 @@ class _Lane:
 class LinkModel:
     """Both directions of one link. `now` must not go back.
 
-    dropped: how many frames the queues had no room for.
+    dropped: number of frames that found a queue full.
     """
 
     def __init__(self, rng: random.Random, settings: LinkSettings | None = None) -> None:
@@ -122,7 +122,7 @@ class LinkModel:
         return min(times, default=None)
 
     def room(self, direction: Direction) -> int:
-        """Bytes that the queue still took at the last push or pop. A frame counts until it is sent."""
+        """Return the bytes that fit the queue at the last push or pop. A frame counts until it is sent."""
         lane = self._lanes[direction]
         on_air = lane.on_air if lane.free_at > self._now else 0
         return max(0, self.settings.queue - lane.queued - on_air)
@@ -141,7 +141,7 @@ class LinkModel:
         self._cuts = [(start, min(stop, now) if start <= now else stop) for start, stop in self._cuts]
 
     def is_cut(self, when: float) -> bool:
-        """Whether the link is cut at that time."""
+        """Return whether the link is cut at that time."""
         return any(start <= when < stop for start, stop in self._cuts)
 
     # -- the middle --------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class LinkModel:
         return len(frame) / self.settings.rate if self.settings.rate else 0.0
 
     def _advance(self, now: float) -> None:
-        """Start every transmission whose turn comes by `now`."""
+        """Start every transmission that is due by `now`."""
         self._now = now
         if self.settings.duplex is Duplex.HALF and self.settings.rate is not None:
             while (lane := self._next_in_turn(now)) is not None:

@@ -1,8 +1,8 @@
 """MAVSDK's FTP server. Layer: sim; pure. Source: mavlink_ftp_server.cpp, servers.md 1-10, a recording.
 
 All clients share one read stream, one write stream and one file size. The server has a thread for bursts, and
-no replay slot. Fields that a handler does not set are 0 in the reply. The server does not answer a request
-that it does not understand.
+no replay slot. Fields that a handler does not set are 0 in the reply. The server ignores a request that it
+does not understand.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim.firmware import ACK, HEADER, NAK, REPLY, Firmware, Refusal, Request, parse, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import Storage
-from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat
+from mavftpfs.sim.tree import Kind, OpenFile, Stat, TreeEntry
 
 _READ = int(Opcode.READ_FILE)
 _BURST = int(Opcode.BURST_READ_FILE)
@@ -121,7 +121,7 @@ class Mavsdk(Firmware):
     # -- timeline ----------------------------------------------------------------------------
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
-        """See Firmware. A checksum blocks the handler thread; its requests wait without limit."""
+        """See Firmware. A checksum blocks the handler thread; other requests wait without limit."""
         self.advance(now)
         start = max(now, self._busy_until)
         seq, _, opcode, size, _, _, _ = HEADER.unpack_from(wire)
@@ -174,7 +174,7 @@ class Mavsdk(Firmware):
         self._busy_until = float("-inf")
 
     def _die(self) -> None:
-        """Lose the streams and what they had buffered."""
+        """Lose the streams and their buffered bytes."""
         if self._writer is not None:
             self._writer.tail = (0, b"")
         self._close()
@@ -214,8 +214,8 @@ class Mavsdk(Firmware):
     # -- directories -------------------------------------------------------------------------
 
     def _list(self, request: Request) -> bytes:
-        """List from a raw index. For a regular file an exception is raised and not caught: the process
-        ends."""
+        """List from a raw index. For a regular file the server raises an exception and does not catch it, so
+        the process ends."""
         path = self._path(request)
         if self._existing(path).kind is not Kind.DIRECTORY:
             self.crashed = True
@@ -233,7 +233,7 @@ class Mavsdk(Firmware):
             raise Refusal(NakCode.EOF)
         return bytes(page)
 
-    def _entry_text(self, directory: bytes, entry: Entry, with_time: bool) -> bytes:
+    def _entry_text(self, directory: bytes, entry: TreeEntry, with_time: bool) -> bytes:
         """Format an entry, symlinks followed. Anything but a file or directory is left out, but counted."""
         try:
             stat = self.storage.stat(directory + b"/" + entry.name)
@@ -248,7 +248,7 @@ class Mavsdk(Firmware):
         return text + (b"\t%d\0" % max(stat.mtime, 0) if with_time else b"\0")
 
     def _remove(self, request: Request) -> bytes:
-        """Remove a file or an empty directory: both requests do both."""
+        """Remove a file or an empty directory, for either of the two requests."""
         path = self._path(request)
         self._existing(path)
         try:
@@ -299,7 +299,7 @@ class Mavsdk(Firmware):
         return u32(self._file_size)
 
     def _open_write(self, request: Request) -> bytes:
-        """Open for writing: the file must exist, is cut to nothing, and the ACK tells its old size."""
+        """Open for writing: the file must exist and is emptied; the ACK reports its old size."""
         if self._writer is not None:
             self._close()
         path = self._path(request)

@@ -1,7 +1,7 @@
 """Missions of one vehicle, as ArduPilot serves and accepts `@MISSION/*.dat`. Layer: sim; pure.
 
-Source: servers.md 11 and 17; AP_Filesystem_Mission and a recording. An upload replaces all items when it is
-closed. If it is refused, the old items stay; some versions ACK the close all the same.
+Source: servers.md 11 and 17; AP_Filesystem_Mission and a recording. Closing an upload replaces all items. If
+the vehicle refuses the upload, the old items stay, although some versions ACK the close.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _PLACELESS = frozenset((20, 112, 114, 115, 177, 178, 183, 206, 211))
 class Missions:
     """Items by kind: mission, fence, rally. The mission's first item is home.
 
-    limit: the most items that the vehicle accepts. says_so: the close of a refused upload is EINVAL;
-    otherwise the server ACKs it.
+    limit: the most items that the vehicle accepts. says_so: closing a refused upload is EINVAL; otherwise the
+    server ACKs it.
     """
 
     limit: int = 700
@@ -47,7 +47,7 @@ class Missions:
         """Take an upload.
 
         Raises:
-            OSError: EINVAL, the vehicle refuses the upload, and `says_so`.
+            OSError: EINVAL, the vehicle refuses the upload, and `says_so` is set.
         """
         kind = NAMES.index(name)
         items = self._parsed(kind, data)
@@ -57,7 +57,7 @@ class Missions:
             raise fail(errno.EINVAL)
 
     def _parsed(self, kind: int, data: bytes) -> list[Item] | None:
-        """Return the items as the vehicle keeps them, None if it refuses them."""
+        """Return the items as the vehicle stores them, None if it refuses them."""
         if len(data) < HEADER.size:
             return None
         magic, found, _, start, count = HEADER.unpack_from(data)
@@ -73,7 +73,7 @@ class Missions:
         return [self._kept(place, item, kind) for place, item in enumerate(items)]
 
     def _kept(self, place: int, item: Item, kind: int) -> Item:
-        """Return the item as it is stored: without ids, a waypoint without yaw, heights in steps."""
+        """Return the item as the vehicle stores it: without ids, a waypoint without yaw, heights in steps."""
         p1, p2, p3, p4, x, y, z, _, command, _, _, frame, *_ = item
         if command == _WAYPOINT and kind == 0:
             p2 = p3 = p4 = 0.0
@@ -95,7 +95,7 @@ class MissionFile(ClaimedFile):
         self._written = bytearray() if write else None
 
     def read(self, offset: int, size: int) -> bytes:
-        """See OpenFile. The items are the present ones."""
+        """See OpenFile. Each read returns the present items."""
         if self._written is not None:
             raise fail(errno.EINVAL)
         return self._missions.packed(self._name)[offset : offset + size]

@@ -3,8 +3,9 @@
 Source: servers.md 11 and 17; AP_Filesystem_Param, PX4's mavlink_ftp_param, and recordings of both. The
 simulator packs and parses with code of its own, so that it shares no mistake with the code that it tests.
 
-A *table* holds the values, packs a download, and takes an upload: PX4 parses strictly, each write as it
-arrives. ArduPilot parses the whole file when the client closes it, and does not tell whether it took it.
+A *table* holds the values, packs a download, and takes an upload. PX4 parses strictly, each write as it
+arrives. ArduPilot parses the whole file when the client closes it, and does not report whether it accepted
+the file.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ MAGIC_DEFAULTS = 0x671C
 INT8, INT16, INT32, FLOAT = 1, 2, 3, 4
 HEADER = struct.Struct("<HHH")
 PX4_BLOCK = 239
-"""PX4 pads for this block size, even if the client reads in others."""
+"""PX4 pads for this block size, even if the client reads in another one."""
 
 _MAX_NAME = 16
 _HAS_DEFAULT = 1
@@ -36,9 +37,9 @@ class Parameter:
     """A parameter. `value` and `default` are as stored, little-endian; a default of None is the value.
 
     drift: the growth of the value in each second. limits: a value outside becomes the nearest one inside.
-    read_only: the vehicle ignores a new value. needs: the parameter exists only while the one of that name is
-    not 0. misfit: the default does not fit the type, so a download has the default although it looks equal
-    (SIM_OH_RELAY_MSK).
+    read_only: the vehicle ignores a new value. needs: the parameter exists only while the parameter of that
+    name is not 0. misfit: the default does not fit the type, so a download includes the default although it
+    looks equal (SIM_OH_RELAY_MSK).
     """
 
     name: bytes
@@ -63,7 +64,7 @@ def unpack(kind: int, value: bytes | bytearray) -> float:
 
 
 def pack(kind: int, number: float) -> bytes:
-    """Return a number as it is stored; for an integer that does not fit, the nearest one that does."""
+    """Return a number in the stored form; for an integer that does not fit, the nearest one that does."""
     if kind == FLOAT:
         return struct.pack("<f", number)
     bits = 8 * _WIDTHS[kind]
@@ -105,7 +106,8 @@ class Selection:
 
 
 def selection(query: bytes) -> Selection:
-    """Parse the text behind the `?`. Unknown keys are ignored, and a text that is no number counts as 0."""
+    """Parse the text behind the `?`. Unknown keys are ignored, and a text that is not a number counts as
+    0."""
     found = dict.fromkeys((b"start", b"count", b"withdefaults"), 0)
     for option in query.split(b"&"):
         key, _, value = option.partition(b"=")
@@ -117,7 +119,7 @@ def selection(query: bytes) -> Selection:
 def pack_file(chosen: Sequence[Parameter], total: int, *, block: int, defaults: bool) -> bytes:
     """Return param.pck for reads of `block` bytes: the last value of an entry crosses no block's end.
 
-    total: as the header says it. defaults: with default values where they differ.
+    total: the header's number of parameters. defaults: with default values where they differ.
     """
     out = bytearray(HEADER.pack(MAGIC_DEFAULTS if defaults else MAGIC, len(chosen), total))
     last = b""
@@ -143,8 +145,7 @@ def _common_prefix(last: bytes, name: bytes) -> int:
 
 
 class Table:
-    """The parameters that a vehicle has, in its order. Times are seconds of any clock that does not go
-    back."""
+    """A vehicle's parameters, in its order. Times are seconds of a clock that does not go back."""
 
     def __init__(self, parameters: Iterable[Parameter]) -> None:
         self._held = {one.name: one for one in parameters}
@@ -152,16 +153,16 @@ class Table:
         self._packed: dict[tuple[Selection, int], bytes] = {}
 
     def visible(self, now: float) -> list[Parameter]:
-        """Return the parameters that are there now, with their present values."""
+        """Return the parameters that exist now, with their present values."""
         self._drift(now)
         return [one for one in self._held.values() if self._is_there(one)]
 
     def number(self, name: str, now: float) -> float:
-        """Return a present value. Raises KeyError: there is no such parameter now."""
+        """Return a present value. Raises KeyError: the parameter does not exist now."""
         return {one.name: one for one in self.visible(now)}[name.encode()].number
 
     def set(self, name: bytes, number: float, now: float) -> None:
-        """Set a value; one that is not there, or is read-only, stays as it is."""
+        """Set a value; a parameter that does not exist, or is read-only, stays as it is."""
         self._drift(now)
         one = self._held.get(name)
         if one is None or not self._is_there(one) or one.read_only:
@@ -170,7 +171,7 @@ class Table:
         self._replace(one, pack(one.kind, max(low, min(high, number))))
 
     def find(self, name: bytes, now: float) -> Parameter | None:
-        """Return a parameter that is there now."""
+        """Return a parameter that exists now."""
         self._drift(now)
         one = self._held.get(name)
         return one if one is not None and self._is_there(one) else None
@@ -179,7 +180,7 @@ class Table:
         """Return the file as read in blocks of `block` bytes.
 
         Raises:
-            OSError: EINVAL, there is nothing from `start` on.
+            OSError: EINVAL, the vehicle has no parameters from `start` on.
         """
         there = self.visible(now)
         if (wanted, block) in self._packed:
@@ -213,8 +214,8 @@ class Table:
         self._packed.clear()
 
 
-class _Entry(NamedTuple):
-    """One entry of an upload, and where the next one begins."""
+class _PackedEntry(NamedTuple):
+    """One entry of an upload, and the position of the next one."""
 
     name: bytes
     kind: int
@@ -222,11 +223,11 @@ class _Entry(NamedTuple):
     stop: int
 
 
-def _parse_entry(data: bytes | bytearray, at: int, last: bytes) -> _Entry | None:
+def _parse_entry(data: bytes | bytearray, at: int, last: bytes) -> _PackedEntry | None:
     """Parse an entry; return None if a part of it is still missing.
 
     Raises:
-        OSError: EINVAL, a flag, a type that does not exist, or a name that is too long.
+        OSError: EINVAL, a flag, an unknown type, or a name that is too long.
     """
     if len(data) < at + 2:
         return None
@@ -238,25 +239,25 @@ def _parse_entry(data: bytes | bytearray, at: int, last: bytes) -> _Entry | None
     if len(data) < stop:
         return None
     name = last[:common] + bytes(data[at + 2 : start])
-    return _Entry(name, kind, unpack(kind, data[start:stop]), stop)
+    return _PackedEntry(name, kind, unpack(kind, data[start:stop]), stop)
 
 
-class Upload:
-    """A param.pck that is being written. Both methods raise OSError: EINVAL."""
+class ParameterUpload:
+    """A param.pck that a client is writing. Both methods raise OSError: EINVAL."""
 
     def write(self, offset: int, data: bytes, now: float) -> None:
         """Take a chunk."""
         raise NotImplementedError
 
     def close(self, now: float) -> None:
-        """The client closed the file."""
+        """Note that the client closed the file."""
         raise NotImplementedError
 
 
-class StrictUpload(Upload):
-    """PX4's: each entry is set as soon as all of it came. After a mistake every write fails, and the close. A
-    chunk that was taken may come again; one that leaves a hole is a mistake. Unknown names are
-    skipped.
+class StrictUpload(ParameterUpload):
+    """PX4's: the server sets each entry as soon as all of it has arrived. After a mistake every write fails,
+    and so does the close. An accepted chunk may arrive again; one that leaves a hole is a mistake. Unknown
+    names are skipped.
     """
 
     def __init__(self, table: Table) -> None:
@@ -268,7 +269,7 @@ class StrictUpload(Upload):
         self._dead = False
 
     def write(self, offset: int, data: bytes, now: float) -> None:
-        """See Upload."""
+        """See ParameterUpload."""
         if self._dead:
             raise fail(errno.EINVAL)
         try:
@@ -278,7 +279,7 @@ class StrictUpload(Upload):
             raise
 
     def close(self, now: float) -> None:
-        """See Upload."""
+        """See ParameterUpload."""
         complete = len(self._taken) >= HEADER.size and self._left == 0
         if self._dead or not complete or HEADER.unpack_from(self._taken)[2] != len(self._taken):
             raise fail(errno.EINVAL)
@@ -299,7 +300,7 @@ class StrictUpload(Upload):
             self._left -= 1
             self._apply(entry, now)
 
-    def _apply(self, entry: _Entry, now: float) -> None:
+    def _apply(self, entry: _PackedEntry, now: float) -> None:
         known = self._table.find(entry.name, now)
         if known is None:
             return
@@ -308,9 +309,9 @@ class StrictUpload(Upload):
         self._table.set(entry.name, entry.number, now)
 
 
-class LenientUpload(Upload):
-    """ArduPilot's: chunks in any order, and all is set at the close. Unknown names are skipped. says_so: a
-    file that is refused is EINVAL at the close; else the close is ACKed.
+class LenientUpload(ParameterUpload):
+    """ArduPilot's: chunks arrive in any order, and the close sets all values. Unknown names are skipped.
+    says_so: closing a refused file is EINVAL; otherwise the server ACKs the close.
     """
 
     def __init__(self, table: Table, *, says_so: bool) -> None:
@@ -319,7 +320,7 @@ class LenientUpload(Upload):
         self._taken = bytearray()
 
     def write(self, offset: int, data: bytes, now: float) -> None:
-        """See Upload. The header tells the length of the file. Bytes that do not come are 0."""
+        """See ParameterUpload. The header has the length of the file. Missing bytes are 0."""
         stop = offset + len(data)
         if offset == 0 and len(data) >= HEADER.size:
             magic, _, length = HEADER.unpack_from(data)
@@ -328,7 +329,7 @@ class LenientUpload(Upload):
         self._taken[offset : offset + len(data)] = data
 
     def close(self, now: float) -> None:
-        """See Upload."""
+        """See ParameterUpload."""
         try:
             for entry in self._entries():
                 self._apply(entry, now)
@@ -336,7 +337,7 @@ class LenientUpload(Upload):
             if self._says_so:
                 raise
 
-    def _entries(self) -> Iterator[_Entry]:
+    def _entries(self) -> Iterator[_PackedEntry]:
         if len(self._taken) < HEADER.size:
             raise fail(errno.EINVAL)
         magic, count, length = HEADER.unpack_from(self._taken)
@@ -350,7 +351,7 @@ class LenientUpload(Upload):
             at, last = entry.stop, entry.name
             yield entry
 
-    def _apply(self, entry: _Entry, now: float) -> None:
+    def _apply(self, entry: _PackedEntry, now: float) -> None:
         """Convert to the parameter's own type, as AP_Param::set_float does: 0.01 more, then truncated."""
         known = self._table.find(entry.name, now)
         if known is None or not math.isfinite(entry.number):
@@ -365,7 +366,8 @@ class ParameterFile(ClaimedFile):
     """param.pck that a session has open. clock: the server's.
 
     live: as ArduPilot's. Each read packs the present values, for blocks of the size of the first read;
-    another size is EINVAL (AP_Filesystem_Param::read). Else as PX4's: packed once, and read in any sizes.
+    another size is EINVAL (AP_Filesystem_Param::read). Otherwise as PX4's: packed once, and read in any
+    sizes.
     """
 
     def __init__(
@@ -376,7 +378,7 @@ class ParameterFile(ClaimedFile):
         *,
         claimed: int,
         live: bool,
-        upload: Upload | None,
+        upload: ParameterUpload | None,
         on_close: Callable[[], None],
     ) -> None:
         super().__init__(claimed, on_close)

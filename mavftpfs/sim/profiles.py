@@ -66,7 +66,7 @@ class Profile:
     double_nul: bool = False
     """Listing entries end in two zero bytes (ArduPilot before mid-2026)."""
     drop_long_names: bool = False
-    """A listing leaves out a name that is too long for a page. False: it ends there (ArduPilot)."""
+    """A listing leaves out a name that is too long for a page. False: the listing ends there (ArduPilot)."""
     root_omits_files: bool = False
     """Listing `/` shows no plain files, listing `.` does (ArduPilot SITL, generation A)."""
     counted_path_nul: bool = True
@@ -78,7 +78,7 @@ class Profile:
     """Data bytes of a reply to a read or a burst at most. PX4 may send less over a radio (servers.md 7)."""
 
     tells_storage: bool = True
-    """The vehicle sends STORAGE_INFORMATION when asked for it (MAVSDK's server does not)."""
+    """The vehicle sends STORAGE_INFORMATION on request (MAVSDK's server does not)."""
 
     # Sessions
     sessions: int = 1
@@ -91,7 +91,7 @@ class Profile:
     open_replaces: bool = False
     """An open closes any other client's file (PX4 of September 2026); otherwise the server refuses it."""
     checks_sender: bool = False
-    """An answer is repeated only to the client that asked, and without stray bytes (PX4 of September
+    """The server repeats an answer only to the client that asked, and without stray bytes (PX4 of September
     2026)."""
 
     # PX4
@@ -101,7 +101,7 @@ class Profile:
     """A path with `..` in it is protected (PX4 of September 2026)."""
     needs_open_file: bool = False
     """Bursts and writes with no file open are InvalidSession, and reading no bytes is EOF (PX4 of September
-    2026); else session 0 is enough."""
+    2026); otherwise session 0 is enough."""
     keeps_buffers: bool = False
     """The scratch buffer is not freed after 2 s, and the whitelist for writes looks at the open file's path
     (PX4 of September 2026)."""
@@ -118,7 +118,7 @@ class Profile:
     stall: tuple[float, float] = (0.05, 0.3)
     """Shortest and longest such stall."""
     crc_rate: float = 100e6
-    """How fast CalcFileCRC32 reads."""
+    """Bytes per second that CalcFileCRC32 reads."""
     readdir_cost: float = 0.0
     """Time per entry read, also those before the page's offset."""
     rx_buffer: int = 212_992

@@ -18,14 +18,14 @@ from mavftpfs.sim.parameters import (
     LenientUpload,
     Parameter,
     ParameterFile,
+    ParameterUpload,
     StrictUpload,
     Table,
-    Upload,
     parameter,
     selection,
 )
 from mavftpfs.sim.profiles import TREES
-from mavftpfs.sim.tree import ClaimedFile, Entry, Kind, OpenFile, Stat, fail
+from mavftpfs.sim.tree import ClaimedFile, Kind, OpenFile, Stat, TreeEntry, fail
 
 MAX_HANDLES = 4
 _SYS_CLAIM = 100_000
@@ -113,8 +113,9 @@ def _is_parameter_file(name: bytes) -> bool:
 class VirtualTrees:
     """The trees of one vehicle.
 
-    trees: their names. exact: claimed sizes are right, and an upload of parameters is parsed as it comes (PX4
-    of 2026). says_so: the close of a refused upload fails (ArduPilot since mid-2025). clock: the server's.
+    trees: their names. exact: claimed sizes are right, and the server parses an upload of parameters as it
+    arrives (PX4 of 2026). says_so: closing a refused upload fails (ArduPilot since mid-2025). clock: the
+    server's.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class VirtualTrees:
         self._leaked_listings = 0
 
     def owns(self, path: bytes) -> bool:
-        """Whether the path lies in one of these trees, with or without a leading slash."""
+        """Return whether the path is in one of these trees, with or without a leading slash."""
         tree = path.removeprefix(b"/").partition(b"/")[0]
         return tree in self._open
 
@@ -152,19 +153,19 @@ class VirtualTrees:
         """Return the trees that a listing of `/` shows."""
         return [tree for tree in (b"@ROMFS", b"@SYS") if tree in self._open]
 
-    def entries(self, path: bytes) -> list[Entry]:
+    def entries(self, path: bytes) -> list[TreeEntry]:
         """List @SYS or a directory of @ROMFS; ENOENT for the rest.
 
         Listing a missing @ROMFS directory leaks one of four slots; then every @ROMFS listing is ENFILE.
         """
         tree, name = self._split(path)
         if tree == b"@SYS" and not name:
-            return [Entry(file, self.stat(b"@SYS/" + file)) for file in self.sys_files]
+            return [TreeEntry(file, self.stat(b"@SYS/" + file)) for file in self.sys_files]
         if tree == b"@ROMFS":
             return self._romfs_entries(name)
         raise fail(errno.ENOENT, path)
 
-    def _romfs_entries(self, name: bytes) -> list[Entry]:
+    def _romfs_entries(self, name: bytes) -> list[TreeEntry]:
         if self._leaked_listings >= MAX_HANDLES:
             raise fail(errno.ENFILE, name)
         prefix = name + b"/" if name else b""
@@ -177,7 +178,7 @@ class VirtualTrees:
         if not found:
             self._leaked_listings += 1
             raise fail(errno.ENOENT, name)
-        return [Entry(file, stat) for file, stat in found.items()]
+        return [TreeEntry(file, stat) for file, stat in found.items()]
 
     def stat(self, path: bytes) -> Stat:
         """Describe a file with the size that the firmware claims."""
@@ -217,7 +218,7 @@ class VirtualTrees:
             raise fail(errno.EROFS, path)
         size = 0 if write and self._exact else self._claimed_size(tree, name)
         if not write and not self._content(tree, name, 239):
-            raise fail(errno.ENOENT, path)  # listed, yet not there (AP_Filesystem_Sys::open)
+            raise fail(errno.ENOENT, path)  # listed, although it cannot be opened (AP_Filesystem_Sys::open)
         if self._open[tree] >= MAX_HANDLES:
             raise fail(errno.ENFILE, path)
         self._open[tree] += 1
@@ -229,7 +230,7 @@ class VirtualTrees:
         return VirtualFile(self._content(tree, name, 239), size, on_close=lambda: self._closed(tree))
 
     def _open_parameters(self, name: bytes, size: int, *, write: bool) -> ParameterFile:
-        upload: Upload | None = None
+        upload: ParameterUpload | None = None
         if write and self._exact:
             upload = StrictUpload(self.table)
         elif write:

@@ -66,7 +66,7 @@ class Stream:
     def read(self, opened: OpenFile, *, last: bool, alone: bool, rng: random.Random) -> bytes:
         """Return the next packet; `complete` tells whether it ends the burst.
 
-        last, alone: it is a tick's last packet, its only one.
+        last, alone: the packet is the tick's last one, its only one.
 
         Raises:
             OSError: reading failed.
@@ -74,18 +74,18 @@ class Stream:
         data = opened.read(self.offset, self.most)
         self.sent += len(data)
         over = self.is_over(last)
-        # The field is not written on a tick's last packet; only then is it the stack's garbage.
+        # The server does not write the field on a tick's last packet; only then is it the stack's garbage.
         garbage = last and alone and not over and rng.random() < _GARBAGE_COMPLETE
         packed = self._pack(ACK, int(over or garbage), data)
         self.offset += len(data)
         return packed
 
     def is_over(self, last: bool) -> bool:
-        """Whether the packet before was the last one."""
+        """Return whether the packet before was the last one."""
         return last and self.sent > _BURST_BYTES
 
     def end(self, code: int, number: int) -> bytes:
-        """Return the NAK that ends it; number: errno."""
+        """Return the NAK that ends the burst; number: errno."""
         return self._pack(NAK, 0, bytes([code, number & 0xFF] if code == NakCode.FAIL_ERRNO else [code]))
 
     def _pack(self, opcode: int, complete: int, data: bytes) -> bytes:
@@ -94,16 +94,16 @@ class Stream:
         return REPLY.pack(seq, 0, opcode, len(data), Opcode.BURST_READ_FILE, complete, self.offset, data)
 
 
-# A fast link brings hundreds of thousands of ReadFile or WriteFile requests a second. So a row of like
-# requests is checked once. The first that differs ends the row, and is handled as usual.
+# A fast link carries hundreds of thousands of ReadFile or WriteFile requests a second. So the server checks a
+# row of like requests once. The first different request ends the row, and is handled as usual.
 
 
 def read_row(
     wires: Sequence[bytes], opened: OpenFile, size: int, least: int, source: Address, replies: Replies
 ) -> int:
-    """Answer ReadFile requests of session 0; return how many.
+    """Answer ReadFile requests of session 0; return their number.
 
-    size: of the file, as it was opened. least: bytes that each answer has.
+    size: of the file at its opening. least: bytes of each answer.
     """
     unpack, pack, read, append = HEADER.unpack_from, REPLY.pack, opened.read, replies.append
     for count, wire in enumerate(wires):
@@ -121,7 +121,8 @@ def read_row(
 
 
 def write_row(wires: Sequence[bytes], opened: OpenFile, source: Address, replies: Replies) -> int:
-    """Answer WriteFile requests of session 0; return how many. None of them repeats the one before it."""
+    """Answer WriteFile requests of session 0; return their number. None of them may repeat the one before
+    it."""
     unpack, pack, write, append = HEADER.unpack_from, REPLY.pack, opened.write, replies.append
     answered = -1
     for count, wire in enumerate(wires):
@@ -179,7 +180,7 @@ class Px4(px4ops.PathRequests):
         if self._started is None:
             self._started = now
         if self._stream is None and not self._pending and now < self._last_request + self._idle_close:
-            self.now = now  # nothing can be due
+            self.now = now  # and nothing is due
         else:
             self.advance(now)
         if self._busy_until > now:
@@ -202,7 +203,8 @@ class Px4(px4ops.PathRequests):
         super().handle_run(wires[served:], source, now)
 
     def _is_plain(self, wire: bytes, now: float) -> bool:
-        """Whether a row that begins with this request is answered at once, with nothing else due before."""
+        """Return whether the server answers a row that begins with this request at once, with nothing else
+        due."""
         idle = self._stream is None and not self._pending and not self._later and self.tx_room is None
         lately = now - self._last_request <= _BUFFER_LIFE and now < self._last_request + self._idle_close
         quick = not self._has_cost and not self._extra_cost and self._busy_until <= now
@@ -256,7 +258,7 @@ class Px4(px4ops.PathRequests):
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         seq, session, opcode, size, _, _, offset = fields = HEADER.unpack_from(wire)
         if now - self._last_request > _BUFFER_LIFE and not self.profile.keeps_buffers:
-            self.scratch = b""  # freed, and allocated again uninitialised
+            self.scratch = b""  # freed, and allocated again without initialisation
         self._last_request = now
         if size > MAX_DATA:
             self._reply(source, wire, self._refuse(NakCode.INVALID_DATA_SIZE), now)
@@ -331,7 +333,7 @@ class Px4(px4ops.PathRequests):
             self.emit(target, wire, due, self.now)
 
     def _replay(self, now: float) -> None:
-        """Send the last answer again. PX4 before September 2026 sends 254 bytes out of a cache of 19: stray
+        """Send the last answer again. PX4 before September 2026 sends 254 bytes from a cache of 19, so stray
         memory follows the data."""
         assert self._cached is not None
         self.replays += 1
@@ -340,7 +342,7 @@ class Px4(px4ops.PathRequests):
         self._transmit(self._cached_target, self._cached + behind, now)
 
     def cost(self, opcode: int) -> float:
-        """Return how long the request that is being answered takes."""
+        """Return the seconds that the present request takes."""
         cost = self.profile.request_cost + self._extra_cost
         self._extra_cost = 0.0
         if opcode in (_READ, _WRITE):
@@ -372,7 +374,7 @@ class Px4(px4ops.PathRequests):
         opened, self._file = self._file, None
         self._stream = None
         if opened is not None:
-            with contextlib.suppress(OSError):  # PX4 ignores its error
+            with contextlib.suppress(OSError):  # PX4 ignores this error
                 opened.close()
 
     def _close_idle(self) -> None:
@@ -399,7 +401,7 @@ class Px4(px4ops.PathRequests):
         return self._open(self.path_of(request), write=True, create=True, truncate=False)
 
     def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
-        """Open. The ACK tells the size before a truncation, and later reads end at that size."""
+        """Open a file. The ACK reports the size before a truncation, and later reads end at that size."""
         if self._file is not None:
             if not self.profile.open_replaces:
                 raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
@@ -433,7 +435,7 @@ class Px4(px4ops.PathRequests):
         self._deliver(source, packed, now)
 
     def _refuse_read(self, request: Request) -> bytes:
-        """Return why a ReadFile cannot be served."""
+        """Return the NAK of a ReadFile that cannot be served, or raise it."""
         if request.session != 0 or self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
         if request.offset >= self._file_size:

@@ -11,7 +11,7 @@ from mavftpfs.sim import profiles
 from mavftpfs.sim.firmware import Firmware, Refusal, Request, c_string, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import NoErrno, Storage
-from mavftpfs.sim.tree import Entry, Kind, OpenFile, fail
+from mavftpfs.sim.tree import Kind, OpenFile, TreeEntry, fail
 
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255
@@ -28,7 +28,7 @@ class PathRequests(Firmware):
         super().__init__(storage, profile, rng)
         self.scratch = b""
         self._errno = 0
-        self._extra_cost = 0.0  # seconds that the request which is being answered takes longer
+        self._extra_cost = 0.0  # seconds that the present request takes longer
         self._handlers: dict[int, Callable[[Request], bytes]] = {
             Opcode.LIST_DIRECTORY: self._list,
             Opcode.REMOVE_FILE: self._changing(storage.unlink),
@@ -47,7 +47,7 @@ class PathRequests(Firmware):
         return self.resolve(path)
 
     def resolve(self, path: bytes) -> bytes:
-        """Return what a client's path names here."""
+        """Return the server's path for a client's path."""
         if self.profile.refuses_parent and b".." in path.split(b"/"):
             raise Refusal(NakCode.FILE_PROTECTED)
         if self.profile.logs and path.startswith(_LOGS):
@@ -60,7 +60,7 @@ class PathRequests(Firmware):
             raise Refusal(NakCode.FILE_PROTECTED)
 
     def is_protected(self, path: bytes) -> bool:
-        """Whether a path is outside the whitelist."""
+        """Return whether a path is outside the whitelist."""
         root = self.profile.writable_root
         return bool(root) and (not path.startswith(root) or b"/../" in path)
 
@@ -87,7 +87,7 @@ class PathRequests(Firmware):
         return bytes(page)
 
     def _changing(self, change: Callable[[bytes], None]) -> Callable[[Request], bytes]:
-        """Return the handler that does this to the path in a request."""
+        """Return the handler that applies `change` to the path in a request."""
 
         def handle(request: Request) -> bytes:
             self.scratch = path = self.path_of(request)
@@ -109,7 +109,7 @@ class PathRequests(Firmware):
         return b""
 
     def _crc(self, request: Request) -> bytes:
-        """Checksum a file; a failed open leaves errno as it was. Uses the other scratch buffer."""
+        """Compute a file's checksum; a failed open leaves errno as it was. Uses the other scratch buffer."""
         path = self.resolve(c_string(request.data[: min(request.size, MAX_DATA - 1)]))
         try:
             if self.storage.stat(path).kind is Kind.DIRECTORY:
@@ -121,7 +121,7 @@ class PathRequests(Firmware):
         return u32(checksum)
 
     def _truncate(self, request: Request) -> bytes:
-        """Cut or extend a file; only recordings ask for it."""
+        """Cut or extend a file; only recordings use this request."""
         self.scratch = path = self.path_of(request)
         self.check_writable(path)
         try:
@@ -146,7 +146,7 @@ def nak_data(code: int, number: int) -> bytes:
 def open_file(
     storage: Storage, path: bytes, *, write: bool, create: bool, truncate: bool
 ) -> tuple[int, OpenFile]:
-    """Open and return the size as it was before a truncation; POSIX opens directories for reading."""
+    """Open a file; return its size before a truncation. POSIX opens directories for reading, too."""
     size = 0
     try:
         stat = storage.stat(path)
@@ -175,7 +175,7 @@ class _OpenDirectory:
         return
 
 
-def _entry_text(profile: Profile, directory: bytes, entry: Entry, with_time: bool) -> bytes:
+def _entry_text(profile: Profile, directory: bytes, entry: TreeEntry, with_time: bool) -> bytes:
     name, stat = entry
     if stat.kind is Kind.FILE:
         size = stat.size & 0xFFFFFFFF if len(directory) + len(name) + 2 < _WORK_BUFFER else 0

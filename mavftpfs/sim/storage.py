@@ -1,6 +1,6 @@
 """A tree as one firmware's filesystem shows it. Layer: sim; pure.
-This adds what FatFs, LittleFS and NuttX do differently (servers.md 6, 8, 9) and the virtual `@` trees.
-NoErrno: the firmware fails without setting errno, so it reports an older one.
+This module adds the differences of FatFs, LittleFS and NuttX (servers.md 6, 8, 9) and the virtual `@` trees.
+NoErrno: the firmware fails without setting errno, so the server reports an older one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from mavftpfs.protocol.payload import crc32
 from mavftpfs.sim import profiles
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees
-from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, Tree, TreeFile, fail, parent_and_name
+from mavftpfs.sim.tree import Kind, OpenFile, Stat, Tree, TreeEntry, TreeFile, fail, parent_and_name
 
 _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
 _SIGNS = rb"!#-)\-0-9@^-`{}~"
@@ -38,7 +38,7 @@ class NoErrno(OSError):
 class Storage:
     """The filesystem of one server. Every method raises OSError.
 
-    removes_first: a rename removes its target also where the source is missing (NuttX before October 2022).
+    removes_first: a rename removes its target even if the source is missing (NuttX before October 2022).
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Storage:
         )
         self._writing: weakref.WeakSet[_FatFile] = weakref.WeakSet()
 
-    def entries(self, path: bytes) -> list[Entry]:
+    def entries(self, path: bytes) -> list[TreeEntry]:
         """Return the directory in readdir order; FAT has no dot entries."""
         if self.virtual.owns(path):
             return self.virtual.entries(path)
@@ -92,13 +92,13 @@ class Storage:
         return opened
 
     def lose_power(self) -> None:
-        """Forget what was written to files that are still open, if this storage loses it."""
+        """Lose the bytes of files that are still open, if this storage loses them."""
         for opened in self._writing:
             opened.lose()
         self._writing.clear()
 
     def crc(self, path: bytes) -> tuple[int, int]:
-        """Return the CRC32 of a file and how many bytes went into it."""
+        """Return the CRC32 of a file, and the number of its bytes."""
         if self.virtual.owns(path):
             content = self.virtual.content(path, block=64)
             return crc32(content), len(content)
@@ -152,11 +152,11 @@ class Storage:
             if self.kind is profiles.Storage.FATFS:
                 raise fail(errno.EACCES, path) from exc
             if self.kind is profiles.Storage.POSIX:
-                self.unlink(path)  # tried after rmdir failed; its EISDIR is reported
+                self.unlink(path)  # runs after rmdir failed; its EISDIR is reported
             raise
 
     def rename(self, old: bytes, new: bytes) -> None:
-        """Rename. An existing target is handled as this filesystem does."""
+        """Rename; treat an existing target as this filesystem does."""
         self._refuse_virtual(old)
         self._refuse_virtual(new)
         if self.kind is profiles.Storage.LITTLEFS:
@@ -201,12 +201,12 @@ class Storage:
         if self._fat and _FAT_FORBIDDEN.intersection(parent_and_name(path)[1]):
             raise fail(errno.EINVAL, path)
 
-    def _fat_entry(self, below: bytes, entry: Entry) -> Entry:
+    def _fat_entry(self, below: bytes, entry: TreeEntry) -> TreeEntry:
         stat = self._as_entered(below + entry.name, entry.stat)
-        return Entry(entry.name, stat._replace(mtime=stat.mtime & ~1))
+        return TreeEntry(entry.name, stat._replace(mtime=stat.mtime & ~1))
 
     def _as_entered(self, path: bytes, stat: Stat) -> Stat:
-        """Return a stat with the size that FAT's directory entry has.
+        """Return a stat with the size in FAT's directory entry.
 
         A file that is open for writing gets its size there only when it is closed.
         """
@@ -216,10 +216,10 @@ class Storage:
         return stat
 
     def _resolve(self, path: bytes) -> bytes:
-        """Return the path as this filesystem has it.
+        """Return the path in this filesystem's spelling.
 
-        FAT drops ends of names (`_kept`). Where case is folded, as NuttX does with short names, a name that
-        does not exist becomes the one that exists in another case.
+        FAT drops ends of names (`_kept`). Where case is folded, as NuttX does with short names, a missing
+        name becomes an existing one in another case.
         """
         if not self._fat:
             return path
@@ -267,12 +267,12 @@ class Storage:
 
 
 def _in_page_850(name: bytes) -> str:
-    """Return a name in capitals as FatFs has it. FatFs takes its bytes for code page 850 (servers.md 9)."""
+    """Return a name in FatFs's capitals. FatFs takes its bytes for code page 850 (servers.md 9)."""
     return "".join(c.upper() if len(c.upper()) == 1 else c for c in name.decode("cp850"))
 
 
 class _Entered:
-    """A FAT file open for reading: it ends where the directory entry said at its opening."""
+    """A FAT file open for reading, which ends at the size of its directory entry at the opening."""
 
     def __init__(self, real: TreeFile, size: int) -> None:
         self._real = real
@@ -293,11 +293,11 @@ class _Entered:
 
 
 class _FatFile:
-    """A FAT file open for writing. Its directory entry gets the size when the file is closed. The sector that
-    was written last is in memory until then, or until another one is written. On FatFs a full card is EIO,
-    and so is a write of no bytes; a gap has the old bytes of the card.
+    """A FAT file open for writing. Closing it writes the size to its directory entry. The last written sector
+    is in memory until then, or until another one is written. On FatFs a full card is EIO, and so is a write
+    of no bytes; a gap has the old bytes of the card.
 
-    path: its present name. entered: the size that its directory entry has. is_open: it was not closed yet.
+    path: its present name. entered: the size in its directory entry. is_open: nobody has closed it.
     """
 
     def __init__(self, path: bytes, real: TreeFile, fatfs: bool, rng: random.Random) -> None:
@@ -333,7 +333,7 @@ class _FatFile:
         self._real.close()
 
     def lose(self) -> None:
-        """The power fails: bytes appended since the file was opened are lost, and those in memory."""
+        """Lose the power: the bytes appended since the file was opened, and those in memory, are lost."""
         if not self.is_open:
             return
         if self._on_card:
@@ -342,7 +342,7 @@ class _FatFile:
             self._real.resize(self.entered)
 
     def _hold_sector(self, offset: int) -> None:
-        """The sector of this place is about to be written in memory."""
+        """Note that the sector of this position is about to be written in memory."""
         sector = offset // _SECTOR
         if sector != self._sector:
             start = sector * _SECTOR

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 
 class Kind(Enum):
-    """The type of an entry, as readdir tells it."""
+    """The type of an entry, as readdir reports it."""
 
     FILE = "file"
     DIRECTORY = "directory"
@@ -31,7 +31,7 @@ class Stat(NamedTuple):
     mtime: int
 
 
-class Entry(NamedTuple):
+class TreeEntry(NamedTuple):
     """One directory entry; the stat does not follow symlinks."""
 
     name: bytes
@@ -39,18 +39,18 @@ class Entry(NamedTuple):
 
 
 class OpenFile(Protocol):
-    """An open file, as a session has it. All methods raise OSError."""
+    """An open file of a session. All methods raise OSError."""
 
     def read(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes; fewer at the end of the file, none past it."""
         ...
 
     def write(self, offset: int, data: bytes) -> int:
-        """Write, and return how many bytes had room: at least 1 unless `data` is empty."""
+        """Write, and return the number of bytes that had room: at least 1 unless `data` is empty."""
         ...
 
     def size(self) -> int:
-        """Return the present size. Virtual files may tell a wrong one."""
+        """Return the present size. Virtual files may report a wrong one."""
         ...
 
     def close(self) -> None:
@@ -59,8 +59,8 @@ class OpenFile(Protocol):
 
 
 class ClaimedFile:
-    """The common part of open files that a server makes itself: the size that they claim, and a close that
-    counts once. on_close: called by the close first.
+    """The common part of open files that a server generates: the size that they claim, and a close that
+    counts once. on_close: called by the first close.
     """
 
     def __init__(self, claimed: int, on_close: Callable[[], None]) -> None:
@@ -94,7 +94,7 @@ class TreeFile(OpenFile, Protocol):
 class Tree(Protocol):
     """A directory tree. All methods raise OSError."""
 
-    def entries(self, path: bytes) -> list[Entry]:
+    def entries(self, path: bytes) -> list[TreeEntry]:
         """Return the entries in readdir order, `.` and `..` among them."""
         ...
 
@@ -117,7 +117,7 @@ class Tree(Protocol):
         ...
 
     def mkdir(self, path: bytes) -> None:
-        """Make a directory; EEXIST if there is anything of that name."""
+        """Make a directory; EEXIST if the name exists."""
         ...
 
     def rmdir(self, path: bytes) -> None:
@@ -181,8 +181,8 @@ class _Node:
 class MemoryTree:
     """A tree in memory, without symlinks.
 
-    capacity: bytes all files together may hold; None = no limit. Single files end at 256 MiB (EFBIG).
-    clock: tells new mtimes, seconds since 1970; a constant unless given.
+    capacity: the most bytes of all files together; None = no limit. Single files end at 256 MiB (EFBIG).
+    clock: returns new mtimes, seconds since 1970; a constant unless given.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ class MemoryTree:
             self._find(path).mtime = mtime
 
     def add_other(self, path: bytes) -> None:
-        """Make something that is neither file nor directory (a fifo, say)."""
+        """Make an entry that is neither file nor directory (a fifo, say)."""
         self._link(path, _Node(Kind.OTHER, self._now()))
 
     def data(self, path: bytes) -> bytes:
@@ -236,13 +236,13 @@ class MemoryTree:
 
     # -- the Tree protocol -------------------------------------------------------------------
 
-    def entries(self, path: bytes) -> list[Entry]:
+    def entries(self, path: bytes) -> list[TreeEntry]:
         """See Tree."""
         node = self._find(path)
         if node.kind is not Kind.DIRECTORY:
             raise fail(errno.ENOTDIR, path)
         present = [name for name in node.order if name in node.children or name in _DOTS]
-        return [Entry(name, node.children.get(name, node).stat()) for name in present]
+        return [TreeEntry(name, node.children.get(name, node).stat()) for name in present]
 
     def stat(self, path: bytes) -> Stat:
         """See Tree."""
@@ -372,7 +372,7 @@ class MemoryTree:
         self.used -= len(node.data)
 
     def _limit(self, node: _Node) -> int:
-        """Return the size that a file may have now."""
+        """Return the largest size that a file may have now."""
         if self.capacity is None:
             return MAX_FILE
         return min(MAX_FILE, len(node.data) + max(0, self.capacity - self.used))
@@ -389,7 +389,7 @@ class MemoryTree:
 
 
 class _MemoryFile:
-    """An open file of a MemoryTree. It stays usable when its name is removed."""
+    """An open file of a MemoryTree. The file stays usable when its name is removed."""
 
     __slots__ = ("_data", "_node", "_tree", "_write")
 
@@ -416,7 +416,7 @@ class _MemoryFile:
         return len(data)
 
     def _grow(self, offset: int, stop: int) -> int:
-        """Make room up to `stop` if the tree has it, and return how far the write may go."""
+        """Make room up to `stop` if the tree has it, and return the end of the possible write."""
         limit = self._tree._limit(self._node)
         if limit <= offset:
             raise fail(errno.EFBIG if offset >= MAX_FILE else errno.ENOSPC)
@@ -451,7 +451,7 @@ class DirectoryTree:
     """Serves the directory `root`; symlinks and `..` that lead out of it are refused with EACCES.
 
     Raises:
-        OSError: `root` is no directory, or not there.
+        OSError: `root` is not a directory, or does not exist.
     """
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
@@ -459,16 +459,16 @@ class DirectoryTree:
         if not os.path.isdir(self._root):
             raise fail(errno.ENOTDIR if os.path.exists(self._root) else errno.ENOENT, self._root)
 
-    def entries(self, path: bytes) -> list[Entry]:
+    def entries(self, path: bytes) -> list[TreeEntry]:
         """See Tree."""
         here = self._real(path)
-        found = [Entry(name, _describe(os.stat(here))) for name in (b".", b"..")]
+        found = [TreeEntry(name, _describe(os.stat(here))) for name in (b".", b"..")]
         with os.scandir(here) as scanned:
             for item in scanned:
                 try:
-                    found.append(Entry(item.name, _describe(item.stat(follow_symlinks=False))))
+                    found.append(TreeEntry(item.name, _describe(item.stat(follow_symlinks=False))))
                 except FileNotFoundError:
-                    continue  # removed while we looked
+                    continue  # removed meanwhile
         return found
 
     def stat(self, path: bytes) -> Stat:
@@ -482,7 +482,7 @@ class DirectoryTree:
         here = self._real(path)
         flags = os.O_RDWR if write else os.O_RDONLY
         flags |= (os.O_CREAT if create else 0) | (os.O_TRUNC if truncate else 0)
-        # O_NONBLOCK: a fifo must not block the server for ever.
+        # O_NONBLOCK, because a fifo must not block the server for ever.
         handle = os.open(here, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
         if not stat_bits.S_ISREG(os.fstat(handle).st_mode):
             os.close(handle)

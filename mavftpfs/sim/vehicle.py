@@ -1,8 +1,8 @@
 """A simulated vehicle: an FTP server with the rest of an autopilot's MAVLink around it. Layer: sim; pure.
 
 Neither class does any I/O. Requests or frames go in, replies or frames come out. `now` is in monotonic
-seconds and must not go back. `next_deadline` tells when to ask again. The server never raises, whatever
-request arrives.
+seconds and must not go back. `next_deadline` returns the time of the next call. The server never raises,
+whatever request arrives.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _FIRMWARES: dict[Family, type[Firmware]] = {
 class FtpServer:
     """The FTP server of one vehicle component.
 
-    tree: the files that it serves. profile: the server that it behaves like. rng: for stray memory and
-    chance. firmware: the code that answers, with its counters. requests: how many came, by opcode.
+    tree: the files that it serves. profile: the server that it imitates. rng: for stray memory and chance.
+    firmware: the code that answers, with its counters. requests: the number of requests by opcode.
     """
 
     def __init__(
@@ -82,14 +82,14 @@ class FtpServer:
             self.firmware.handle(self._shortened(wire), source, now)
 
     def _shortened(self, wire: bytes) -> bytes:
-        """Return a request as it is, or one for data that asks for no more than the server sends."""
+        """Return a request, for data shortened to the size that the server sends."""
         longest = self.profile.longest_reply
         if longest == MAX_DATA or wire[3] not in _ASKING_DATA or 0 < wire[4] <= longest:
             return wire
         return wire[:4] + bytes([longest]) + wire[5:]
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
-        """Take payloads that came together: the same as one by one, in less time."""
+        """Take payloads that arrived together, with the same result as one by one, in less time."""
         firmware = self.firmware
         alone = len(wires) == 1  # as over every link in memory, where tests look at each in `handle`
         unfit = firmware.crashed or any(len(wire) != PAYLOAD_SIZE for wire in wires)
@@ -105,12 +105,12 @@ class FtpServer:
         return self.firmware.outgoing(now)
 
     def next_deadline(self) -> float | None:
-        """Return when to call `outgoing` again if no request comes; a past time if there is a reply now."""
+        """Return when to call `outgoing` again if no request arrives; a past time if there is a reply now."""
         return self.firmware.next_deadline()
 
     def reboot(self, now: float) -> None:
-        """Lose every session, queue and reply, as a vehicle that restarts does. Files stay, except for what
-        FAT storage writes only when a file is closed.
+        """Lose every session, queue and reply, as a restarted vehicle does. Files stay, except for the bytes
+        that FAT storage writes only when a file is closed.
         """
         self.firmware.crashed = False
         self._storage.lose_power()
@@ -124,7 +124,7 @@ class FtpServer:
 
     @property
     def open_sessions(self) -> int:
-        """How many sessions hold a file."""
+        """The number of sessions that hold a file."""
         return len(self.open_paths)
 
 
@@ -148,14 +148,15 @@ class SimVehicle:
     """One vehicle on one link.
 
     Args:
-        telemetry: bytes per second of unasked messages beside heartbeat and system time.
+        telemetry: bytes per second of other messages beside heartbeat and system time.
         armed: at the start; after a reboot it is always disarmed.
-        tells_storage: answers when asked for STORAGE_INFORMATION; None: as the profile does.
+        tells_storage: whether it answers a request for STORAGE_INFORMATION; None: as the profile does.
         signing_key: as for Framer.
 
     Attributes:
-        tells_time: sends its boot time unasked. ArduCopter does so only if a program asked for its EXTRA3.
-        on_news: called when it was changed from outside, so that the link looks at it again.
+        tells_time: whether it sends its boot time unasked. ArduCopter does so only after a request for its
+            EXTRA3.
+        on_news: called when somebody changed the vehicle from outside, so that the link looks at it again.
     """
 
     def __init__(
@@ -180,7 +181,7 @@ class SimVehicle:
         self.on_news: Callable[[], None] = lambda: None
         self.tells_storage = profile.tells_storage if tells_storage is None else tells_storage
         self.heard: dict[Address, Heartbeat] = {}
-        self._uid = rng.getrandbits(64) ^ address.system  # another one beside it, of the same seed
+        self._uid = rng.getrandbits(64) ^ address.system  # differs for a second vehicle of the same seed
         self._booted_at: float | None = None
         self._down_until = float("-inf")
         self._next_beat = float("-inf")
@@ -198,8 +199,8 @@ class SimVehicle:
         self._set_armed(False)
 
     def reboot(self, now: float, downtime: float = 0.0, *, beat_after: float = 0.0) -> None:
-        """Restart: sessions and boot time are lost, files stay; deaf and mute for `downtime` seconds. The
-        first heartbeat and boot time come `beat_after` seconds later."""
+        """Restart: sessions and boot time are lost, files stay; the vehicle is deaf and mute for `downtime`
+        seconds. The first heartbeat and boot time are sent `beat_after` seconds later."""
         self.server.reboot(now)
         self.framer.reset()
         self.armed = False
@@ -211,7 +212,7 @@ class SimVehicle:
         self.on_news()
 
     def set_stream(self, stream: bool) -> None:
-        """Set, before the first `receive`, whether that gets pieces of a stream or datagrams."""
+        """Set, before the first `receive`, whether that takes pieces of a stream or datagrams."""
         self.framer.stream = stream
 
     def receive(self, data: bytes, now: float) -> None:
@@ -220,7 +221,7 @@ class SimVehicle:
             return
         address = self.address
         for message in self.framer.feed(data):
-            if type(message) is FtpRun:  # a transfer is thousands of these a second
+            if type(message) is FtpRun:  # a transfer has thousands of these a second
                 source, target, payloads = message
                 if target == address or self._is_for_us(target):
                     self.server.handle_run(payloads, source, now)
@@ -233,10 +234,9 @@ class SimVehicle:
                     self.heard[message.source] = message
 
     def foreign_request(self, payload: bytes, source: Address, now: float, *, audible: bool = True) -> None:
-        """Let another ground station ask something over another link.
+        """Let another ground station send a request over another link.
 
-        This link hears the answers, to `source`, too, and, if `audible`, the request, as a router forwards
-        it.
+        This link hears the replies to `source`, too, and, if `audible`, the request, as a router forwards it.
         """
         if audible:
             self._ready.append(Framer(source, stream=False).encode_ftp(self.address, payload))
@@ -304,7 +304,7 @@ class SimVehicle:
         self._next_beat = now + HEARTBEAT_PERIOD
 
     def _add_telemetry(self, frames: list[bytes], now: float) -> None:
-        """Add what is due. For a second after each FTP reply ArduPilot sends only a quarter
+        """Add the messages that are due. For a second after each FTP reply ArduPilot sends only a quarter
         (GCS_Common.cpp)."""
         slowed = self.profile.family is Family.ARDUPILOT and now - self._replied_at < _SLOWED_FOR
         rate = self.telemetry / (_SLOWED if slowed else 1.0)
@@ -315,7 +315,7 @@ class SimVehicle:
             self._telemetry_step += 1
             frames.append(frame)
             self._next_telemetry = max(self._next_telemetry, self._booted_at or 0.0) + len(frame) / rate
-        self._next_telemetry = now  # an autopilot skips what it could not send
+        self._next_telemetry = now  # because an autopilot skips messages that it could not send
 
     def _on_command(self, command: CommandLong, now: float) -> None:
         wanted = int(command.params[0]) if abs(command.params[0]) < 1e6 else -1

@@ -13,9 +13,9 @@ from mavftpfs.sim.parameters import (
     INT32,
     LenientUpload,
     Parameter,
+    ParameterUpload,
     StrictUpload,
     Table,
-    Upload,
     parameter,
     selection,
 )
@@ -98,7 +98,7 @@ def chunks(steps: dict[str, Step], upload: str) -> Iterator[tuple[int, bytes, bo
                 yield struct.unpack_from("<I", request[1], 8)[0], data, reply[1].opcode == 128
 
 
-def attempt(upload: Upload, offset: int, data: bytes) -> bool:
+def attempt(upload: ParameterUpload, offset: int, data: bytes) -> bool:
     try:
         upload.write(offset, data, 0)
     except OSError:
@@ -106,7 +106,7 @@ def attempt(upload: Upload, offset: int, data: bytes) -> bool:
     return True
 
 
-def ended(upload: Upload) -> bool:
+def ended(upload: ParameterUpload) -> bool:
     try:
         upload.close(0)
     except OSError:
@@ -119,7 +119,7 @@ def test_uploads_are_acked_and_refused_as_recorded(name: str) -> None:
     steps = steps_of(name)
     table = recorded_table(steps)
     for upload_name in UPLOADS:
-        upload: Upload = StrictUpload(table) if name == PX4 else LenientUpload(table, says_so=False)
+        upload: ParameterUpload = StrictUpload(table) if name == PX4 else LenientUpload(table, says_so=False)
         for offset, data, acked in chunks(steps, upload_name):
             assert attempt(upload, offset, data) == acked, (upload_name, offset)
         closed = steps[upload_name + ": terminate"].replies[0][1].opcode == 128
