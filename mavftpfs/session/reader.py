@@ -46,7 +46,7 @@ class FileStream(SessionUser):
         self._received = 0  # by that transfer
         self._last_data_at = -inf
         self._lost = 0  # how often the session was, without progress
-        self._wanted = trio.Event()
+        self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
             self.opened.end()
         else:
@@ -68,7 +68,7 @@ class FileStream(SessionUser):
             self._wants.add(self._sink.missing(start, stop), demand=demand)
         if self.waiting_since is None and not self._wants.demand.todo.empty:
             self.waiting_since = self._scheduler.clock()
-        self._wanted.set()
+        self._changed.unpark_all()
         self._server.wake()
 
     def drop(self, *, demand: bool = True) -> None:
@@ -81,7 +81,7 @@ class FileStream(SessionUser):
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True
         self.drop()
-        self._wanted.set()
+        self._changed.unpark_all()
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
         self._scheduler.remove(self)
@@ -128,8 +128,7 @@ class FileStream(SessionUser):
         server = self._server
         while not self.closed:
             if self.idle:
-                self._wanted = trio.Event()
-                await self._wanted.wait()
+                await self._changed.park()
                 continue
             try:
                 async with self._scheduler.turn(self) as turn:
