@@ -70,7 +70,7 @@ def clients_of(rows: Iterable[Row]) -> list[str]:
 
 
 def peers_table(rows: Sequence[Row]) -> str:
-    """Return rates in kB/s, and of the others what part of ours that is."""
+    """Return rates in kB/s, and of the other clients which share of that of mavftpfs they reach."""
     names = clients_of(rows)
     found = {(row.server, row.link, row.direction, row.client): row for row in rows}
     lines = []
@@ -78,7 +78,7 @@ def peers_table(rows: Sequence[Row]) -> str:
         server, link, direction = cell
         texts = [rate_text(found.get((*cell, name))) for name in names]
         lines.append([f"{server_name(server)}, {link_name(link)}, {direction}", *texts])
-    return markdown(["kB/s (part of ours)", *names], lines)
+    return markdown(["kB/s (share of mavftpfs)", *names], lines)
 
 
 def rate_text(row: Row | None) -> str:
