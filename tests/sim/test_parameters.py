@@ -18,7 +18,7 @@ from mavftpfs.client.progress import Progress
 from mavftpfs.client.status import Facts, snapshot
 from mavftpfs.parameters.packed import pack_upload
 from mavftpfs.parameters.text import Line, parse
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -181,6 +181,28 @@ async def test_parameters_come_whole_where_replies_are_shorter_than_asked(profil
         lines, problems = parse((await read_file(tree, ALL)).decode())
         assert problems == []
         assert {line.name: line.value for line in lines} == pytest.approx(numbers(here), rel=1e-6)
+
+
+@pytest.mark.parametrize("after", [1, 3, 7])
+async def test_parameters_come_whole_where_a_clamp_comes_and_goes(after: int) -> None:
+    """A link may be signed only for a while: so many reads pass, as many are clamped, and so on."""
+    async with vehicle("px4-2026", parameters=many(drifting=0)[:-1]) as (here, tree):
+        reads = 0
+
+        def clamp(request: Payload, reply: Payload) -> list[Payload]:
+            nonlocal reads
+            reads += request.opcode == Opcode.READ_FILE
+            longest = 91 if reads // after % 2 else MAX_DATA
+            here.server.profile = here.server.firmware.profile = replace(
+                here.server.profile, longest_reply=longest
+            )
+            return [reply]
+
+        here.server.change = clamp
+        lines, problems = parse((await read_file(tree, ALL)).decode())
+        assert problems == []
+        assert {line.name: line.value for line in lines} == pytest.approx(numbers(here), rel=1e-6)
+        assert reads > after
 
 
 @MARKS

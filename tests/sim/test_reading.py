@@ -69,6 +69,26 @@ async def test_replies_may_be_shorter_than_asked(profile: str, mode: ReadMode) -
         assert await read_file(connection, here.root + b"/big") == data
 
 
+@BOTH
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "mavsdk"])
+async def test_a_clamp_may_come_and_go_while_a_file_is_read(profile: str, mode: ReadMode) -> None:
+    """A signed link carries fewer bytes of a reply, and it may be signed only for a while."""
+    data = content(60_000)
+    here = Rig(profile, {b"/big": data}, LinkSettings(rate=20_000.0, delay=0.02))
+
+    async def clamp() -> None:
+        for longest in (91, MAX_DATA, 78, MAX_DATA) * 3:
+            firmware = here.server.firmware
+            here.server.profile = firmware.profile = replace(here.server.profile, longest_reply=longest)
+            await trio.sleep(0.4)
+
+    async with here.connected(ConnectOptions(read_mode=mode)) as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(clamp)
+        assert await read_file(connection, here.root + b"/big") == data
+        sent = connection.engine.stats.by_opcode
+        assert sent[Opcode.READ_FILE] <= 3.5 * len(data) / MAX_DATA
+
+
 async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
     """Requests that go out during a pause only overflow the buffer of a server so near."""
     data = content(1_000_000)
