@@ -303,7 +303,7 @@ class Engine:
                 self.remove(op)
         if starved:
             self.flow.on_starved()
-        if self.flow.limited:  # it is not the vehicle that is silent
+        if self.flow.limited and self._heard_at >= self.flow.sent_at:  # it is not the vehicle that is silent
             for op in self._ops:
                 op.progress(max(op.progress_at, now))
         return wires

@@ -101,7 +101,7 @@ QUEUE = 0.1
 meanwhile."""
 
 SMOOTHING = 0.2
-"""What one round counts for in an average, at most."""
+"""The share that one round counts for in an average, at most."""
 
 LOSS_MEMORY = 100
 """Requests over which the share of losses is averaged, at least."""
@@ -124,7 +124,7 @@ OVERHEAD, FULL = 58, 58 + MAX_DATA
 
 @dataclass(slots=True)
 class Round:
-    """What was seen since a round began.
+    """The answers and losses since a round began.
 
     Attributes:
         began: when. end: the order of the first request that was sent after that.
@@ -168,6 +168,7 @@ class Flow:
             server that pauses, does not count.
         alone: no other FTP client was heard lately.
         limited: requests wait for `bwlimit=`.
+        sent_at: when requests went out last.
     """
 
     def __init__(
@@ -182,7 +183,7 @@ class Flow:
         self._bucket = Bucket((DEPTH_SERIAL if serial else DEPTH) * FULL, TICK)
         self._bucket.rate = self._bwlimit
         self._cost = float(FULL)  # bytes that a usual request and its answer take on the link
-        self._hurried, self._ready_at, self._sent_at = False, inf, -inf
+        self._hurried, self._ready_at, self.sent_at = False, inf, -inf
         self._starting, self._flat = True, 0
         self._before_silence = 0
         # What is known of the path.
@@ -238,7 +239,7 @@ class Flow:
             room += self._beyond(now, self._reserve() if paced else 0.0)
         if urgent and self._queues_few and in_flight >= self.cap and self._rate > 0.0:
             # The queue, which is full of what was sent last, would drop it. Nothing else goes out before.
-            due = self._sent_at + self.cap / self._rate
+            due = self.sent_at + self.cap / self._rate
             if now < due:
                 self._ready_at = due
                 return 0
@@ -279,7 +280,7 @@ class Flow:
         """Note that so many requests, at least one, go out. There was room for them. size: bytes of data that
         they and their answers carry, at most."""
         self._bucket.charge(count * OVERHEAD + size)
-        self._sent_at = now
+        self.sent_at = now
 
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""

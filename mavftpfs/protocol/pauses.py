@@ -28,7 +28,7 @@ KNOWN = 30.0
 
 
 class Pauses:
-    """What the times of answers tell of a server's pauses.
+    """A server's pauses, as the times of its answers show them.
 
     Attributes:
         length: seconds without an answer that prove no loss, because the server pauses; 0 if it does not.

@@ -46,7 +46,7 @@ class DataSink(Protocol):
 
 
 class Wants:
-    """What is wanted of a file and has not come. It outlives the transfers that take from it.
+    """The ranges of a file that are wanted and have not come. They outlive the transfers that take from them.
 
     Attributes:
         demand: what programs wait for; it goes first. ahead: readahead, none of it in demand.

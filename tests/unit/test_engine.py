@@ -330,6 +330,22 @@ def test_who_begins_to_want_something_while_nothing_may_go_out_does_not_wait_for
     assert isinstance(transfer.error, RequestTimeout)
 
 
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("bwlimit", [100.0, 300.0, 5000.0])
+def test_a_low_limit_does_not_hide_that_the_vehicle_is_silent(bwlimit: float) -> None:
+    engine = Engine(StuckRandom(1), Flow(bwlimit=bwlimit))
+    transfer, _ = reading(engine)
+    now = 0.0
+    while not transfer.done:
+        sent(engine, now)
+        due = engine.next_deadline()
+        assert due is not None
+        now = max(now + 1e-3, due)
+        engine.on_deadline(now)
+    assert isinstance(transfer.error, RequestTimeout)
+    assert now == pytest.approx(30.0)
+
+
 # --- window and priority
 
 
