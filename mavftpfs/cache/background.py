@@ -29,7 +29,7 @@ PAUSES = (2.0, 30.0)
 
 
 class Background:
-    """Tries again to deliver what no program writes any more."""
+    """Tries again to deliver files that no program is writing."""
 
     def __init__(self, card: Card) -> None:
         self._card = card
@@ -116,8 +116,8 @@ class Background:
             self.retry()
 
     def retry(self) -> None:
-        """Deliver what no program writes any more: the vehicle is back, or may be written again. Errors that
-        this ends are forgotten."""
+        """Deliver all files that no program is writing: the vehicle is back, or may be written again. Errors
+        that this ends are forgotten."""
         for file in self._card.live:
             if isinstance(file.error, PASSING):
                 file.error = None

@@ -144,7 +144,7 @@ class _Waiter:
 
 
 class Blocks:
-    """What was read of one file on the vehicle; implements cache.remote.ReadSink.
+    """The bytes read of one file on the vehicle; implements cache.remote.ReadSink.
 
     Attributes:
         size: bytes of the vehicle's file, by the reply to its last open.
@@ -320,8 +320,8 @@ class Blocks:
 
     async def wait_for(self, start: int, stop: int) -> None:
         """Wait for the missing bytes of [start, stop), at most a piece, which the caller has just asked for.
-        `get` may find nothing afterwards, if bytes were dropped. Bytes for which no read waits any more,
-        after a cancellation or a time-out, are not fetched.
+        `get` may find nothing afterwards, if bytes were dropped. After a cancellation or a time-out, bytes
+        that no other read waits for are not fetched.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.

@@ -41,7 +41,7 @@ MAX_CLOSED = 2048
 
 
 class Card:
-    """What is known of the vehicle's card.
+    """All that is known of the vehicle's card.
 
     Attributes:
         clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks.
@@ -141,7 +141,7 @@ class Card:
 
     def maybe_forget(self, file: File) -> None:
         """Let a file go that no program has open and of which the vehicle lacks nothing: the bytes read of it
-        are kept as long as there is room, those written here are not needed any more."""
+        are kept as long as there is room, those written here are forgotten."""
         if file.handles or file.undelivered or file.unsure or file.lock.locked() or file.attempt:
             return
         self.live.pop(file, None)
@@ -172,11 +172,11 @@ class Card:
 
     def lose_name(self, file: File) -> None:
         """Take the name from a file that was removed, renamed over, or replaced by others: open handles keep
-        it, and what the vehicle has is not read any more."""
+        it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
         file.lose_name()
         file.content.on_unneeded()
-        file.blocks.end(FileChanged(f"what was {file.path!r} is not on the vehicle any more"))
+        file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
         if not file.handles:
             self.live.pop(file, None)
             file.content.forget()
@@ -252,7 +252,7 @@ class Card:
         self.directories.rebooted()
 
     def _on_suspect(self, file: File) -> None:
-        """What was read of a file is suspect, and was dropped; the kernel may have copies."""
+        """Note that the bytes read of a file are suspect, and were dropped; the kernel may have copies."""
         file.in_kernel = False
         if file.has_name:
             self.tell_changed(file.path)

@@ -16,7 +16,7 @@ from mavftpfs.shared.model import EntryKind, is_virtual, join, split
 
 
 class CardFiles(Source):
-    """What is on the card, pending changes included. Paths are the vehicle's."""
+    """The card's files and directories, pending changes included. Paths are the vehicle's."""
 
     def __init__(self, card: Card) -> None:
         self._card = card
@@ -160,8 +160,8 @@ class CardFiles(Source):
             raise
 
     async def _undo_truncate(self, file: File) -> None:
-        """Forget the change of a call that failed: its bytes are not wanted any more. If the vehicle may have
-        some of them, the change is kept, and delivered later."""
+        """Forget the change of a call that failed: its bytes are not wanted. If the vehicle may have some of
+        them, the change is kept, and delivered later."""
         card = self._card
         async with file.lock, card.paths.steady(file, lasting=True):
             await uploads.abandon(card, file)

@@ -52,7 +52,7 @@ class Content:
 
     @property
     def held(self) -> ExtentSet:
-        """What the spool has (a copy)."""
+        """The extents that the spool has (a copy)."""
         return ExtentSet(self._held)
 
     @property
@@ -170,7 +170,7 @@ class Content:
         self.spooled.mark_unneeded()
 
     def on_unneeded(self) -> None:
-        """Note that no vehicle is to get these bytes: the file has no name any more."""
+        """Note that no vehicle is to get these bytes: the file lost its name."""
         if self.spooled is not None:
             self.spooled.name = None
             self.spooled.mark_unneeded()

@@ -1,6 +1,6 @@
 """Delivers files: sends each one, verifies it, and places it under its name. Layer: cache.
 
-`deliver` returns when the vehicle has the file, verified (promise 2), or when none is wanted any more.
+`deliver` returns when the vehicle has the file, verified (promise 2), or when the file is not wanted.
 Otherwise it raises the reason. Bytes that are not delivered stay held, and the next call goes on with them.
 During a delivery no program changes the file (`File.lock`), so the verified bytes are the sent bytes.
 
@@ -203,7 +203,7 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
         elif (unproven or attempt.upload.made_twice) and await card.names.size(path) != file.size:
             raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
     except VerificationFailed:
-        # What was placed is spoilt, so the next delivery may replace it, whatever it has become.
+        # The placed file is spoilt, so the next delivery may replace it, whatever it has become.
         file.base, file.content.base_limit = Known(file.size), 0
         if unproven:
             await card.names.learn_rename_works(path)
@@ -312,7 +312,7 @@ async def _withdraw(card: Card, file: File) -> bool | None:
         if file.base is not None:
             there = None if in_place else there
         elif in_place or await uploads.is_empty_in_place(card, path):
-            await card.names.remove_if_there(path)  # it is a part of ours
+            await card.names.remove_if_there(path)  # a part that this mount wrote
     except MavftpfsError as error:
         log.info("%r is taken back, but nobody knows what has its name: %s", path, error)
         there = None

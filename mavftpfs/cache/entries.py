@@ -5,7 +5,7 @@ that is below it moves with it, so no table has to follow. An entry exists while
 remember of it: a listing, an open file, cached bytes.
 
 A file that was removed, or that another one was renamed over, keeps its folder and its last name, for
-messages; `has_name` tells that the folder does not know it any more.
+messages; its `has_name` is false then.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mavftpfs.shared.model import DirEntry, join, split
 
 @dataclass(slots=True)
 class Directory:
-    """What a directory was last seen to hold.
+    """A remembered listing of a directory.
 
     entries: by name. listed_at: when the sweep began, ended_at: when it was done, by the caches' clock;
     fresh_until: after that it proves nothing. complete: the vehicle listed it to its end. end: see
@@ -111,7 +111,7 @@ class Folder(Entry):
     """A directory.
 
     Attributes:
-        children: the entries in it, by name. listing: what it was last seen to hold, None if it was not
+        children: the entries in it, by name. listing: what it remembered of it, None if it was not
         listed, or that was forgotten. sweep: the listing that is under way. times: mtimes that users
         set.
     """

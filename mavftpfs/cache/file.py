@@ -36,7 +36,7 @@ from mavftpfs.shared.sending import SendBuffer
 
 
 class State(Enum):
-    """What the vehicle has of a file; see the module."""
+    """How much the vehicle has of a file; see the module."""
 
     CLEAN = "clean"
     DIRTY = "dirty"
@@ -45,7 +45,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to a file.
+    """An event in the life of a file.
 
     CHANGED: a program made it, wrote or truncated it. EMPTIED: a program truncated it to nothing, so the base
     matters no more. PLACED: the vehicle has all of it under its name, verified. REPLACED: others replaced the
@@ -150,7 +150,7 @@ class File(Entry):
 
     @property
     def blocks(self) -> Blocks:
-        """What was read of the vehicle's file."""
+        """The bytes read of the vehicle's file."""
         return self.content.blocks
 
     @property
@@ -186,7 +186,7 @@ class File(Entry):
             return True
         if self.attempt is None or not self.attempt.in_place:
             return False
-        # A new file is ours once bytes went out: CreateFile was ACKed. An old one may be emptied before that.
+        # A new file counts once bytes went out: CreateFile was ACKed. An old one may be emptied before that.
         sending = self.attempt.sending
         return sending.handed_out > 0 if self.base is None else sending.begun
 
@@ -211,7 +211,7 @@ class File(Entry):
         return self.changes != unsure.changes
 
     def require_alive(self) -> None:
-        """Raise FileChanged if others replaced the file: nothing of it is read any more."""
+        """Raise FileChanged if others replaced the file: no handle reads it from then on."""
         if self.state is State.STALE and not self.has_name:
             raise FileChanged(f"{self.path!r} was replaced on the vehicle")
 
@@ -220,7 +220,7 @@ class File(Entry):
         if self.state is State.STALE:
             raise FileChanged(f"{self.path!r} is another file by now")
         if not self.has_name:
-            raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
+            raise FileChanged(f"what was {self.path!r} is gone from the vehicle")
 
     def require_not_broken(self) -> None:
         """Raise WriteFailed if a write of it failed."""

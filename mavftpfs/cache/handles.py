@@ -77,7 +77,7 @@ class ReadHandle(OpenFile):
         await self._deliver(ends_write=ends_write)
 
     async def release(self) -> None:
-        """Deliver what was written by this handle, and close it. What could not be delivered stays held.
+        """Deliver what was written by this handle, and close it. Bytes that could not be delivered stay held.
 
         Raises:
             Why it is not delivered.
@@ -107,7 +107,7 @@ class ReadHandle(OpenFile):
 
 
 def on_closed(card: Card, file: File) -> None:
-    """Let go of a file that no program has open any more."""
+    """Let go of a file whose last handle was closed."""
     if not file.undelivered:
         file.blocks.on_failed(LocalProtocolError(f"{file.path!r} was closed while it was read"))
         file.blocks.close_reader()
@@ -184,8 +184,8 @@ class WriteHandle(ReadHandle):
         """Hold the file's lock while the body changes the file. If the body fails, or there is no room for
         it, the file breaks, if this handle changed it before.
 
-        size: bytes that the file will have at least. empties: the body empties the file: the bytes on their
-        way to the vehicle are not wanted any more, and new ones need no room.
+        size: bytes that the file will have at least. empties: the body empties the file: an upload
+        that is under way is cancelled, and the change needs no room.
 
         Raises:
             As _have_room; WriteFailed.

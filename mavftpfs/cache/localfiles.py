@@ -56,7 +56,7 @@ class LocalFiles(Source):
     """All local files of a mount. They are entries of its tree, so they follow their directory.
 
     Attributes:
-        used: bytes of content, also of files that are open and have no name any more.
+        used: bytes of content, also of open files that were removed.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What every kind of path offers: the vehicle's files, local files, snapshots, texts. Layer: cache.
+"""The calls that each kind of path offers: the card's files, local files, snapshots, texts. Layer: cache.
 
 `Tree` finds the source of a path once, and asks it. A source that does not override a call refuses changes.
 """

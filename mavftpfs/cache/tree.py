@@ -66,7 +66,7 @@ class Tree:
         attributes are wrong; must not block.
 
         `nursery`: listings and snapshots under way survive the cancellation of their callers.
-        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names.
+        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers temporary files.
         """
         self._options = options
         self._forget_copies = invalidate
@@ -117,7 +117,7 @@ class Tree:
     def negative_valid_for(self, path: bytes) -> float:
         """Return for how many seconds a caller may remember that stat(path) raised NotFound.
 
-        0 where the absence is not proven: the listing was incomplete or is not fresh any more.
+        0 where the absence is not proven: the listing was incomplete or is too old.
         """
         remote, directories = self._remote(path), self._card.directories
         left = self._virtual.absent_until(remote) - self._card.clock()

@@ -154,7 +154,7 @@ async def abandon(card: Card, file: File) -> None:
 
 
 def forget_attempt(file: File, attempt: Attempt) -> None:
-    """Note that an attempt ended without success. What it left under the file's own name is the file's."""
+    """Note that an attempt ended without success. Bytes under the file's own name belong to the file."""
     if file.lies_in_place:
         file.unsure = Unsure(attempt.path, None, Known(attempt.sending.size), file.changes, in_place=True)
     file.attempt = None

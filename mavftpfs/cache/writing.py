@@ -1,6 +1,6 @@
-"""What programs do to the content of files: opening for writing, changing, breaking. Layer: cache.
+"""Changes of files by programs: opening for writing, changing, breaking. Layer: cache.
 
-A change is put into the local spool at once. **What is dirty becomes whole**: if a program changes a part of
+A change is put into the local spool at once. **A changed file becomes whole**: if a program changes a part of
 a file, the rest is fetched from the vehicle once the program pauses, or when it closes the file. So what is
 sent, or kept when it cannot be sent, is always a file; and a program that overwrites every byte makes nothing
 be fetched.
