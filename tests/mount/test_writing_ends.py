@@ -300,7 +300,7 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
             "mavftpfs: Ctrl-C only stops this command; to save the remaining files here now: "
             f"kill {process.popen.pid}\n"
         )
-        assert third == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
+        assert third == "mavftpfs: uploading 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
         assert not mounted_at(mount.path)
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
