@@ -1,6 +1,6 @@
 """Compares a local file with the vehicle's by size and CRC32. Layer: client.
 
-get, sync, sync --check, recover and the watch all decide here whether two files are the same.
+get, sync, sync --check, recover and the watch all compare files here.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from mavftpfs.shared.model import is_snapshot
 Verify = Literal["auto", "all", "none"]
 
 VERIFIED_BY_DEFAULT = 16_000_000
-"""`auto` asks for the checksum of files of up to so many bytes. A vehicle computes about a megabyte a second,
-and most vehicles answer nothing else meanwhile."""
+"""The largest file for which `auto` asks for the checksum, in bytes. A vehicle computes about a megabyte a
+second, and most vehicles answer nothing else meanwhile."""
 
 NOT_NOW = (Armed, NotDeliveredYet, RequestTimeout, SessionBusy, FileBusy)
 """Errors of a request for a checksum that may succeed later."""
 
 
 class Match(Enum):
-    """Whether two files are the same."""
+    """The result of comparing two files."""
 
     SAME = "same"
     DIFFERS = "differs"
@@ -50,8 +50,9 @@ class Match(Enum):
 class Comparison:
     """The result of `compare`.
 
-    how: for people, the properties that agree, or how they differ. lacking: why the vehicle told no checksum
-    although it was asked, else "". later: it may tell one later.
+    how: for people, the properties that agree, or the difference. lacking: the reason why the vehicle
+    reported no checksum although mavftpfs asked for one, otherwise "". later: the vehicle may report one
+    later.
     """
 
     match: Match
@@ -66,7 +67,7 @@ GENERATED = Comparison(Match.UNKNOWN, "size (generated at each opening, so a che
 
 
 class Content(NamedTuple):
-    """The size in bytes and the CRC32 of bytes that are here."""
+    """The size in bytes and the CRC32 of local bytes."""
 
     size: int
     crc32: int
@@ -82,12 +83,12 @@ async def compare(
 ) -> Comparison:
     """Compare a file of the vehicle with a local one.
 
-    size: of the vehicle's file, if a listing or an open just told it. checksum: whether the vehicle is asked
-    for its CRC32; without it the match is UNKNOWN or DIFFERS.
+    size: of the vehicle's file, if a listing or an open has just reported it. checksum: ask the vehicle for
+    its CRC32; without one the match is UNKNOWN or DIFFERS.
 
     Raises:
-        LinkError: the vehicle, or the mount, is gone. OSError: the local file cannot be read. Of the size,
-        if that is asked for, as Files.stat.
+        LinkError: the vehicle, or the mount, is gone. OSError: the local file cannot be read. For the size as
+        Files.stat.
     """
     if size is None:
         size = (await session.files.stat(remote)).size
@@ -111,8 +112,8 @@ async def compare(
 
 
 def wants_checksum(verify: Verify, size: int, *, resumed: bool = False) -> bool:
-    """Return whether a file of that size is compared by its checksum, too. resumed: an earlier run brought
-    bytes of it."""
+    """Return whether a file of that size is compared by its checksum, too. resumed: some of its bytes are
+    from an earlier run."""
     if resumed or verify == "all":
         return True
     return verify == "auto" and size <= VERIFIED_BY_DEFAULT
@@ -123,7 +124,7 @@ def _size(local: Path) -> int:
 
 
 def _why_not(error: MavftpfsError) -> str:
-    """Return in a few words why there is no checksum."""
+    """Return the reason for a missing checksum in a few words."""
     match error:
         case Armed():
             return "armed"

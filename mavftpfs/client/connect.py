@@ -53,7 +53,7 @@ from mavftpfs.shared.options import Options
 MIB = 1 << 20
 KEY_SIZE = 32
 BITS_PER_BYTE = 10
-"""On a serial port: eight, and a start and a stop bit."""
+"""Bits of a byte on a serial port: eight, and a start and a stop bit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,8 @@ class Space:
 class Attached:
     """A connected vehicle and its files.
 
-    watcher: to be run by a program that keeps running. notice: moves what earlier mounts left, and returns a
-    line, or "".
+    watcher: a program that keeps running has to run it. notice: moves the files of earlier mounts to a
+    recovery directory, and returns a line about them, or "".
     """
 
     connection: Connection
@@ -78,11 +78,11 @@ class Attached:
     notice: Callable[[], str] = str
 
     def status(self) -> dict[str, Any]:
-        """Return what is known of vehicle, link and files, JSON-able."""
+        """Return the facts about vehicle, link and files, JSON-able."""
         return snapshot(self.connection.status(), self.tree.status(), self.watcher.traffic)
 
     def space(self) -> Space | None:
-        """Return what STORAGE_INFORMATION said, if it was sent."""
+        """Return the space in the vehicle's STORAGE_INFORMATION, None before that was received."""
         storage = self.connection.vehicle.storage
         if storage is None or not storage.total_capacity > 0:
             return None
@@ -92,8 +92,8 @@ class Attached:
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """Where the traffic of the link is recorded: FTP payloads, and whole frames. tell: gets lines for people
-    about what is waited for."""
+    """Records of the link's traffic: FTP payloads, and whole frames. tell: receives lines for people about
+    waiting for a vehicle."""
 
     payload: PayloadSink | None = None
     frame: Callable[[bytes], None] | None = None
@@ -105,7 +105,7 @@ NO_SINKS = Sinks()
 
 @contextmanager
 def open_sinks(options: Options, *, debug: bool, tell: Callable[[str], None]) -> Iterator[Sinks]:
-    """Open what tlog= and -d ask for, and close it after the body; tell: see Sinks.
+    """Open the records for tlog= and -d, and close them after the body; tell: see Sinks.
 
     Raises:
         UsageError: the file cannot be created.
@@ -120,11 +120,11 @@ def _print_payload(now: float, direction: str, wire: bytes) -> None:
 
 
 HOLDER_PATIENCE = 3.0
-"""Seconds for mounts to say whether they have a link."""
+"""Seconds for mounts to answer which link they have."""
 
 
 async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
-    """Return the status of the mount that has a link, None where none is known."""
+    """Return the status of the mount that has a link, None if no mount is known."""
     with trio.move_on_after(HOLDER_PATIENCE):
         return await trio.to_thread.run_sync(holder_of, spec, abandon_on_cancel=True)
     return None
@@ -132,12 +132,12 @@ async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
 
 @asynccontextmanager
 async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
-    """Open a link for the length of the body, alone or with other programs of ours.
+    """Open a link for the length of the body, alone or with other mavftpfs programs.
 
-    beats: only to hear heartbeats; then the link is shared from the beginning.
+    beats: receive only heartbeats; then the link is shared from the beginning.
 
     Raises:
-        LinkClosed: as open_link; a mount that has the port or the device, and cannot share it, is named.
+        LinkClosed: as open_link; the text names a mount that has the port or the device and cannot share it.
     """
     own = Address(options.source_system, OWN_COMPONENT)
     wanted = PortRequest(own, options.forward, process_name(), beats)
@@ -171,7 +171,7 @@ def _had_by(spec: LinkSpec, status: Mapping[str, Any]) -> str:
 
 
 def waiting(spec: LinkSpec, options: Options) -> str:
-    """Return what a person is told while a vehicle is waited for."""
+    """Return the line for a person while mavftpfs waits for a vehicle."""
     return f"waiting for a heartbeat on {spec.description} ({options.connect_timeout:g} s)"
 
 
@@ -186,13 +186,15 @@ async def attached(
     writing: bool = False,
     rescue_for: str | None = None,
 ) -> AsyncIterator[Attached]:
-    """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
+    """Connect, wait for the first heartbeat and the first listing, and keep the connection for the length of
+    the body.
 
-    list_root: False if the body asks for something at once itself, as a command that waits for other clients.
-    writing: the tree may be changed, if the options do not forbid it. Its held bytes then lie in a spool that
-    survives the process. rescue_for: `Attached.notice` moves what earlier mounts left there to a recovery
-    directory named after this SOURCE. It is called when its line can be shown to a person. Without rescue_for
-    this program leaves nothing in the spool either: its undelivered files are still where they came from.
+    list_root: False if the body itself sends a request at once, as a command that waits for other clients
+    does. writing: the body may change the tree, unless the options forbid it. Pending changes then go into a
+    spool that survives the process. rescue_for: `Attached.notice` moves the files that earlier mounts left
+    there to a recovery directory named after this SOURCE; it is called when its line can be shown to a
+    person. Without rescue_for this program, too, leaves no file in the spool, because the local originals
+    still exist.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
@@ -223,7 +225,7 @@ async def with_tree(
     writing: bool = False,
     rescue_for: str | None = None,
 ) -> AsyncIterator[Attached]:
-    """Give a connected vehicle's files for the length of the body; arguments as of `attached`."""
+    """Give a connected vehicle's files to the body; arguments as of `attached`."""
     writing = writing and not options.read_only
     caches = replace(cache_options(options, spec), read_only=not writing)
     async with plain_nursery() as nursery:
@@ -253,8 +255,8 @@ async def with_tree(
 
 
 def other_vehicles_heard(connection: Connection, options: Options) -> str:
-    """Return a line on other vehicles that are heard, if the first one was taken because it came first; else
-    ""."""
+    """Return a line about other vehicles on the link, if the user named none and the first one is used;
+    otherwise ""."""
     address = connection.vehicle.address
     if options.target_system or address is None:
         return ""
@@ -268,7 +270,7 @@ def other_vehicles_heard(connection: Connection, options: Options) -> str:
 
 
 def process_name() -> str:
-    """Return how a hub names this program to people: its name, or the words of a command of ours, with an
+    """Return this program's name for the hub's lists: its name, or the words of a mavftpfs command, with an
     absolute mountpoint; and its process id."""
     path = Path(sys.argv[0] if sys.argv else "")
     name = path.parent.name if path.name == "__main__.py" else path.name
@@ -301,9 +303,9 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
             await tree.list(ROOT)
             return
     except ListingIncomplete:
-        return  # the program that lists it gets the error
+        return  # the program that lists the root gets the error
     except (RequestTimeout, VehicleLost):
-        pass  # for the user the same: no answer
+        pass  # for the user this is no answer, too
     except SessionBusy as exc:
         raise NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use") from exc
     except (NotFound, NotADirectory, FtpNak) as exc:
@@ -316,7 +318,7 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
 
 
 def no_answer(connection: Connection, options: Options) -> NoFtp:
-    """Return the error for no answer to an FTP request within connect_timeout."""
+    """Return the error for a vehicle that answers no FTP request within connect_timeout."""
     return NoFtp(
         f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "
         f"within {options.connect_timeout:g} s ({_flag(connection)})"
@@ -336,7 +338,7 @@ def _flag(connection: Connection) -> str:
 
 
 def subscribe(connection: Connection, tree: Tree) -> None:
-    """Tell a tree what happens to the vehicle and the link, from now on."""
+    """Report all events of the vehicle and the link to a tree, from now on."""
     reactions: dict[str, Callable[[], None]] = {
         "reboot": tree.rebooted,
         "back": tree.link_back,
@@ -375,10 +377,10 @@ def _values(options: Options) -> dict[str, Any]:
 def read_key(path: str) -> bytes:
     """Return the MAVLink 2 signing key in a file: 32 raw bytes, 64 hex digits, or a passphrase.
 
-    A passphrase becomes a key by SHA-256, as ground stations do it.
+    A passphrase becomes a key by SHA-256, as in ground stations.
 
     Raises:
-        UsageError: it cannot be read, is empty, or others can read it too (the same rule as ssh has).
+        UsageError: the file cannot be read, is empty, or others can read it, too (the same rule as ssh's).
     """
     try:
         with Path(path).open("rb") as file:
@@ -402,12 +404,12 @@ def read_key(path: str) -> bytes:
 
 
 VERSION_PATIENCE = 5.0
-"""Seconds for a vehicle to send AUTOPILOT_VERSION, which has its unique id."""
+"""Seconds for a vehicle to send AUTOPILOT_VERSION, which contains its unique id."""
 _VERSION_POLL = 0.02
 
 
 async def told_version(connection: Connection) -> AutopilotVersion | None:
-    """Return what a vehicle tells of itself, None if it does not. It is asked at each connection."""
+    """Return the vehicle's AUTOPILOT_VERSION, None if it sends none. Each connection asks for it."""
     with trio.move_on_after(VERSION_PATIENCE):
         while connection.vehicle.version is None:  # noqa: ASYNC110 (for once)
             await trio.sleep(_VERSION_POLL)

@@ -1,4 +1,4 @@
-"""How the watch hears vehicles and gets the files of one: over a link, or by a mount. Layer: client."""
+"""The watch's way to vehicles and the files of one: over a link, or by a mount. Layer: client."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from mavftpfs.shared.options import Options
 
 
 class Heard(NamedTuple):
-    """A heartbeat of a vehicle. restarted, refused: since the last one it restarted, or refused to be
-    armed."""
+    """A heartbeat of a vehicle. restarted, refused: since the last heartbeat the vehicle restarted, or
+    refused to arm."""
 
     system: int
     armed: bool
@@ -31,41 +31,41 @@ class Heard(NamedTuple):
 
 
 class Contact(Protocol):
-    """A way to vehicles, to the files of one of them."""
+    """A way to vehicles, and to the files of one of them."""
 
     @property
     def system(self) -> int | None:
-        """The vehicle whose files can be had, None before one was heard."""
+        """The vehicle whose files are accessible, None before a vehicle was heard."""
 
     @property
     def replaced(self) -> bool:
-        """Whether another vehicle has that system id now, so that the contact is of no use."""
+        """Whether another vehicle has that system id now, so that the contact is useless."""
 
     @property
     def uid(self) -> str | None:
-        """The unique id of that vehicle, None as long as it does not tell it."""
+        """The unique id of that vehicle, None while unknown."""
 
     async def listen(self) -> list[Heard]:
-        """Return what was heard since the last call.
+        """Return the heartbeats since the last call.
 
         Raises:
             LinkError: the contact broke.
         """
 
     async def identity(self) -> str | None:
-        """Return the unique id when the vehicle told it; None if it does not."""
+        """Return the unique id once the vehicle has reported it; None if it never does."""
 
     def session(self) -> AbstractAsyncContextManager[Session]:
         """Give that vehicle's files for the length of the body.
 
         Raises:
-            LinkError: they are to be had another way now.
+            LinkError: the contact has ended; another one leads to the files now.
         """
 
 
 @dataclass(slots=True)
 class LinkContact:
-    """A connection of the watch's own. When the connection ends it closes the server's session.
+    """A connection of the watch's own. When the connection ends, it closes the server's session.
 
     is_mounted: returns whether a mount has the vehicle now, which would share its only session.
     """
@@ -126,7 +126,7 @@ class LinkContact:
 
 @dataclass(slots=True)
 class MountContact:
-    """A mount that is up. The mount closes the server's session itself when nothing uses it."""
+    """A mount that is up. The mount closes the server's session itself when no program uses it."""
 
     files: Session
     system: int | None = None

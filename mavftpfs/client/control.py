@@ -1,15 +1,15 @@
-"""The control socket: how commands and programs talk to a running mount. Layer: client.
+"""The control socket: commands and programs send requests to a running mount. Layer: client.
 
-One Unix socket for each mount, named after a hash of the mountpoint. One request and one reply, each a JSON
-object on a line; the reply to `umount` comes when all is delivered and the session is closed. These lines
-stay as they are, so that mounts of all versions can be asked and ended. A request for `files` is followed by
-the messages of client.wire.
+Each mount has a Unix socket, named after a hash of the mountpoint. A request and its reply are each a JSON
+object on a line; the reply to `umount` is sent after the last upload, when the session is closed. These lines
+never change, so that a command can query and end mounts of all versions. After a request for `files`, the
+messages of client.wire follow.
 
-The socket is the user's alone (0600). That of root's mount is in SYSTEM: it serves the user that `uid=`
-names, too.
+The socket belongs to the user alone (0600). A mount of root has its socket in SYSTEM, and also serves the
+user that `uid=` names.
 
-This is the side of the commands: plain blocking code, because they should start at once. The mount's side is
-mount.controlserver.
+This is the side of the commands: plain blocking code, because commands should start at once. The mount's side
+is mount.controlserver.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 SYSTEM = Path("/run/mavftpfs")
 FOREIGN = "belongs to another user; only that user and root may use it by commands"
-"""Why a mount refuses; its files may be for all."""
+"""The reason why a mount refuses, although its files may be for everybody."""
 BOUND = Path("/proc/net/unix")
 """The kernel's table of sockets that are bound."""
 _SUFFIX = ".sock"
@@ -49,7 +49,7 @@ class ControlError(MountFailed):
 
 
 class Refused(ControlError):
-    """The mount's process refused; the text says why."""
+    """The mount's process refused; the text gives the reason."""
 
 
 class NobodyThere(ControlError):
@@ -66,7 +66,7 @@ def socket_name(mountpoint: str) -> str:
 
 
 def usable_directory(preferred: Path | None = None) -> Path:
-    """Return a directory for this user's sockets, which is made if need be.
+    """Return a directory for this user's sockets, and make it if necessary.
 
     Raises:
         ControlError: none can be made.
@@ -81,7 +81,7 @@ def usable_directory(preferred: Path | None = None) -> Path:
 
 
 def _is_roots(directory: Path) -> bool:
-    """Make a directory that all may enter; return whether only root may change what is in it."""
+    """Make a directory that all may enter; return whether only root may change its entries."""
     with suppress(OSError):
         with suppress(FileExistsError):
             directory.mkdir()
@@ -126,7 +126,7 @@ def granted(reply: object) -> Reply:
     """Return a reply.
 
     Raises:
-        Refused: the reply says why. ControlError: it is none.
+        Refused: the reply gives the reason. ControlError: the reply is malformed.
     """
     if not isinstance(reply, dict):
         raise ControlError("malformed answer")
@@ -142,7 +142,7 @@ def find_socket(mountpoint: str, uid: int | None = None) -> Path:
     """Return the socket of the mount on `mountpoint`, of this user, of root or of `uid`.
 
     Raises:
-        NobodyThere: there is none.
+        NobodyThere: there is no such socket.
     """
     for path in all_sockets(uid):
         if path.name == socket_name(mountpoint):
@@ -152,7 +152,7 @@ def find_socket(mountpoint: str, uid: int | None = None) -> Path:
 
 def all_sockets(uid: int | None = None) -> Iterator[Path]:
     """Yield the sockets at which mounts of this user, of root or of `uid` listen in this network namespace,
-    wherever they are."""
+    in every directory."""
     owners = {0, os.getuid(), uid}
     try:
         lines = BOUND.read_text(errors="surrogateescape").splitlines()
@@ -160,6 +160,6 @@ def all_sockets(uid: int | None = None) -> Iterator[Path]:
         return
     for path in dict.fromkeys(line.split(maxsplit=7)[-1] for line in lines):
         if _OURS.search(path):
-            with suppress(OSError):  # it is another user's
+            with suppress(OSError):  # the directory is another user's
                 if os.stat(path).st_uid in owners:
                     yield Path(path)

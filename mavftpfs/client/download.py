@@ -35,20 +35,21 @@ from mavftpfs.shared.model import EntryKind, join, split
 from mavftpfs.shared.readable import name_text
 
 MAX_TIMEOUTS = 2
-"""Files in a row whose requests timed out, after which a run ends: the others would time out, too."""
+"""The number of successive files with timed-out requests that ends a run, because the others would fail,
+too."""
 
 
 class Reports:
     """Receives the news of a run of downloads; this base class ignores them."""
 
     def begins(self, wanted: Wanted) -> None:
-        """A file begins. An error of this call ends the run."""
+        """Note that a file begins. An error of this call ends the run."""
 
     def arrived(self, fetched: Fetched) -> None:
-        """A file is here."""
+        """Note that a file is complete."""
 
     def failed(self, name: str, error: MavftpfsError) -> None:
-        """A file is not here, or a directory could not be listed; the run goes on."""
+        """Note that a file failed, or that a directory could not be listed; the run continues."""
         self.says(named(name, error))
 
     def says(self, line: str) -> None:
@@ -57,10 +58,10 @@ class Reports:
 
 @dataclass(slots=True)
 class Outcome:
-    """How far a run came. place: the directory of logs; here: files that were here already.
+    """The progress of a run. place: the directory of logs; here: files that were here already.
 
-    verified: how files were compared. failed: why a file, or the files of a directory, are not here. checked:
-    `sync --check` ran. finished: nothing ended the run before its last file.
+    verified: the comparison of each file. failed: the error of each file, or of a directory. checked: `sync
+    --check` ran. finished: the run came to its last file.
     """
 
     place: bytes = b""
@@ -74,24 +75,25 @@ class Outcome:
 
     @property
     def differing(self) -> dict[bytes, str]:
-        """How the files that differ do so."""
+        """The difference of each file that differs, in words."""
         return {path: one.how for path, one in self.verified.items() if one.match is Match.DIFFERS}
 
     @property
     def complete(self) -> bool:
-        """Whether all wanted files are here; after `sync --check`, whether all are proven to be the same."""
+        """Whether all wanted files are here; after `sync --check`, whether all are verified to be the
+        same."""
         unproven = self.checked and bool(self.lacking)
         return self.finished and not (self.failed or self.differing or unproven)
 
     @property
     def lacking(self) -> Counter[str]:
-        """Why checksums were not compared although they should have been, and for how many files."""
+        """The reasons for missing checksums, each with its number of files."""
         return Counter(one.lacking for one in self.verified.values() if one.lacking)
 
 
 @dataclass(frozen=True, slots=True)
 class Downloads:
-    """Downloads files, and keeps `outcome` up to date, so that an interrupted run can be told, too."""
+    """Downloads files, and keeps `outcome` up to date, so that an interrupted run can be reported, too."""
 
     fetcher: Fetcher
     outcome: Outcome
@@ -106,7 +108,7 @@ class Downloads:
         recursive: bool,
         selection: Selection = EVERYTHING,
     ) -> None:
-        """Fetch files, and with `recursive` directories; names may be patterns.
+        """Download files, and with `recursive` directories; names may be patterns.
 
         A single file goes into `local` if that is a directory; otherwise it gets that name. Everything else
         goes into `local`, which is made. Files that match a pattern keep their directories from the first
@@ -138,8 +140,8 @@ class Downloads:
         await self.fetch_all(apart(found), alone=alone)
 
     async def _refreshed_for(self, path: bytes) -> bool:
-        """Have a mount list again if it does not know a path: the file may be newer than its last listing.
-        Return whether the mount did."""
+        """Have a mount list again if it does not know a path, because the file may be newer than its last
+        listing. Return whether the mount did."""
         files = self.fetcher.session.files
         try:
             if await matching(files, path) == [path]:
@@ -185,7 +187,7 @@ class Downloads:
         """Pass on the bytes of files, one behind the other.
 
         Raises:
-            As Fetcher.write_to where only one file is asked for; LinkError always.
+            As Fetcher.write_to for a single file; LinkError always.
         """
         for path in paths:
             try:
@@ -197,12 +199,12 @@ class Downloads:
     async def fetch_all(
         self, wanted: Sequence[Wanted], *, alone: bool = False, note: Callable[[Fetched], None] | None = None
     ) -> None:
-        """Download files, and go on after one that fails; alone: raise its error instead. note: called for
-        each file that is here.
+        """Download files, and continue after one that fails; alone: raise its error instead. note: called for
+        each downloaded file.
 
         Raises:
-            LinkError, LocalDiskFull, and RequestTimeout for MAX_TIMEOUTS files in a row: the others would
-            fail, too. Whatever Reports.begins raises.
+            LinkError, LocalDiskFull, and RequestTimeout for MAX_TIMEOUTS successive files, because the others
+            would fail, too. Also the errors of Reports.begins.
         """
         progress, timeouts = self.fetcher.progress, 0
         self.outcome.wanted = [*wanted]
@@ -231,7 +233,7 @@ class Downloads:
         self.reports.arrived(fetched)
 
     def fail(self, path: bytes, error: MavftpfsError, name: str = "", *, alone: bool = False) -> None:
-        """Report a failure; or raise the error, if the other files would fail, too, or there are none."""
+        """Report a failure; or raise the error, if the other files would fail, too, or if there are none."""
         self.outcome.failed[path] = error
         if alone or isinstance(error, LinkError | LocalDiskFull):
             raise error
@@ -240,8 +242,8 @@ class Downloads:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where paths of the vehicle go. `local` stands for the directory `top`; into: as a directory, which is
-    made. source: the directory or file that was asked for; for a pattern, `top`."""
+    """The local place for paths of the vehicle. `local` stands for the directory `top`; into: as a directory,
+    which is made. source: the directory or file that the user named; for a pattern, `top`."""
 
     top: bytes
     source: bytes
@@ -249,7 +251,7 @@ class Place:
     into: bool
 
     def of(self, path: bytes, *, alone: bool) -> Path:
-        """Return where a path goes; alone: `local` may be the name of the file."""
+        """Return the local path for a path; alone: `local` may be the name of the file."""
         if alone and not (self.into or self.local.is_dir()):
             return self.local
         return self.local / os.fsdecode(_below(path, self.top))
@@ -261,7 +263,7 @@ def _require_apart(wanted: Iterable[Wanted]) -> None:
     for one in wanted:
         if one.local in names:
             raise UsageError(
-                f"{names[one.local]} and {one.name} would both become {one.local}; nothing was fetched: "
+                f"{names[one.local]} and {one.name} would both become {one.local}; nothing was downloaded: "
                 "get each into a directory of its own"
             )
         names[one.local] = one.name
@@ -272,18 +274,18 @@ def _below(path: bytes, top: bytes) -> bytes:
 
 
 def named(name: str, error: MavftpfsError) -> str:
-    """Return an error's text with the name of its file; some texts have it already."""
+    """Return an error's text with the name of its file, which some texts already contain."""
     text = str(error)
     return text if name in text else f"{name}: {text}"
 
 
 def wanted_file(remote: bytes, local: Path, name: bytes, stat: Stat, *, keep_old: bool = False) -> Wanted:
-    """Return what to download for a listed file; name: its path for people."""
+    """Return the Wanted for a listed file; name: its path for people."""
     mtime = known_time(stat.mtime)
     return Wanted(remote, name_text(name), stat.size, mtime, local, part_of(local), keep_old)
 
 
 def apart(wanted: Sequence[Wanted]) -> list[Wanted]:
-    """Return files of one run, none of which has its .part where another belongs."""
+    """Return the files of a run without those whose .part has the name of another file."""
     finals = {one.local for one in wanted}
     return [replace(one, part=part_of(one.local, finals)) for one in wanted]

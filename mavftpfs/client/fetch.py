@@ -45,22 +45,22 @@ from mavftpfs.shared.readable import name_text, readable_size
 LEAST_READ, LARGEST_READ = 2048, 128 * 1024
 """Bytes of one read."""
 QUICK, SLOW = 0.25, 1.0
-"""Seconds: after a read that took less the next one is larger, after one that took more it is smaller."""
+"""Seconds of one read: after a shorter one the next read is larger, after a longer one it is smaller."""
 
 EARLIEST = 946_684_800
-"""2000-01-01 UTC: an earlier time tells people nothing."""
+"""2000-01-01 UTC: an earlier time is meaningless."""
 
 
 def known_time(mtime: int) -> int | None:
-    """Return a listed time, None if it tells nothing."""
+    """Return a listed time, None if it is meaningless."""
     return mtime if mtime >= EARLIEST else None
 
 
 def next_read_size(size: int, took: float) -> int:
-    """Return how many bytes to read next, after `size` bytes took so many seconds.
+    """Return the size of the next read, after `size` bytes took so many seconds.
 
-    After each read the bytes are safe in the .part, and the screen shows them. On a radio a read should take
-    about a second.
+    After each read the bytes are safe in the .part, and the screen shows them. So on a radio a read should
+    take about a second.
     """
     if took < QUICK:
         return min(size * 2, LARGEST_READ)
@@ -73,14 +73,14 @@ MAX_RETURNS = 20
 
 
 class LocalDiskFull(UsageError):
-    """Nothing more can be written on the local disk."""
+    """The local disk is full."""
 
 
 class StillGrowing(MavftpfsError):
-    """The vehicle is writing the file; the bytes that arrived so far stay as its .part.
+    """The vehicle is writing the file; the downloaded bytes stay as its .part.
 
     Attributes:
-        came: the bytes that are here.
+        came: number of downloaded bytes.
     """
 
     def __init__(self, reason: str, came: int) -> None:
@@ -89,16 +89,16 @@ class StillGrowing(MavftpfsError):
 
 
 class NotProvenYet(MavftpfsError):
-    """All bytes are in the .part, but some are of an earlier run and nothing proves them now."""
+    """The .part is complete, but some bytes are from an earlier run, and nothing verifies them now."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
     """A file to download. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
-    part: the local file that holds the bytes until all are here. keep_old: a local file of that name may be
-    the beginning of this one; if it is not, it is renamed to NAME.~1~. growing: the
-    vehicle still writes the file, so its present bytes stay a .part.
+    part: the local file for the bytes until all have arrived. keep_old: a local file of that name may be the
+    beginning of this one; otherwise it is renamed to NAME.~1~. growing: the vehicle still writes the file, so
+    its present bytes stay a .part.
     """
 
     remote: bytes
@@ -127,11 +127,11 @@ class Wanted:
 
 
 def _still_growing(name: str, came: int) -> StillGrowing:
-    return StillGrowing(f"{name} is still growing: only its first {readable_size(came)} came", came)
+    return StillGrowing(f"{name} is still growing: only its first {readable_size(came)} are here", came)
 
 
 def _size(path: Path) -> int:
-    """Return the size of a local file; -1 where none is."""
+    """Return the size of a local file; -1 if there is none."""
     try:
         return path.stat().st_size if path.is_file() else -1
     except OSError:
@@ -140,7 +140,7 @@ def _size(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file that is here. resumed: bytes that were here before; was_here: the whole file was here under its
+    """A downloaded file. resumed: bytes from an earlier run; was_here: the whole file was here under its
     name; kept: the new name of another file that had its name.
     """
 
@@ -153,7 +153,7 @@ class Fetched:
 
     @property
     def proven(self) -> bool:
-        """Whether its checksum was compared, or need not be compared later."""
+        """Whether its checksum was compared, or is not required."""
         return not (self.verified.lacking and self.verified.later)
 
     @property
@@ -179,30 +179,30 @@ def local_disk(place: Path) -> Iterator[None]:
 
 
 class Part:
-    """A .part, locked against another program that fetches the same file."""
+    """A .part, locked against another program that downloads the same file."""
 
     def __init__(self, path: Path, local: Path) -> None:
-        """Raises: UsageError: it is no file, or is in use. OSError."""
+        """Open and lock it. Raises: UsageError: the path is not a file, or is in use. OSError."""
         self.local = local
         self.path = path
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         fd = os.open(self.path, flags, 0o666)
         try:
             if not stat.S_ISREG(os.fstat(fd).st_mode):
-                raise UsageError(f"{self.path} is no file")
+                raise UsageError(f"{self.path} is not a file; remove or rename it")
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.lstat(self.path).st_ino != os.fstat(fd).st_ino:
                 raise FileNotFoundError
         except BaseException as exc:
             os.close(fd)
-            if isinstance(exc, BlockingIOError | FileNotFoundError):  # it has, or just finished the file
+            if isinstance(exc, BlockingIOError | FileNotFoundError):  # the other program has, or finished, it
                 raise UsageError(f"{self.path} is being written by another program") from None
             raise
         self._file = os.fdopen(fd, "r+b")
 
     @property
     def size(self) -> int:
-        """Bytes that are here."""
+        """The number of bytes in the .part."""
         return os.fstat(self._file.fileno()).st_size
 
     def cut(self, size: int) -> None:
@@ -210,14 +210,14 @@ class Part:
         self._file.truncate(size)
 
     def append(self, data: bytes | memoryview) -> None:
-        """Add bytes. They are in the file when this returns, so that a kill loses nothing."""
+        """Append bytes, and write them to the file at once, so that a kill loses nothing."""
         self._file.seek(0, os.SEEK_END)
         self._file.write(data)
         self._file.flush()
 
     def commit(self, mtime: int | None, *, keep_old: bool) -> Path | None:
         """Sync the .part to the disk, and give it its final name; return the new name of another file that
-        had that one. mtime: None for the present time."""
+        had that name. mtime: None for the present time."""
         kept: Path | None = None
         os.fsync(self._file.fileno())
         if mtime is not None:
@@ -228,7 +228,7 @@ class Part:
         return kept
 
     def _begins_like(self, old: Path) -> bool:
-        """Return whether all of another file is at the beginning of this one."""
+        """Return whether another file equals the beginning of this one."""
         self._file.seek(0)
         with old.open("rb") as other:
             while theirs := other.read(READ_SIZE):
@@ -237,18 +237,18 @@ class Part:
         return True
 
     def drop(self) -> None:
-        """Remove it."""
+        """Remove the .part."""
         self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Leave it for the next run, unless it is empty or got its name."""
+        """Close the .part. It stays for the next run, unless it is empty or has its final name."""
         if self.size == 0:
             self.drop()
         self._file.close()
 
 
 def _free_name(local: Path) -> Path:
-    """Return NAME.~1~, or the first such name that is free, as cp --backup makes them."""
+    """Return NAME.~1~, or the first such name that is free, in the style of cp --backup."""
     number = 1
     while (place := local.with_name(f"{local.name}.~{number}~")).exists():
         number += 1
@@ -271,9 +271,9 @@ class Fetcher:
         """Download a file. If the vehicle is lost meanwhile, wait for it, and resume.
 
         Raises:
-            DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
-            UsageError: the local disk refuses it. VehicleLost: the vehicle was not heard again within
-            connect_timeout. Otherwise as Files.open and File.read.
+            DataUnproven: size or checksum differed twice. StillGrowing, NotProvenYet: the .part stays.
+                UsageError: the local disk refuses the file. VehicleLost: the vehicle stayed silent for
+                connect_timeout. Otherwise as Files.open and File.read.
         """
         for _ in range(MAX_RETURNS):
             try:
@@ -290,7 +290,7 @@ class Fetcher:
         """Pass the bytes of a file on, and verify them.
 
         Raises:
-            IsADirectory. DataUnproven, StillGrowing: the vehicle has something else. Otherwise as `fetch`.
+            IsADirectory. DataUnproven, StillGrowing: the vehicle's file differs. Otherwise as `fetch`.
         """
         name = name_text(remote)
         if (await self.session.files.stat(remote)).kind is EntryKind.DIRECTORY:
@@ -304,7 +304,7 @@ class Fetcher:
         verified = await self._compare_here(wanted) if wanted.here else None
         if verified is not None:
             return Fetched(wanted, wanted.size, wanted.size, verified, was_here=True)
-        if wanted.keep_old:  # logs keep their directories
+        if wanted.keep_old:  # a log keeps its directory
             wanted.local.parent.mkdir(parents=True, exist_ok=True)
         part = Part(wanted.part, wanted.local)
         try:
@@ -321,7 +321,7 @@ class Fetcher:
             part.close()
 
     async def _compare_here(self, wanted: Wanted) -> Comparison | None:
-        """Compare a local file that has the right size; return None if the file has to be downloaded.
+        """Compare a local file of the right size; return None if the file must be downloaded.
 
         Without a checksum, the size is enough for a log, and another file needs the same time, too.
         """
@@ -350,7 +350,7 @@ class Fetcher:
         return Fetched(wanted, size, resumed, verified, kept=kept)
 
     async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, Comparison]:
-        """Download what is missing, and verify the whole; return its size, and how it was verified."""
+        """Download the missing bytes, and verify the whole; return its size, and how it was verified."""
         here = part.size
         self.progress.begin(wanted.name, wanted.size, here)
         content = Content(here, await local_crc32(part.path) if here else 0)
@@ -366,7 +366,7 @@ class Fetcher:
         return content.size, await self._verify(wanted.remote, wanted.name, content, resumed=here > 0)
 
     async def _copy(self, remote: bytes, take: Take, here: Content) -> Content:
-        """Pass on the bytes of a file behind those that are here; return all that is here then."""
+        """Pass on the bytes of a file behind the local ones; return all local bytes after that."""
         amount = LEAST_READ
         offset, crc = here
         async with reading(self.session.files, remote) as file:
@@ -388,13 +388,13 @@ class Fetcher:
         """Compare the downloaded bytes with the vehicle's file; return how they were verified.
 
         Raises:
-            DataUnproven: they differ, or a resumed file has to be downloaded again from the beginning.
+            DataUnproven: the bytes differ, or a resumed file must be downloaded again from the beginning.
             StillGrowing, NotProvenYet.
         """
         checksum = wants_checksum(self.verify, content.size, resumed=resumed)
         found = await compare(self.session, remote, content, size=content.size, checksum=checksum)
         if found is GENERATED and resumed:
-            raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
+            raise DataUnproven(f"{name} is generated at each opening, so it cannot be resumed")
         if found is GENERATED or found.match is Match.SAME:
             return found
         await self._require_size(remote, name, content.size)
@@ -410,7 +410,7 @@ class Fetcher:
         """Ask for the size again, because no checksum shows that the file is whole.
 
         Raises:
-            StillGrowing: it has become larger. DataUnproven: it has become smaller.
+            StillGrowing: the file has become larger. DataUnproven: the file has become smaller.
         """
         now = await self.session.size_now(remote)
         if now > size:

@@ -1,8 +1,8 @@
 """The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
-Two programs should not share the vehicle's only FTP session. So while a mount of the vehicle is up, its files
-(client/mountfiles.py) are used in place of a second connection. `Files` and `File` say what both offer. Paths
-are normalised (shared.model.normalise).
+Two programs should not share the vehicle's only FTP session. So while a mount of the vehicle is up, commands
+use its files (client/mountfiles.py) in place of a second connection. `Files` and `File` define the calls of
+both. Paths are normalised (shared.model.normalise).
 """
 
 from __future__ import annotations
@@ -42,48 +42,48 @@ from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import name_text
 
 WITHDRAWAL_TIME = 45.0
-"""Seconds to take back what was written: a request or two without an answer."""
+"""Seconds to discard the changes of a file: a request or two without an answer."""
 CLOSING_TIME = 5.0
-"""Seconds to close a file of which nothing more is delivered."""
+"""Seconds to close a file without further uploads."""
 READ_SIZE = 128 * 1024
 _TICK = 0.2
-"""Seconds between two questions whether a lost vehicle is heard again."""
+"""Seconds between two checks whether a lost vehicle is heard again."""
 
 
 class File(Protocol):
     """An open file: cache.openfile.OpenFile, or one of a mount's. All calls raise only MavftpfsError.
 
-    A file that is written ends by `Writing`.
+    `Writing` ends a file that is written.
     """
 
     @property
     def size(self) -> int:
-        """Bytes; of a file being written they follow what was written."""
+        """The size in bytes, pending changes included."""
 
     @property
     def verified(self) -> str:
-        """How what was written was compared with the card by the last fsync or release: "size and CRC32",
-        "size", or "" if nothing was sent."""
+        """The comparison of the last fsync or release with the card: "size and CRC32", "size", or "" if
+        nothing was sent."""
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
-        """Return `size` bytes at `offset`, fewer only at the end."""
+        """Return `size` bytes at `offset`, or fewer at the end of the file."""
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """Take all of `data` and return its length."""
+        """Write all of `data`, and return its length."""
 
     async def truncate(self, size: int) -> None:
-        """Cut or extend it; delivered like written bytes."""
+        """Cut the file, or extend it with zeros; a pending change like written bytes."""
 
     async def fsync(self) -> None:
-        """Return when everything written is on the card, checked."""
+        """Upload pending changes; return when they are on the card, verified."""
 
     async def release(self) -> None:
-        """Deliver what was written, and close in any case."""
+        """Upload pending changes, and close the file even if that fails."""
 
     async def take_back(self) -> bool | None:
-        """Close, and take back what is not on the card: nothing of it is sent from now on.
+        """Close the file, and discard its pending changes: mavftpfs sends nothing of them later.
 
-        Returns whether the card has what was written, None if that is not known.
+        Return whether the card has the written content, None if unknown.
         """
 
 
@@ -94,16 +94,16 @@ class Files(Protocol):
         """Return a path's attributes."""
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
-        """Return what is in a directory."""
+        """Return the entries of a directory."""
 
     async def open(
         self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
     ) -> File:
-        """Open a file that is there; `truncate` empties it. append: for cache.texts: what is written goes to
-        the end."""
+        """Open an existing file; `truncate` empties it. append: for cache.texts: written bytes go to the
+        end."""
 
     async def create(self, path: bytes, *, exclusive: bool) -> File:
-        """Make a file, or open the one that is there, for reading and writing."""
+        """Make a file, or open an existing one, for reading and writing."""
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file on the card."""
@@ -121,10 +121,10 @@ class Files(Protocol):
         """Remove a file."""
 
     async def rename(self, old: bytes, new: bytes) -> None:
-        """Rename, over an existing file or directory as far as rename(2) allows."""
+        """Rename, replacing an existing file or directory as far as rename(2) allows."""
 
     async def refresh(self) -> None:
-        """Forget what is known of the vehicle, so that it is asked again."""
+        """Drop the cached listings and data of the vehicle."""
 
 
 @asynccontextmanager
@@ -148,12 +148,11 @@ async def close_reader(file: File) -> None:
 
 
 class Writing:
-    """The end of a file that is written: it is delivered, or taken back. Only here is said what the card has
-    then.
+    """The end of a file that is written: delivery, or discarding. `there` has the result.
 
     Attributes:
-        there: whether the card has the file as it was written. False: it has what it had before, and nothing
-            is sent from now on. None: that is not known, or not decided.
+        there: whether the card has the file as it was written. False: the card has the old file, or none, and
+            nothing is sent later. None: unknown, or undecided.
     """
 
     def __init__(self, file: File) -> None:
@@ -161,10 +160,10 @@ class Writing:
         self.there: bool | None = None
 
     async def deliver(self) -> None:
-        """Close the file when all of it is on the card, checked.
+        """Close the file when all of it is on the card, verified.
 
         Raises:
-            NotDelivered: it is taken back; its cause says why.
+            NotDelivered: the changes are discarded; the cause is attached.
         """
         try:
             await self._file.fsync()
@@ -174,17 +173,17 @@ class Writing:
         await self._file.release()
 
     async def fail(self, error: BaseException) -> NoReturn:
-        """Take the file back because writing it failed, and raise that.
+        """Discard the changes because writing the file failed, and raise that error.
 
         Raises:
-            NotDelivered: in place of a MavftpfsError, which is its cause. Else the error.
+            NotDelivered: in place of a MavftpfsError, which is its cause. Otherwise the error itself.
         """
         await self.take_back()
         self._raise_undelivered(error)
 
     async def take_back(self, *, whole: bool = False) -> None:
-        """Close the file without delivering it. whole: all of it was written; else what was delivered is a
-        part."""
+        """Close the file without delivering it. whole: all of it was written; otherwise its delivered bytes
+        are a part."""
         with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
             there = await self._file.take_back()
             self.there = None if there and not whole else there
@@ -197,7 +196,7 @@ class Writing:
 
 @asynccontextmanager
 async def written(file: File) -> AsyncIterator[Writing]:
-    """Write a file in the body. After it the file is delivered; after an error it is taken back.
+    """Write a file in the body. Deliver it after the body; discard its changes after an error.
 
     Raises:
         NotDelivered: see Writing.
@@ -214,10 +213,10 @@ async def written(file: File) -> AsyncIterator[Writing]:
 class Session:
     """A vehicle's files for the length of one command.
 
-    status: asks for what `status --json` tells of vehicle, link and transfers. root: where `/` of `files`
-    lies on the vehicle. mountpoint: of the mount whose files these are, None for a connection of our own.
-    patience: seconds for which a lost vehicle is waited for. unnamed: the vehicles on the link; None if
-    SOURCE or the options name one.
+    status: returns the facts of `status --json` about vehicle, link and transfers. root: the vehicle's
+    directory that is `/` in `files`. mountpoint: of the mount that serves the files, None for a connection of
+    this program's own. patience: seconds to wait for a lost vehicle. unnamed: the vehicles on the link; None
+    if SOURCE or the options name one.
     """
 
     files: Files
@@ -228,17 +227,17 @@ class Session:
     unnamed: Unnamed | None = None
 
     async def require_one_vehicle(self, option: str) -> None:
-        """Check, before something is changed, that the vehicle is the only one that may be meant.
+        """Check, before a change, that the user can mean only this vehicle.
 
         Raises:
-            UsageError: there are several on the link, and none was named.
+            UsageError: several vehicles are on the link, and the user named none.
         """
         if self.unnamed is not None:
             await self.unnamed.require_one(option)
 
     @asynccontextmanager
     async def noting_others(self, tell: Callable[[str], None], option: str) -> AsyncIterator[None]:
-        """Tell once during the body that other vehicles may be meant, if there are any."""
+        """Print a line once during the body if the user may mean another vehicle."""
         async with nullcontext() if self.unnamed is None else self.unnamed.noted(tell, option):
             yield
 
@@ -251,7 +250,7 @@ class Session:
         return (await self.status())["link"]["state"] in ("lost", "replaced")
 
     async def returned(self) -> bool:
-        """Wait for a lost vehicle; return whether it is heard again in time. Raises: as `lost`."""
+        """Wait for a lost vehicle; return whether it was heard again in time. Raises: as `lost`."""
         with trio.move_on_after(self.patience):
             while await self.lost():  # noqa: ASYNC110 (a mount is asked)
                 await trio.sleep(_TICK)
@@ -259,15 +258,15 @@ class Session:
         return False
 
     async def acknowledged(self, path: bytes) -> int | None:
-        """Return the bytes that the vehicle has of a file that is being sent; None if it is not. Raises: as
-        `lost`."""
+        """Return the number of bytes that the vehicle has of a file in flight; None for another file. Raises:
+        as `lost`."""
         name = self.on_vehicle(path).decode(errors="replace")
         transfers = (await self.status())["transfers"]
         sent = {facts["path"]: facts["done"] for facts in transfers if facts["direction"] == "write"}
         return sent.get(name)
 
     def on_vehicle(self, path: bytes) -> bytes:
-        """Return the vehicle's own name of a path."""
+        """Return the path of a file on the vehicle."""
         return self.root.rstrip(b"/") + path if path != b"/" else self.root
 
     async def size_now(self, path: bytes) -> int:
@@ -287,14 +286,14 @@ async def is_directory(files: Files, path: bytes) -> bool:
 Found = list[tuple[bytes, Stat]]
 """Everything below a directory: (path from there, attributes)."""
 Unlisted = list[tuple[bytes, errors.MavftpfsError]]
-"""Directories that cannot be listed, and why."""
+"""Directories that cannot be listed, with the reasons."""
 
 
 async def walk(files: Files, top: bytes) -> tuple[Found, Unlisted]:
-    """Return all that is below a directory, parents first, and what could not be listed.
+    """Return everything below a directory, parents first, and the directories that could not be listed.
 
     Raises:
-        LinkError; of `top` itself whatever Files.list raises.
+        LinkError; for `top` itself the errors of Files.list.
     """
     found: Found = []
     unlisted: Unlisted = []
@@ -323,7 +322,7 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Async
     """Give the files below `subtree` of a mount to the body.
 
     Raises:
-        LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is no directory.
+        LinkClosed: the mount does not answer. NotFound, NotADirectory: the subtree is not a directory.
         UsageError: the options ask for another vehicle or component.
     """
     status = await usable_status(mountpoint)
@@ -367,7 +366,7 @@ async def usable_status(mountpoint: str) -> Status:
     """Return the status of a mount.
 
     Raises:
-        LinkClosed: it does not answer, or does not serve this program; the text says why.
+        LinkClosed: the mount does not answer, or does not serve this program; the text gives the reason.
     """
     ask = partial(status_of, mountpoint, STATUS_PATIENCE)
     try:
@@ -379,10 +378,10 @@ async def usable_status(mountpoint: str) -> Status:
 
 
 async def find_mount(spec: LinkSpec, options: Options) -> Status | None:
-    """Return the status of the mount that has this link now, if it is of the wanted vehicle and serves us.
+    """Return the status of the mount that has this link, if it has the wanted vehicle and serves this user.
 
     Raises:
-        LinkClosed: it is of another version.
+        LinkClosed: the mount has another version.
     """
     look = partial(mounts_on, spec)
     for status in await trio.to_thread.run_sync(look, abandon_on_cancel=True):
@@ -393,10 +392,11 @@ async def find_mount(spec: LinkSpec, options: Options) -> Status | None:
 
 
 async def vehicles_below(mountpoint: str) -> dict[str, str]:
-    """Return the mountpoint of each vehicle of a mount of several, by name; an empty one is not mounted now.
+    """Return the mountpoint of each vehicle of a mount of several, by name; "" for one that is not mounted
+    now.
 
     Raises:
-        LinkClosed: the mount does not answer. UsageError: it is of a single vehicle.
+        LinkClosed: the mount does not answer. UsageError: the mount has a single vehicle.
     """
     status = await usable_status(mountpoint)
     if "members" not in status:
@@ -416,7 +416,7 @@ def _heard_by(status: Status, spec: LinkSpec) -> Unnamed:
 
 
 def heartbeats_in(status: Status) -> list[Heartbeat]:
-    """Return what a mount heard of the components on its link."""
+    """Return the heartbeats that a mount heard from the components on its link."""
     return [
         Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
         for facts in status["connection"]["heard"]
@@ -425,7 +425,7 @@ def heartbeats_in(status: Status) -> list[Heartbeat]:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Which vehicle, and how to talk to it. mount: (mountpoint, subtree) if SOURCE was a mountpoint."""
+    """The vehicle, and the way to it. mount: (mountpoint, subtree) if SOURCE was a mountpoint."""
 
     spec: LinkSpec | None
     options: Options
@@ -434,7 +434,7 @@ class Target:
 
     @asynccontextmanager
     async def mounted(self) -> AsyncIterator[Session | None]:
-        """Give the files of the mount that is to be used to the body, None if there is none."""
+        """Give the files of a usable mount to the body, None if there is none."""
         if self.mount is not None:
             async with open_mount(*self.mount, self.options) as session:
                 yield session
@@ -457,7 +457,7 @@ class Target:
     ) -> AsyncIterator[Session]:
         """Give the vehicle's files for the length of the body.
 
-        list_root: wait for an FTP answer first; else what the body asks for first takes its place.
+        list_root: wait for an FTP answer first; otherwise the body's first request serves for that.
 
         Raises:
             LinkClosed, VehicleLost, NoFtp: no answer within connect_timeout, with the reason.
@@ -489,7 +489,7 @@ def _unnamed(connection: Connection, options: Options) -> Unnamed | None:
 
 
 def session_of(vehicle: Attached, options: Options) -> Session:
-    """Return the files of a connection of our own."""
+    """Return the files of a connection of this program's own."""
 
     async def status() -> Facts:
         return vehicle.status()
@@ -499,7 +499,7 @@ def session_of(vehicle: Attached, options: Options) -> Session:
 
 @asynccontextmanager
 async def _answered_by(deadline: float, vehicle: Attached, options: Options) -> AsyncIterator[None]:
-    """End the body when no FTP request was answered by the deadline.
+    """Cancel the body if the vehicle answered no FTP request by the deadline.
 
     Raises:
         NoFtp: as a mount says it.

@@ -1,7 +1,7 @@
-"""Which vehicles and other components are on a link, by their heartbeats alone. Layer: client.
+"""Vehicles and other components on a link, found by their heartbeats alone. Layer: client.
 
-A scan and a mount of all vehicles listen in this way. A program that has a connection to a vehicle knows the
-others by that (`session.vehicle.Vehicle.heard`).
+A scan and a mount of all vehicles listen in this way. A program with a connection to a vehicle learns of the
+others there (`session.vehicle.Vehicle.heard`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Listener:
 
     Attributes:
         heard: the last heartbeat of each component.
-        first: something was heard.
+        first: set when a first heartbeat was received.
     """
 
     def __init__(self, link: Link, options: Options, on_heard: Callable[[Heartbeat], None]) -> None:
@@ -47,7 +47,7 @@ class Listener:
         self._framer.link_id = 0 if link.seat is None else link.seat.number
 
     def nobody(self, timeout: float) -> VehicleLost:
-        """Return what is raised when no heartbeat came within `timeout` seconds."""
+        """Return the error for no heartbeat within `timeout` seconds."""
         return nobody(self._link, timeout, self.heard, self._framer.stats)
 
     async def run(self) -> None:
@@ -69,7 +69,7 @@ class Listener:
             await trio.sleep(HEARTBEAT_PERIOD)
 
     async def _take(self) -> None:
-        """Take what arrives next, or find what a stream that fell silent ended in."""
+        """Take the next bytes that arrive, or the frames at the end of a stream that fell silent."""
         messages = []
         with trio.move_on_after(QUIET if self._framer.waiting else inf) as scope:
             for data, _ in await self._link.receive():

@@ -19,13 +19,13 @@ from mavftpfs.shared.model import EntryKind, join
 from mavftpfs.shared.readable import name_text
 
 LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/var/APM/logs", b"/@MAV_LOG")
-"""Where vehicles keep logs: PX4, ArduPilot, ArduPilot's simulator, PX4's simulator, ArduPilot on Linux, and
-the standard's alias, which shows one of the others again and so comes last."""
+"""The directories of logs: PX4's, ArduPilot's, ArduPilot's simulator's, PX4's simulator's, ArduPilot's on
+Linux, and the standard's alias. The alias comes last, because it shows one of the others again."""
 
 
 @dataclass(frozen=True, slots=True)
 class SyncRequest:
-    """Which logs to download. place: the directory on the vehicle, None to find it."""
+    """The logs to download. place: their directory on the vehicle, None to find it."""
 
     local: Path
     place: bytes | None = None
@@ -40,7 +40,7 @@ class Record(Protocol):
         """Return the logs to download or to verify now."""
 
     def note(self, session: Session, fetched: Fetched) -> None:
-        """Note a log that is here.
+        """Note a downloaded log.
 
         Raises:
             OSError: the local disk refuses it.
@@ -49,7 +49,7 @@ class Record(Protocol):
 
 class Unproven:
     """The record of plain `sync`: a log whose name and size are here was downloaded, and the manifest names
-    those for which the vehicle told no checksum then."""
+    those whose checksum the vehicle did not report then."""
 
     def __init__(self, local: Path, verify: Verify) -> None:
         """Raises: OSError: the manifest cannot be read."""
@@ -73,12 +73,12 @@ class Unproven:
 
 
 def path_of(session: Session, log: Wanted) -> str:
-    """Return the path of a log on the vehicle, as the manifest has it."""
+    """Return the path of a log on the vehicle, in the manifest's spelling."""
     return os.fsdecode(session.on_vehicle(log.remote))
 
 
 async def sync(downloads: Downloads, request: SyncRequest, record: Record | None = None) -> None:
-    """Download the logs that are not here, and verify those that are here as far as the record wants it.
+    """Download the missing logs, and verify those here as far as the record requires it.
 
     record: None for that of plain `sync`.
 
@@ -167,12 +167,12 @@ async def _listed(downloads: Downloads, request: SyncRequest) -> list[Wanted]:
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:
-    """Return the directory that holds the vehicle's logs, and what `walk` tells of it.
+    """Return the directory with the vehicle's logs, and the result of `walk` for it.
 
-    It is the first known one with a file in it, or with something that cannot be listed.
+    The function takes the first known directory with a file in it, or with a part that cannot be listed.
 
     Raises:
-        NotFound: there is none.
+        NotFound: no known directory has files.
     """
     empty: bytes | None = None
     for known in LOG_PLACES:
@@ -193,7 +193,7 @@ async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:
 
 
 def _below(root: bytes, place: bytes) -> bytes | None:
-    """Return the path of a vehicle's directory below the root that is used, None if it is not below it."""
+    """Return the path of a vehicle's directory below the session's root, None if it is elsewhere."""
     if root == place or root.startswith(place + b"/"):
         return b"/"
     if root == b"/":

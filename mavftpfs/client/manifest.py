@@ -22,11 +22,11 @@ HEAD = 4096
 @dataclass(frozen=True, slots=True)
 class Downloaded:
     """A downloaded log. path: on the vehicle; file: below the local directory; size: in bytes; mtime: seconds
-    UTC, None if the vehicle tells none.
+    UTC, None if the vehicle reports no times.
 
-    vehicle: its unique id, None if sync did not ask for that. head: the CRC32 of the first HEAD bytes, None
-    if nobody noted it. proven: its checksum was compared, or did not have to be. handed_on: no command of
-    `--exec` has to run for it.
+    vehicle: its unique id, None if sync did not ask for it. head: the CRC32 of the first HEAD bytes, None if
+    unknown. proven: its checksum was compared, or is not required. handed_on: the command of `--exec` has
+    run, or there is none.
     """
 
     path: str
@@ -56,7 +56,7 @@ class Manifest:
                 self._logs[log.vehicle, log.path] = log
 
     def of(self, vehicle: str | None, path: str) -> Downloaded | None:
-        """Return what the manifest says of a log."""
+        """Return the manifest's entry for a log."""
         return self._logs.get((vehicle, path))
 
     def logs(self) -> list[Downloaded]:
@@ -76,7 +76,7 @@ class Manifest:
         return self._place.exists()
 
     def note(self, log: Downloaded) -> None:
-        """Write down a log, in place of what the manifest said of it.
+        """Write down a log, replacing its entry in the manifest.
 
         Raises:
             OSError: the local disk refuses it.
@@ -97,7 +97,7 @@ class Manifest:
 
 
 def _line(log: Downloaded) -> bytes:
-    """Return a log as a line. The line begins with a line end, in case the last one was cut."""
+    """Return a log as a line. The line begins with a line end, in case the last line was cut."""
     return b"\n" + json.dumps(asdict(log)).encode() + b"\n"
 
 

@@ -20,9 +20,9 @@ from mavftpfs.shared.model import ROOT, normalise
 from mavftpfs.shared.readable import name_text
 
 SENDING_TIME = 10.0
-"""Seconds for the mount's process to take a request: it always reads."""
+"""Seconds for the mount's process to take a request; it always reads."""
 _PIECE = 256 * 1024
-"""Bytes that are received at once."""
+"""Bytes to receive at once."""
 
 Dial = Callable[[], Awaitable["Connection"]]
 
@@ -42,11 +42,11 @@ class Connection:
         """Return the reply to a request. If the task is cancelled, the next request cancels this one.
 
         Raises:
-            LinkClosed: the mount is gone. Else as the call of Files or File.
+            LinkClosed: the mount is gone. Otherwise as the call of Files or File.
         """
         async with self._asking:
             with self._gone():
-                # Whole in any case: a part of a request would make the next one unreadable.
+                # Always whole, because a part of a request would make the next one unreadable.
                 with trio.move_on_after(SENDING_TIME, shield=True) as patience:
                     await self._stream.send_all(wire.encoded({"call": call, **facts}, data))
                 if patience.cancelled_caught:
@@ -82,11 +82,12 @@ class Connection:
 
     @property
     def idle(self) -> bool:
-        """Whether another request can be made."""
+        """Whether the connection can take another request."""
         return not self.broken and not self._unanswered
 
     def close(self) -> None:
-        """End the connection: what was written by it, and not released, is taken back."""
+        """End the connection. The mount's process discards the changes that were written over it and not
+        released."""
         self.broken = True
         self._stream.socket.close()
 
@@ -95,13 +96,13 @@ async def connect(status: Status, mountpoint: str) -> Connection:
     """Connect to a mount's process. mountpoint: for people.
 
     Raises:
-        LinkClosed: it is gone, is another one now, or refuses.
+        LinkClosed: the mount is gone, was replaced by another one, or refuses.
     """
     gone = f"the mount on {mountpoint} is gone"
     try:
         stream = await trio.open_unix_socket(status["socket"])
     except OSError:
-        raise LinkClosed(gone) from None  # its number is of the socket, and would pass for one of a file
+        raise LinkClosed(gone) from None  # the errno is the socket's, and would pass for a file's
     try:
         request = {"command": "files", "version": wire.VERSION}
         await stream.send_all(json.dumps(request).encode() + b"\n")
@@ -126,13 +127,13 @@ async def connect(status: Status, mountpoint: str) -> Connection:
 
 
 class MountFiles:
-    """Implements client.files.Files. Paths are below `root`, a directory of the vehicle; `mounted` is the one
-    that is the mount's root."""
+    """Implements client.files.Files. Paths are below `root`, a directory of the vehicle; `mounted` is the
+    directory at the mount's root."""
 
     def __init__(
         self, dial: Dial, mountpoint: str, mounted: bytes, root: bytes, *, read_only: bool = False
     ) -> None:
-        """read_only: refuse changes, whatever the mount allows."""
+        """read_only: refuse changes, even if the mount allows them."""
         self._dial = dial
         self._mountpoint = mountpoint
         self._mounted = mounted.rstrip(b"/")
@@ -147,7 +148,7 @@ class MountFiles:
             connection.close()
 
     async def status(self) -> dict[str, Any]:
-        """Return what `status --json` tells. Raises: LinkClosed."""
+        """Return the facts of `status --json`. Raises: LinkClosed."""
         status: dict[str, Any] = (await self._ask("status")).facts["status"]
         return status
 
@@ -206,7 +207,7 @@ class MountFiles:
         await self._ask("refresh")
 
     async def _ask(self, call: str, path: bytes = ROOT, facts: Facts | None = None) -> Message:
-        """Ask by a connection that has no file open."""
+        """Send a request over a connection without an open file."""
         place = wire.text(self._place(path)) if call not in ("refresh", "status") else "/"
         connection = self._idle.pop() if self._idle else await self._dial()
         try:
@@ -244,7 +245,7 @@ class MountFiles:
 
 
 class MountFile:
-    """Implements client.files.File: an open file and its connection. forget: called when it is closed.
+    """Implements client.files.File: an open file and its connection. forget: called when the file is closed.
 
     Attributes:
         size, verified: see File.
@@ -294,7 +295,7 @@ class MountFile:
             self._close()
 
     async def take_back(self) -> bool | None:
-        """See File. A mount that is gone has taken it back, or placed it before: that is not known."""
+        """See File. If the mount is gone, it has discarded or delivered the changes, which is unknown."""
         there: bool | None = None
         try:
             with suppress(LinkClosed):

@@ -1,7 +1,7 @@
-"""Checks before a mount, one line each, and taking a mount down. Layer: client; only the standard library.
+"""Checks before a mount, with one line each, and unmounting. Layer: client; only the standard library.
 
-Everything here is called before our own mount exists, or from another process or a worker thread: a
-system call on our own mount from the event loop would wait for itself.
+Everything here is called before this program's mount exists, or from another process or a worker thread,
+because a system call on the mount from its own event loop would wait for itself.
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ FUSE_DEVICE = "/dev/fuse"
 FUSE_SETTINGS = Path("/proc/sys/fs/fuse")
 _CONTAINER = "a container needs --device /dev/fuse --cap-add SYS_ADMIN"
 SUBTYPE = "mavftpfs"
-"""The mount's type is fuse.mavftpfs: the same word that fstab has."""
+"""The mount's type is fuse.mavftpfs, with the same word in fstab."""
 
 OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
 UNMOUNT_PATIENCE = 60.0
-"""Seconds for an unmount: it waits for the last flush."""
+"""Seconds for an unmount, which waits for the last flush."""
 XATTR_CRC32 = b"user.mavftp.crc32"
 XATTR_STATUS = b"user.mavftpfs.status"
 BUSY_PATIENCE = 1.0
-"""Seconds in which a mount may look busy without being it: the kernel lets go of the files of a program that
-ended a moment after its parent was told, and desktop services look at what is new."""
+"""Seconds for which a mount may look busy by chance: the kernel closes the files of a program a moment after
+its parent learned of its end, and desktop services look at new files."""
 _BUSY_PAUSE = 0.1
 
 
 class DeadMount(MountFailed):
-    """The mount there has lost its program."""
+    """The mount's program is gone."""
 
 
 def canonical(path: str) -> str:
-    """Return the absolute path without symbolic links on the way; a trailing link is followed too.
+    """Return the absolute path without symbolic links on the way; a trailing link is followed, too.
 
-    Only the parents of the mountpoint are looked at: the mountpoint itself may be a mount that hangs.
+    The function looks only at the parents of the mountpoint, because the mountpoint itself may be a mount
+    that hangs.
     """
     absolute = os.path.abspath(path)
     if absolute in mounts():
@@ -57,9 +58,10 @@ def canonical(path: str) -> str:
 
 
 def enclosing_mount(path: str) -> tuple[str, str] | None:
-    """Return (mountpoint of ours, path on the mount or "") for a mountpoint, or a path below one; else None.
+    """Return (mountpoint, path on the mount or "") for a vehicle's mountpoint, or a path below one; otherwise
+    None.
 
-    Symbolic links are followed only if the path as it is spelled does not lead there.
+    The function follows symbolic links only if the path as it is spelled does not lead to a mount.
     """
     return _enclosing(os.path.abspath(path)) or _enclosing(canonical(path))
 
@@ -79,7 +81,7 @@ def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
 
     Raises:
         DeadMount: a mount that was killed is still there.
-        MountFailed: anything else, and what to do about it.
+        MountFailed: any other reason; the text says what to do.
     """
     if is_dead(path, table=table):
         raise DeadMount(
@@ -99,11 +101,11 @@ def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
     """Check that this machine and user can mount FUSE at all.
 
     Raises:
-        MountFailed: and what to do about it.
+        MountFailed: they cannot; the text says what to do.
     """
     if not os.path.exists(device):
         raise MountFailed(f"there is no {device}; run: sudo modprobe fuse ({_CONTAINER})")
-    if not os.access(device, os.R_OK | os.W_OK):  # fusermount3 opens it with its user's rights
+    if not os.access(device, os.R_OK | os.W_OK):  # fusermount3 opens the device with its user's rights
         raise MountFailed(f"{device} may not be opened; run: sudo chmod 666 {device} ({_CONTAINER})")
     if (os.getuid() if uid is None else uid) != 0 and shutil.which("fusermount3") is None:
         raise MountFailed("fusermount3 is missing, which mounts for users; run: sudo apt install fuse3")
@@ -119,7 +121,7 @@ def request_timeout(settings: Path = FUSE_SETTINGS) -> int | None:
 
 
 def timeout_note() -> str:
-    """Return what a person is told about the kernel's limit, or ""."""
+    """Return a warning for people about the kernel's limit, or ""."""
     limit = request_timeout()
     if limit is None:
         return ""
@@ -131,7 +133,7 @@ def timeout_note() -> str:
 
 
 def why_not_mounted(path: str, said: str) -> str:
-    """Return what a person is told when libfuse or fusermount3 could not mount."""
+    """Return the message for people if libfuse or fusermount3 could not mount."""
     hint = f" ({_CONTAINER})" if "not permitted" in said else ""
     return f"cannot mount on {path}: {said}{hint}"
 
@@ -140,9 +142,9 @@ def why_not_mounted(path: str, said: str) -> str:
 class Mounted:
     """An entry of the kernel's table of mounts.
 
-    number: no other mount has it as long as this one is used. uid: of the user that mounted it, None if that
-    is not told. root: the directory of the file system that is seen there, for a bind mount of a part of it.
-    others: all places where the same file system is mounted.
+    number: unique among the mounts that exist at one time. uid: of the user that mounted it, None if unknown.
+    root: the directory of the file system that is visible there, for a bind mount of a part of it. others:
+    all places where the same file system is mounted.
     """
 
     number: str
@@ -154,13 +156,13 @@ class Mounted:
 
 
 def is_ours(path: str, *, table: str = MOUNT_TABLE) -> bool:
-    """Return whether the topmost mount on `path` is of this program."""
+    """Return whether the topmost mount on `path` is one of mavftpfs."""
     mount = mounts(table).get(path)
     return mount is not None and mount.type == OUR_TYPE
 
 
 def is_dead(path: str, *, table: str = MOUNT_TABLE) -> bool:
-    """Return whether the mount on `path` is of this program, and has lost its process."""
+    """Return whether the mount on `path` is one of mavftpfs, and has lost its process."""
     if not is_ours(path, table=table):
         return False
     try:
@@ -189,7 +191,7 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
 
 
 def vehicles_below(place: str) -> list[str]:
-    """Return the mountpoints of vehicles that a mount of all vehicles has below its directory, sorted."""
+    """Return the mountpoints of a mount of all vehicles, one for each vehicle, sorted."""
     found = {path for path, mount in mounts().items() if mount.type == OUR_TYPE}
     return sorted(path for path in found if os.path.dirname(path) == place and _is_number(path))
 
@@ -199,10 +201,11 @@ def _is_number(path: str) -> bool:
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:
-    """Unmount, waiting for it; with `lazy` even if it is in use. Another program may have done it already.
+    """Unmount, and wait for the end; with `lazy` even if programs use the mount. Another program may have
+    unmounted it already.
 
     Raises:
-        MountFailed: it is still mounted: busy, or whatever fusermount3 said.
+        MountFailed: the mount is still there: busy, or for the reason that fusermount3 gave.
     """
     program = "fusermount3" if shutil.which("fusermount3") else "umount"
     words = [program, *(["-u"] if program == "fusermount3" else []), *(["-z"] if lazy else []), "--", path]
@@ -222,7 +225,8 @@ def _said_by(words: list[str], path: str) -> str | None:
     """Return the complaint of a program that mounts or unmounts, None if it succeeded.
 
     Raises:
-        MountFailed: it cannot be started (it is missing, or no descriptors are left), or does not end.
+        MountFailed: the program cannot be started (it is missing, or no descriptors are left), or does not
+            end.
     """
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
@@ -240,9 +244,9 @@ def _is_busy(said: str) -> bool:
 
 @contextmanager
 def stderr_of() -> Iterator[Callable[[], str]]:
-    """Catch what C libraries and child programs write to stderr during the body.
+    """Catch the output of C libraries and child programs on stderr during the body.
 
-    Yields a function that returns the first line of it, without libfuse's `fuse: `.
+    Yields a function that returns its first line, without libfuse's `fuse: `.
     """
     saved = os.dup(2)
     with tempfile.TemporaryFile() as capture:

@@ -1,9 +1,9 @@
-"""Which mounts are up, and what each says of itself. Layer: client.
+"""The mounts that are up, and the status of each. Layer: client.
 
 The extended attribute of a mount's root names its control socket. Users that may not read the attribute
-(root, for users' mounts) look for the socket by the name of the mountpoint. Then the mount is asked by its
-socket. Of a mount that does not answer, or does not serve this user, only what the attribute tells is known,
-with `state` and `problem`.
+(root, for users' mounts) look for the socket by the name of the mountpoint. Then the mount answers over its
+socket. If a mount does not answer, or does not serve this user, only its attribute is known, with `state` and
+`problem`.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from mavftpfs.shared.options import Options
 Status = Mapping[str, Any]
 
 PATIENCE = 10.0
-"""Seconds for a mount to answer: it does so without asking the vehicle."""
+"""Seconds for a mount to answer, which it does without asking the vehicle."""
 STATUS_PATIENCE = 3.0
-"""Seconds for a mount to answer a command that could do without it."""
+"""Seconds for a mount to answer a command that can do without the answer."""
 
 _OF_ONE_VEHICLE = frozenset(("vehicle", "link", "transfers", "held", "connection", "cache"))
-"""Keys that the status of a mount of one vehicle has; a mount of another version may not tell them."""
+"""Keys in the status of a mount of one vehicle; a mount of another version may lack some."""
 
 
 # -- asking ---------------------------------------------------------------------------------------
@@ -60,7 +60,7 @@ def all_statuses() -> list[Status]:
     known = {control.socket_name(path) for path in found}
     for socket in control.all_sockets():
         if socket.name not in known:
-            # The kernel does not show it any more, but it still delivers; or it is in another mount
+            # The kernel no longer shows this mount, but it still uploads; or it is in another mount
             # namespace.
             with suppress(ControlError):  # only the mount itself could say which one it is
                 status = _ask(socket, PATIENCE)
@@ -71,13 +71,13 @@ def all_statuses() -> list[Status]:
 def _of_mounts(patience: float) -> Iterator[Status]:
     """Yield the status of each mount in the kernel's table that this user may see."""
     for path, mount in mounts().items():
-        if mount.type == OUR_TYPE and mount.root == "/":  # else it is a part of another one
+        if mount.type == OUR_TYPE and mount.root == "/":  # otherwise a bind mount of a part
             with suppress(NobodyThere):
                 yield _status_of(path, mount, patience)
 
 
 def status_of(mountpoint: str, patience: float = PATIENCE) -> Status:
-    """Return the status of one mount; if it does not tell it, `state` (dead, mute) and `problem` in words.
+    """Return the status of one mount; without an answer, `state` (dead, mute) and `problem` in words.
 
     Raises:
         NobodyThere: no vehicle is mounted there, or this user may not ask.
@@ -92,10 +92,10 @@ def status_of(mountpoint: str, patience: float = PATIENCE) -> Status:
 
 
 def socket_of(mountpoint: str) -> Path:
-    """Return the control socket of a mount, which may not answer any more.
+    """Return the control socket of a mount, which may have stopped answering.
 
     Raises:
-        NobodyThere: there is none, or this user may not know it.
+        NobodyThere: there is no socket, or this user may not see it.
     """
     mount = mounts().get(mountpoint)
     if mount is None or mount.type != OUR_TYPE:
@@ -120,7 +120,7 @@ def _socket(told: Facts, mountpoint: str, mount: Mounted) -> Path:
 
 
 def _status_of(path: str, mount: Mounted, patience: float) -> Status:
-    """Return what a mount says. Raises: as status_of."""
+    """Return a mount's own status. Raises: as status_of."""
     answer = _questions.ask(path, mount, patience)
     told: Facts = {"mountpoint": path, "source": mount.source}
     if isinstance(answer, bytes):
@@ -138,7 +138,7 @@ def _status_of(path: str, mount: Mounted, patience: float) -> Status:
     except NobodyThere:
         if "link" in told:  # a mount of version 0.2 tells everything by its attribute
             return told
-        if not isinstance(answer, bytes):  # this user may not know it
+        if not isinstance(answer, bytes):  # this user may not see it
             raise _nobody(path) from None
         return _unasked(told, "mute", f"its socket {told.get('socket')} cannot be reached from here")
     except ControlError as exc:
@@ -157,7 +157,7 @@ def _unasked(told: Facts, state: str, problem: str) -> Status:
 
 
 def _ask(socket: Path, patience: float) -> Status:
-    """Return what a mount says at its control socket, with all keys on which others rely."""
+    """Return the status from a mount's control socket, with all keys that other functions need."""
     status: Status = control.ask(socket, {"command": "status"}, timeout=patience)["status"]
     if "members" in status or status.keys() >= _OF_ONE_VEHICLE:
         return status
@@ -167,8 +167,8 @@ def _ask(socket: Path, patience: float) -> Status:
 
 
 class _Questions:
-    """Reads the attribute of mounts, each in a thread, because a mount that was stopped never answers. It
-    keeps one thread, however often it is asked."""
+    """Reads the attribute of mounts, each in a thread, because a mount that was stopped never answers.
+    Further questions about the same mount use the same thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -202,10 +202,10 @@ _questions = _Questions()
 
 
 def require_usable(status: Status, mountpoint: str) -> None:
-    """Check that a mount that was asked answers, and speaks this program's version of the protocol.
+    """Check that a mount with this status answers, and has this program's version of the protocol.
 
     Raises:
-        LinkClosed: it does not; the text says why, or which side is to be upgraded.
+        LinkClosed: it does not; the text gives the reason, or says which side to upgrade.
     """
     if status.get("problem"):
         raise LinkClosed(f"the mount on {mountpoint}: {status['problem']}")
@@ -243,9 +243,8 @@ def several_above(path: str) -> str | None:
 def vehicle_below(status: Status, subtree: bytes, options: Options) -> str:
     """Return the mountpoint of the vehicle that the options ask for, below a mount of several vehicles.
 
-    Raises:
-        UsageError: the options do not say which one. NotFound: `subtree` names one that is not there.
-        LinkClosed: it is not mounted now.
+    UsageError: the options do not name one. NotFound: `subtree` names a vehicle that is not there.
+    LinkClosed: the vehicle is not mounted now.
     """
     place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
     first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
@@ -300,7 +299,7 @@ def with_vehicles(status: Status) -> list[Status]:
 
 
 def network_namespace() -> str:
-    """Return what tells this process's network namespace from others that exist now."""
+    """Return an identifier of this process's network namespace, unique among those that exist now."""
     facts = os.stat("/proc/self/ns/net")
     return f"{facts.st_dev}:{facts.st_ino}"
 
@@ -308,7 +307,7 @@ def network_namespace() -> str:
 def has_link(status: Status, spec: LinkSpec) -> bool:
     """Return whether the mount with this status is of one vehicle and has that link. A port belongs to a
     network namespace."""
-    with suppress(MavftpfsError, KeyError):  # it cannot be asked, or is of an older version
+    with suppress(MavftpfsError, KeyError):  # the mount does not answer, or is of an older version
         return (
             "members" not in status
             and status["network_namespace"] == network_namespace()
@@ -318,12 +317,13 @@ def has_link(status: Status, spec: LinkSpec) -> bool:
 
 
 def mounts_on(spec: LinkSpec) -> list[Status]:
-    """Return the status of each mount of one vehicle that has a link, of other users' what they tell."""
+    """Return the status of each mount of one vehicle that has a link, as far as other users' mounts show
+    it."""
     return [status for status in _of_mounts(STATUS_PATIENCE) if has_link(status, spec)]
 
 
 def holder_of(spec: LinkSpec) -> Status | None:
-    """Return the status of the mount that has a link, also of another user's; None if there is none."""
+    """Return the status of the mount that has a link, even another user's; None if there is none."""
     return next((status for status in all_statuses() if has_link(status, spec)), None)
 
 
@@ -345,8 +345,8 @@ def also_mounted(spec: LinkSpec, vehicle: Facts) -> str:
 
 
 def by_others(spec: LinkSpec, *, table: str = MOUNT_TABLE) -> str:
-    """Return a line about mounts of other users on a link, or "". This user may not ask them, so they may be
-    of another vehicle on the link."""
+    """Return a line about mounts of other users on a link, or "". This user may not query them, so they may
+    have another vehicle on the link."""
     found = []
     for place, mount in mounts(table).items():
         if mount.type == OUR_TYPE and mount.uid not in (None, os.getuid()):
@@ -369,7 +369,7 @@ def _user(uid: int | None) -> str:
 
 
 def is_wanted(status: Status, options: Options) -> bool:
-    """Return whether a mount is of the vehicle that the options ask for, and that vehicle still answers
+    """Return whether a mount has the vehicle that the options ask for, and that vehicle still answers
     there."""
     vehicle, component = status["vehicle"], options.target_component
     autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
@@ -381,7 +381,7 @@ def is_wanted(status: Status, options: Options) -> bool:
 
 
 def mountpoint_of(source: str) -> tuple[str, bytes] | None:
-    """Return (mountpoint, subtree) if SOURCE is a mountpoint of ours or lies below one, else None.
+    """Return (mountpoint, subtree) if SOURCE is a vehicle's mountpoint or a path below one, otherwise None.
 
     The directory of a mount of all vehicles counts as a mountpoint.
     """

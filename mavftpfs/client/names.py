@@ -1,4 +1,4 @@
-"""Names on the vehicle: how people write them, ls, mkdir, rmdir, rm, mv; and crc. Layer: client; silent."""
+"""Names on the vehicle: their spellings, ls, mkdir, rmdir, rm, mv; and crc. Layer: client; silent."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def fixed_part(pattern: bytes) -> bytes:
 
 
 async def matching(files: Files, path: bytes) -> list[bytes]:
-    """Return the paths that match a pattern as in a shell, sorted; or the path itself, if it exists or is no
-    pattern.
+    """Return the paths that match a pattern as in a shell, sorted; or the path itself, if it exists or is not
+    a pattern.
 
     Raises:
-        NotFound: nothing matches. Else as Files.list.
+        NotFound: nothing matches. Otherwise as Files.list.
     """
     if not is_pattern(path) or await _exists(files, path):
         return [path]
@@ -83,16 +83,17 @@ async def matching(files: Files, path: bytes) -> list[bytes]:
 
 
 async def all_matching(files: Files, paths: Sequence[bytes]) -> list[bytes]:
-    """Return what several patterns match, each path once. Raises: as `matching`."""
+    """Return the paths that match several patterns, each path once. Raises: as `matching`."""
     found = [name for path in paths for name in await matching(files, path)]
     return list(dict.fromkeys(found))
 
 
 async def matching_files(files: Files, path: bytes, tell: Callable[[str], None]) -> list[bytes]:
-    """Return what `matching` returns, without the directories that a pattern matches; `tell` of each.
+    """Return the paths of `matching`, without the directories that a pattern matches; `tell` of each
+    directory.
 
     Raises:
-        IsADirectory: a pattern matches only directories. Else as `matching`.
+        IsADirectory: a pattern matches only directories. Otherwise as `matching`.
     """
     found = await matching(files, path)
     if found == [path]:
@@ -126,7 +127,7 @@ async def _names_like(files: Files, directory: bytes, pattern: bytes) -> list[by
 Entry = dict[str, Any]
 
 Listing = tuple[str | None, list[Entry]]
-"""A directory's name and what it holds; None: the path is a file, the only entry."""
+"""A directory's name and its entries; None: the path is a file, the only entry."""
 
 
 async def list_paths(session: Session, paths: Sequence[bytes], *, recursive: bool = False) -> list[Listing]:
@@ -169,7 +170,7 @@ async def checksum_paths(
     """Have the vehicle compute CRC32s of files and of those that patterns match; `tell(path, crc)` for each.
 
     Raises:
-        IsADirectory. Else as matching_files, Files.stat and crc32.
+        IsADirectory. Otherwise as matching_files, Files.stat and crc32.
     """
     found = [name for path in paths for name in await matching_files(session.files, path, complain)]
     for path in dict.fromkeys(found):
@@ -187,7 +188,7 @@ async def emptied(files: Files, path: bytes) -> File:
 
 
 async def make_directory(files: Files, path: bytes, *, may_exist: bool) -> None:
-    """Make one directory. may_exist: unless it is there already, which is no change.
+    """Make one directory. may_exist: an existing directory is fine, and stays as it is.
 
     Raises:
         AlreadyExists: the name is taken (with `may_exist`: by a file).
@@ -197,7 +198,7 @@ async def make_directory(files: Files, path: bytes, *, may_exist: bool) -> None:
 
 
 async def make_directories(session: Session, paths: Sequence[bytes], *, parents: bool) -> None:
-    """Make directories; with `parents` also those above them, and what is there already is fine.
+    """Make directories; with `parents` also those above them, and existing ones are fine.
 
     Raises:
         As make_directory and Files.mkdir.
@@ -219,7 +220,7 @@ async def remove_directories(session: Session, paths: Sequence[bytes]) -> None:
     """Remove empty directories.
 
     Raises:
-        UsageError: the root. Else as Files.rmdir.
+        UsageError: the root. Otherwise as Files.rmdir.
     """
     refuse_root(paths)
     for path in paths:
@@ -227,21 +228,21 @@ async def remove_directories(session: Session, paths: Sequence[bytes]) -> None:
 
 
 def refuse_root(paths: Sequence[bytes]) -> None:
-    """Check that not everything is to be removed.
+    """Check that the paths do not name the root, and with it everything.
 
     Raises:
         UsageError: the root is named.
     """
     if ROOT in paths:
-        raise UsageError("the root itself is not removed; name what is in it")
+        raise UsageError("the root itself cannot be removed; name the files and directories in it")
 
 
 async def remove_paths(session: Session, paths: Sequence[bytes], *, recursive: bool) -> None:
-    """Remove files, and with `recursive` directories with all below.
+    """Remove files, and with `recursive` directories with everything below.
 
     Raises:
-        IsADirectory: a directory without `recursive`; ReadOnly: a path that the vehicle makes itself. Nothing
-            is removed before all paths were looked at.
+        IsADirectory: a directory without `recursive`; ReadOnly: a path that the vehicle generates. The
+            function looks at all paths before it removes the first one.
     """
     found = [(path, await session.files.stat(path)) for path in paths]
     for path, stat in found:
@@ -277,7 +278,7 @@ async def require_directory(files: Files, path: bytes) -> None:
     except NotFound:
         raise NotFound(f"{name_text(path)}/: there is no such directory") from None
     if kind is not EntryKind.DIRECTORY:
-        raise NotADirectory(f"{name_text(path)}/ is no directory")
+        raise NotADirectory(f"{name_text(path)}/ is not a directory")
 
 
 async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, into: bool = False) -> None:
@@ -286,12 +287,12 @@ async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, int
     into: `to` was written with a `/` at its end: a file goes into that directory only.
 
     Raises:
-        NotADirectory: several things, or a file is to go into it, and `to` is no directory; NotFound: it is
-        not there. Else as Files.rename.
+        NotADirectory: several things, or a file with `into`, and `to` is not a directory; NotFound: `to` does
+        not exist. Otherwise as Files.rename.
     """
     inside = await is_directory(session.files, to)
     if not inside and len(paths) > 1:
-        raise NotADirectory(f"{name_text(to)} is no directory, so only one thing can be moved there")
+        raise NotADirectory(f"{name_text(to)} is not a directory, so only one thing can be moved there")
     if into and not inside and not await is_directory(session.files, paths[0]):
         await require_directory(session.files, to)
     for path in paths:
@@ -299,12 +300,13 @@ async def move_paths(session: Session, paths: Sequence[bytes], to: bytes, *, int
 
 
 async def move(files: Files, old: bytes, new: bytes) -> None:
-    """Rename. If the server cannot, copy (which is verified) and delete, as mv does between disks.
+    """Rename. If the server cannot, copy the file, verify it and delete the old one, as mv does between
+    disks.
 
     Raises:
-        InvalidMove: the root. Else as Files.rename and copy.
+        InvalidMove: the root. Otherwise as Files.rename and copy.
     """
-    if old == ROOT:  # else it would be copied into itself where the server cannot rename
+    if old == ROOT:  # where the server cannot rename, the root would be copied into itself
         raise InvalidMove("the root itself cannot be moved")
     try:
         await files.rename(old, new)
@@ -322,12 +324,12 @@ async def move(files: Files, old: bytes, new: bytes) -> None:
 
 
 async def copy(files: Files, old: bytes, new: bytes) -> None:
-    """Copy a file by way of this computer, which verifies it.
+    """Copy a file through this computer, which verifies it.
 
     Raises:
-        InvalidMove: onto itself. NotDelivered. Else as Files.open.
+        InvalidMove: onto itself. NotDelivered. Otherwise as Files.open.
     """
-    if old == new:  # to open the new one for writing would empty the old one
+    if old == new:  # opening the new file for writing would empty the old one
         raise InvalidMove(f"{old!r} cannot be copied onto itself")
     async with reading(files, old) as source:
         file = await emptied(files, new)

@@ -1,4 +1,4 @@
-"""How options are given: words of `-o`, keywords of the library, and those of 0.2. Layer: client; pure."""
+"""The spellings of options: words of `-o`, keywords of the library, and those of 0.2. Layer: client; pure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavftpfs.shared.options import LIBRARY, Options, Parser, number, parsed_by,
 
 
 class Gone(NamedTuple):
-    """An option of version 0.2 that is gone. now: what holds instead, or what to write.
+    """A removed option of version 0.2. now: its replacement, or what to write instead.
 
     becomes: the field of Options that its value still sets, by `parse`. refused: the option is an error.
     """
@@ -30,19 +30,19 @@ GONE: Mapping[str, Gone] = {
     "auto_unmount": Gone("`mavftpfs umount` clears the mountpoint of a mount that was killed"),
     "fsname": Gone("the table of mounts shows SOURCE"),
     "log_file": Gone("the log is in the journal or syslog, and with -f on the terminal"),
-    "dirty_max": Gone("what waits for the card lies on the local disk"),
-    "spool_max": Gone("up to 1 GB waits on the local disk for the card"),
-    "cache_dir": Gone("a mount reads again; `mavftpfs sync` keeps copies of logs"),
+    "dirty_max": Gone("pending changes wait on the local disk"),
+    "spool_max": Gone("up to 1 GB of pending changes waits on the local disk"),
+    "cache_dir": Gone("a mount reads files again; `mavftpfs sync` keeps copies of logs"),
     "attr_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
     "negative_timeout": Gone("dir_timeout= limits this, too; with 0 the kernel asks each time"),
     "source_component": Gone("mavftpfs is component 191"),
-    "heartbeat=onboard": Gone("that is what mavftpfs says it is"),
+    "heartbeat=onboard": Gone("mavftpfs always is an onboard computer"),
     "heartbeat": Gone(
         "mavftpfs always says that it is an onboard computer, because a ground station's heartbeat would "
         "trigger the vehicle's failsafe when it stops; leave the option out",
         refused=True,
     ),
-    "window": Gone("mavftpfs finds out how many requests the link carries"),
+    "window": Gone("mavftpfs measures how many requests the link carries"),
     "trace": Gone("-d prints every request and reply, and tlog=FILE records the link"),
     "rmw_max": Gone("a change that needs more than two minutes of the link is refused (EFBIG)"),
     "local": Gone("the list of names that stay in memory is fixed; see the guide, Edit and upload"),
@@ -51,26 +51,27 @@ GONE: Mapping[str, Gone] = {
     ),
     "root": Gone("write SOURCE#/dir", "root", remote_path),
     "baud": Gone("write /dev/ttyUSB0,57600", "baud", number(300, 12_000_000).parse),
-    "verify=auto": Gone("that is how written files are checked"),
+    "verify=auto": Gone("this is the way to verify written files"),
     "verify=size": Gone("write verify_max=0", "verify_max", lambda text: 0),
     "verify=none": Gone("the size is always compared; write verify_max=0", "verify_max", lambda text: 0),
     "verify=crc": Gone(
-        "write verify_max=1024G; a CRC32 that the vehicle does not answer is no error then, but logged",
+        "write verify_max=1024G; a CRC32 that the vehicle does not answer is logged, and no longer an error",
         refused=True,
     ),
 }
-"""A line of /etc/fstab or a unit of 0.2 goes on to mount: harmless options are ignored or translated, and the
-log names them. Only what changed a promise is an error. A key may have a value. Drop all this after 1.0."""
+"""A line of /etc/fstab or a unit of 0.2 still mounts: harmless options are ignored or translated, and the log
+names them. Only an option that changed a promise is an error. A key may have a value. Drop all this after
+1.0."""
 
 
 _NO_BAUD = "option baud is gone, and means nothing here: SOURCE is not a serial port"
 
 
 def take_gone(values: dict[str, Any], name: str, text: str) -> bool:
-    """Return whether an option is gone; if so, note a line about it in `values`.
+    """Return whether an option is a removed one; if so, note a line about it in `values`.
 
     Raises:
-        UsageError: what it asked for cannot be had any more.
+        UsageError: the option's effect no longer exists.
     """
     gone = GONE.get(f"{name}={text}") or GONE.get(name)
     if gone is None:
@@ -94,7 +95,7 @@ def _gone_line(name: str, gone: Gone) -> str:
 def options_of(keywords: Mapping[str, object]) -> Options:
     """Return the options that keywords name as `-o` does: `ro=True, target_system=2, cache_size="1G"`.
 
-    None as a value is as if it were not given.
+    A value of None counts as absent.
 
     Raises:
         UsageError: an unknown name, or a bad value; the message names it.
@@ -118,7 +119,7 @@ def options_of(keywords: Mapping[str, object]) -> Options:
 
 
 def _as_text(name: str, value: object) -> str:
-    """Return a keyword's value as `-o` has it."""
+    """Return a keyword's value in the spelling of `-o`."""
     path = getattr(value, "__fspath__", None)
     text = value if path is None else path()
     if isinstance(text, bytes):
@@ -133,7 +134,7 @@ def at_source(spec: LinkSpec, options: Options) -> tuple[LinkSpec, Options]:
     endpoint of forward= once, in one spelling.
 
     Raises:
-        UsageError: root= is given, too, or an endpoint cannot be understood.
+        UsageError: root= is given, too, or an endpoint is malformed.
     """
     endpoints = [parsed_by(parse_endpoint, "forward", text) for text in options.forward]
     options = replace(options, forward=tuple(dict.fromkeys(one.description for one in endpoints)))

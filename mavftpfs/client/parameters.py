@@ -1,7 +1,7 @@
 """A vehicle's parameters for commands: read, compared, set. Layer: client.
 
-The commands use the texts in `@PARAM`, of a mount that is up or of a connection, so that one place alone sets
-parameters and reads them back (`cache.parameters`).
+The commands use the texts in `@PARAM`, of a mount that is up or of a connection, so that parameters are set
+and read back in one place only (`cache.parameters`).
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ DIRECTORY = b"/@PARAM/"
 PACKED, ALL, CHANGED, QGC = b"param.pck", b"params.parm", b"changed.parm", b"params.params"
 LAST_ERROR = b"last_error.txt"
 MOST = 4 << 20
-"""The most bytes of a file for --load."""
+"""The largest file for --load, in bytes."""
 
 _DEFAULT = re.compile(r"^([^,#\n]+),\S+ # default (\S+)$", re.MULTILINE)
 
 
 def at_root(target: Target) -> Target:
-    """Return a target whose `/` is the vehicle's, where `@PARAM` lies; or that of a mount that shows less."""
+    """Return a target whose `/` is the vehicle's, where `@PARAM` is; or that of a mount that shows less."""
     mount = None if target.mount is None else (target.mount[0], ROOT)
     return replace(target, options=replace(target.options, root=ROOT), mount=mount)
 
@@ -48,7 +48,7 @@ async def read_text(session: Session, name: bytes) -> str:
     """Return one of the texts.
 
     Raises:
-        NotFound: this vehicle has none. Else as Files.open.
+        NotFound: this vehicle has none. Otherwise as Files.open.
     """
     return (await _read(session, name)).decode()
 
@@ -63,7 +63,7 @@ async def read_parameters(session: Session) -> list[Parameter]:
 
 
 async def read_with_defaults(session: Session) -> list[Parameter]:
-    """Return all parameters with their defaults, where the vehicle tells these.
+    """Return all parameters with their defaults, if the vehicle reports these.
 
     Raises:
         As read_parameters.
@@ -86,7 +86,7 @@ async def _read(session: Session, name: bytes) -> bytes:
             return bytes(await file.read(0, file.size))
     except NotFound as exc:
         if name == CHANGED:
-            raise NotFound("this vehicle does not tell the defaults of its parameters") from exc
+            raise NotFound("this vehicle does not report the defaults of its parameters") from exc
         part = (
             "" if session.root == ROOT else f"; the mount shows {session.root.decode(errors='replace')} only"
         )
@@ -99,8 +99,8 @@ async def _read(session: Session, name: bytes) -> bytes:
 async def split_by_component(
     session: Session, lines: Sequence[Line]
 ) -> tuple[Sequence[Line], Sequence[Line]]:
-    """Return the lines of this vehicle's component, and those of others: QGroundControl saves all of them in
-    one file, and names may be the same.
+    """Return the lines of this vehicle's component, and those of others, because QGroundControl saves all of
+    them in one file, and names may be the same.
 
     Raises:
         As read_text.
@@ -134,7 +134,7 @@ def _matches(one: Parameter, pattern: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A value that is to be set; before: the vehicle's present value."""
+    """A value to set; before: the vehicle's present value."""
 
     before: Parameter
     after: Parameter
@@ -161,7 +161,7 @@ def assignments(words: Sequence[str]) -> list[Line]:
     """Parse NAME=VALUE words.
 
     Raises:
-        UsageError: a word has no name, a value is no number, or a name has two.
+        UsageError: a word has no name, a value is not a number, or a name has two values.
     """
     lines: list[Line] = []
     for number, word in enumerate(words, 1):
@@ -175,13 +175,13 @@ def assignments(words: Sequence[str]) -> list[Line]:
         if any(
             other.name.upper() == line.name.upper() and not same(other.value, line.value) for other in lines
         ):
-            raise UsageError(f"{line.name} is given two values")
+            raise UsageError(f"{line.name} has two values; leave one out")
         lines.append(line)
     return lines
 
 
 def spelled(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Line]:
-    """Return lines with the vehicle's own spelling of their names, where that differs by case only."""
+    """Return lines with the vehicle's own spelling of their names, where only the case differs."""
     names = {one.name.upper(): one.name for one in current}
     return [replace(line, name=names.get(line.name.upper(), line.name)) for line in lines]
 
@@ -190,7 +190,7 @@ def load(path: Path) -> list[Line]:
     """Return the lines of a parameter file in any spelling.
 
     Raises:
-        UsageError: it cannot be read. InvalidText: lines of it are invalid; the text names each.
+        UsageError: the file cannot be read. InvalidText: it has invalid lines; the text names each.
     """
     try:
         with path.open("rb") as file:
@@ -200,7 +200,7 @@ def load(path: Path) -> list[Line]:
     try:
         text = data.decode()
     except UnicodeDecodeError:
-        raise UsageError(f"{path} is no text file of parameters") from None
+        raise UsageError(f"{path} is not a text file of parameters") from None
     if len(data) > MOST:
         raise UsageError(f"{path} is too long for a file of parameters")
     lines, problems = parse(text)
@@ -233,7 +233,7 @@ def plan_changes(
 
 
 def enabling(changes: Sequence[Change]) -> list[Change]:
-    """Return the changes that may make more parameters appear: of integers that were 0 (docs/servers.md
+    """Return the changes that may make more parameters appear: those of integers that were 0 (docs/servers.md
     17)."""
     return [change for change in changes if change.before.kind is not Kind.FLOAT and not change.before.value]
 
@@ -242,8 +242,8 @@ async def set_values(session: Session, changes: Sequence[Change], progress: Prog
     """Set values, and read all of them back. Progress counts the bytes that the vehicle acknowledged.
 
     Raises:
-        ReadOnly, Armed: nothing is set in flight. NotTaken: the vehicle did not take some; `last_error` tells
-            which.
+        ReadOnly, Armed: nothing is set in flight. NotTaken: the vehicle did not accept some; `last_error`
+            names them.
     """
     text = "".join(f"{change.after.name},{value_text(change.after)}\n" for change in changes)
     file = await session.files.open(DIRECTORY + ALL, write=True, append=True)
@@ -272,7 +272,7 @@ async def last_error(session: Session) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A line of a file that the vehicle does not agree with; None: it has no such parameter."""
+    """A line of a file that differs from the vehicle's value; None: the vehicle has no such parameter."""
 
     name: str
     vehicle: str | None
@@ -280,7 +280,8 @@ class Difference:
 
 
 def compare(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Difference]:
-    """Return where a file differs from a vehicle, except in parameters that the vehicle sets by itself."""
+    """Return the differences between a file and a vehicle, except in parameters that the vehicle sets by
+    itself."""
     values = {one.name: one for one in current}
     found = []
     for line in {line.name: line for line in lines}.values():
@@ -294,7 +295,7 @@ def compare(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Differe
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A parameter that differs between vehicles. values: a text for each vehicle, None where it has no such
+    """A parameter that differs between vehicles. values: a text for each vehicle, None if it has no such
     parameter."""
 
     name: str

@@ -1,6 +1,6 @@
 """The progress of transfers, as numbers. Layer: client.
 
-Only safe bytes count: those that arrived here, or that the vehicle acknowledged.
+Only safe bytes count: those that have arrived here, or that the vehicle acknowledged.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from mavftpfs.shared.speed import Speed
 
 
 class Progress:
-    """Counts; shows nothing by itself. All sizes in bytes. lost: the vehicle is lost. untouched: the name of
-    the file that is being sent still has its old content on the vehicle."""
+    """Counts, and shows nothing by itself. All sizes in bytes. lost: the vehicle is lost. untouched: the path
+    of the present file still has its old content on the vehicle."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -33,7 +33,7 @@ class Progress:
         self.untouched = True
 
     def plan(self, files: int, total: int) -> None:
-        """Note how much there is to do in all, from now on; no files: nothing."""
+        """Note the amount of work from now on; no files: unknown."""
         self.files, self.total = files, total
         self.files_done = self._ended = 0
 
@@ -43,13 +43,13 @@ class Progress:
         self.untouched = True
 
     def at(self, here: int) -> None:
-        """Note how many bytes of the file are safe."""
+        """Note the number of safe bytes of the file."""
         self._speed.on_bytes(max(0, here - self.here), self._clock())
         self.here = here
         self.size = max(self.size, here)
 
     def check(self) -> None:
-        """Note that all bytes moved, and that the vehicle is asked for the checksum."""
+        """Note that all bytes moved, and that the vehicle computes the checksum."""
         self.state = "checking"
 
     def end(self, planned: int) -> None:
@@ -66,7 +66,7 @@ class Progress:
 
     @property
     def rate(self) -> float | None:
-        """Bytes per second that move, None before it is known."""
+        """Bytes per second that move, None while unknown."""
         return self._speed.at(self._clock())
 
     @property
@@ -81,7 +81,7 @@ LOOK_PERIOD = 0.5
 
 @asynccontextmanager
 async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[None]:
-    """Tell progress during the body whether the vehicle is lost."""
+    """Report to progress during the body whether the vehicle is lost."""
 
     async def watch() -> None:
         while True:

@@ -1,7 +1,7 @@
-"""Puts files that did not reach a vehicle back to their places there. Layer: client; prints nothing.
+"""Uploads files that did not reach a vehicle to their paths there. Layer: client; prints nothing.
 
-Only the user starts this, because the file on the vehicle may have changed since. `recover` puts nothing on
-another vehicle, or over a file that was changed since: `mavftpfs put` does that.
+Only the user starts this, because the file on the vehicle may have changed since. `recover` uploads nothing
+to another vehicle, and replaces no file that was changed since: `mavftpfs put` does that.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mavftpfs.shared.model import EntryKind
 from mavftpfs.shared.readable import name_text
 
 _TICK = 0.05
-"""Seconds between two questions whether the vehicle told its unique id."""
+"""Seconds between two checks whether the vehicle has reported its unique id."""
 
 
 async def put_back(
@@ -35,14 +35,14 @@ async def put_back(
     progress: Progress,
     tell: Callable[[Recovered, bool], None],
 ) -> list[Recovered]:
-    """Put files back. Remove the local copy of each file that is proven to be on the vehicle.
+    """Upload files. Remove the local copy of each file that is verified to be on the vehicle.
 
     tell: called for each file, with whether it was there already.
 
-    Returns the files of other vehicles, which stay here.
+    Return the files of other vehicles, which stay here.
 
     Raises:
-        UsageError: one of them cannot be put back, and the text says why; the others were put back.
+        UsageError: one of them cannot be uploaded, and the text gives the reason; the others were uploaded.
         NotDelivered: a file did not reach the vehicle.
     """
     others = await _of_others(session, wanted)
@@ -64,12 +64,12 @@ async def put_back(
 
 
 async def _of_others(session: Session, wanted: Sequence[Recovered]) -> list[Recovered]:
-    """Return the files that are of another vehicle."""
+    """Return the files that belong to another vehicle."""
     if not any(copy.facts.get("uid") for copy in wanted):
         return []
     vehicle = (await session.status())["vehicle"]
     with trio.move_on_after(VERSION_PATIENCE):
-        while vehicle["firmware"] is None:  # it is told together with the unique id
+        while vehicle["firmware"] is None:  # arrives together with the unique id
             await trio.sleep(_TICK)
             vehicle = (await session.status())["vehicle"]
     return [copy for copy in wanted if copy.is_of_another(vehicle)]
@@ -80,7 +80,7 @@ def _in_session(session: Session, copy: Recovered) -> bytes:
     assert copy.path is not None
     root = session.root.rstrip(b"/")
     if not copy.path.startswith(root + b"/"):
-        raise UsageError(f"{name_text(copy.path)} does not lie below {name_text(session.root)}")
+        raise UsageError(f"{name_text(copy.path)} is not below {name_text(session.root)}")
     return copy.path[len(root) :]
 
 
@@ -99,7 +99,7 @@ async def _is_there(session: Session, path: bytes, copy: Recovered) -> bool:
     if (await compare(session, path, copy.file, size=found.size)).match is Match.SAME:
         return True
     before = copy.facts.get("size_on_vehicle")
-    if found.size not in (before, 0):  # an empty one holds nothing to lose
+    if found.size not in (before, 0):  # an empty file has nothing to lose
         known = "nothing" if before is None else f"{before} bytes"
         raise UsageError(
             f"{name_text(path)} has {found.size} bytes on the vehicle, and had {known} when this was kept: "

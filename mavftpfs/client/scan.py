@@ -1,4 +1,4 @@
-"""Components on a link, and which of them serve files. Layer: client; prints nothing."""
+"""Components on a link, and whether they serve files. Layer: client; prints nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Entry = dict[str, Any]
 LISTEN_TIME = 3.0
 """Seconds in which every component sends its heartbeat at least twice."""
 PROBE_TIME = 6.0
-"""Seconds that a component has at most to answer a listing."""
+"""The most seconds for a component to answer a listing."""
 
 
 async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
@@ -64,7 +64,7 @@ def _shown(entries: list[Entry], show: Callable[[Entry], None]) -> list[Entry]:
 
 
 async def _by_mount(mountpoint: str) -> list[Entry]:
-    """Return what a mount, or the mounts of several vehicles, tell."""
+    """Return the entries from a mount, or from the mounts of several vehicles."""
     status = await usable_status(mountpoint)
     if "members" in status:
         _, *below = await trio.to_thread.run_sync(with_vehicles, status)
@@ -73,7 +73,7 @@ async def _by_mount(mountpoint: str) -> list[Entry]:
 
 
 async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]) -> AsyncIterator[Entry]:
-    """Yield the other components that are heard, and which of them answer MAVLink FTP."""
+    """Yield the other components that are heard, with their answers to MAVLink FTP."""
     assert target.spec is not None
     options, tell = target.options, target.sinks.tell
     tell(f"listening on {target.spec.description} for {LISTEN_TIME:g} s")
@@ -90,7 +90,7 @@ async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]
 async def _listen(
     link: Link, options: Options, on_wait: Callable[[], None], on_new: Callable[[Heartbeat], None]
 ) -> dict[Address, Heartbeat]:
-    """Return the heartbeats that are heard within LISTEN_TIME of the first one."""
+    """Return the heartbeats that arrive within LISTEN_TIME of the first one."""
     found: dict[Address, Heartbeat] = {}
 
     def on_heard(heartbeat: Heartbeat) -> None:
@@ -106,7 +106,7 @@ async def _listen(
 
 
 def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:
-    """Return what a heartbeat tells; ftp: what is known of its sender's files."""
+    """Return the entry for a heartbeat; ftp: the words about its sender's files."""
     return {
         "system": heartbeat.source.system,
         "component": heartbeat.source.component,
@@ -140,7 +140,7 @@ async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: f
         except FtpNak as exc:
             answer = f"answers, but: {exc}"
         except VehicleLost:
-            answer = "no answer (it is not heard any more)"
+            answer = "no answer (its heartbeats stopped)"
         except MavftpfsError as exc:
             answer = f"no answer ({exc})"
         answers = answer.startswith("answers")
@@ -157,7 +157,7 @@ async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: f
 
 
 def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
-    """Return what else was learnt of its FTP."""
+    """Return the other observations of its FTP."""
     seen = []
     flag, rtt, times = facts["vehicle"]["says_ftp"], facts["link"]["rtt"], facts["connection"]["lists_times"]
     if flag is not None and flag is not answers:
@@ -172,7 +172,7 @@ def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
 
 
 def _own_entry(status: Mapping[str, Any]) -> Entry:
-    """Return what a mount tells of its vehicle."""
+    """Return the entry of a mount's vehicle."""
     vehicle, lost = status["vehicle"], status["link"]["state"] == "lost"
     return {
         "system": vehicle["system"],
@@ -191,7 +191,7 @@ def _own_entry(status: Mapping[str, Any]) -> Entry:
 
 
 def _of_mounts(statuses: Sequence[Mapping[str, Any]]) -> list[Entry]:
-    """Return what mounts tell of their vehicles: an entry for each, however many mounts it has."""
+    """Return the entries of mounts' vehicles, one for each vehicle, however many mounts it has."""
     found: dict[tuple[Any, ...], Entry] = {}
     for status in sorted(statuses, key=lambda status: status["link"]["state"] == "lost"):
         entry = _own_entry(status)
@@ -207,7 +207,7 @@ def _second(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
-    """Return what a mount tells of its vehicle, and of others that it hears; these are not asked."""
+    """Return the entries of a mount's vehicle, and of others that the mount hears; these are not asked."""
     own = _own_entry(status)
     others = [one for one in heartbeats_in(status) if one.source != (own["system"], own["component"])]
     reason = f"not asked (the mount on {status['mountpoint']} has the link)"

@@ -28,8 +28,8 @@ _UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 class Selection:
     """The files that a user wants.
 
-    newest: at most so many; since: none that is older, seconds UTC. include: patterns, one of which a file
-    has to match if there are any; exclude: patterns, none of which a file may match.
+    newest: the largest number of files; since: the oldest time, seconds UTC. include: a file must match one
+    of these patterns if there are any; exclude: a file may match none of these.
     """
 
     newest: int | None = None
@@ -39,19 +39,19 @@ class Selection:
 
     @property
     def by_name(self) -> bool:
-        """Whether names decide."""
+        """Whether patterns decide."""
         return bool(self.include or self.exclude)
 
     def takes(self, below: bytes) -> bool:
-        """Return whether the patterns take a file; below: its path below the directory that is fetched."""
+        """Return whether the patterns select a file; below: its path below the downloaded directory."""
         path = os.fsdecode(below)
         taken = not self.include or _matches_one(path, self.include)
         return taken and not _matches_one(path, self.exclude)
 
     def of_logs(self, logs: Iterable[Wanted]) -> list[Wanted]:
-        """Return the logs that are young enough, the newest first.
+        """Return the logs that are new enough, the newest first.
 
-        `since` leaves a log out only if the time of the log is known: another one may be new.
+        `since` leaves a log out only if the time of the log is known, because another one may be new.
         """
         young = [log for log in newest_first(logs) if not self._is_older(log)]
         return young if self.newest is None else young[: self.newest]
@@ -61,14 +61,14 @@ class Selection:
         return self.since is not None and when is not None and when < self.since
 
     def warning(self, logs: Sequence[Wanted]) -> str:
-        """Return a line about logs that are fetched although `since` may mean to leave them out, or ""."""
+        """Return a line about logs that are downloaded although `since` may mean to leave them out, or ""."""
         undated = [log for log in logs if time_of(log) is None and not log.here and not is_no_log(log)]
         if self.since is None or not undated:
             return ""
         size = readable_size(sum(log.size - log.begun for log in undated))
         return (
             f"--since does not leave out {len(undated)} of {len(logs)} logs ({size}), because the vehicle "
-            "tells no time for them; use --newest N to fetch fewer"
+            "reports no time for them; use --newest N to download fewer"
         )
 
 
@@ -81,12 +81,12 @@ def _matches_one(below: str, patterns: Sequence[str]) -> bool:
 
 
 def is_no_log(log: Wanted) -> bool:
-    """Return whether a file that lies among the logs is none."""
+    """Return whether a file among the logs is something else."""
     return log.remote.endswith(NO_LOG)
 
 
 def time_of(log: Wanted) -> int | None:
-    """Return the time of a log, seconds UTC, as listed or as its path tells it; None if neither does."""
+    """Return the time of a log, seconds UTC, from its listing or its path; None if neither has one."""
     return latest_in(log.remote) if log.mtime is None else log.mtime
 
 
@@ -105,8 +105,8 @@ def latest_in(path: bytes) -> int | None:
 
 
 def newest_first(logs: Iterable[Wanted]) -> list[Wanted]:
-    """Order logs by time, then by their numbers. Logs without a time come last, and files that are no logs
-    behind them."""
+    """Order logs by time, then by their numbers. Logs without a time follow, and files that are not logs come
+    last."""
 
     def age(log: Wanted) -> tuple[bool, int, object]:
         return not is_no_log(log), time_of(log) or 0, natural(log.remote)
@@ -115,17 +115,17 @@ def newest_first(logs: Iterable[Wanted]) -> list[Wanted]:
 
 
 def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
-    """Return a key by which `log10` comes after `log9`."""
+    """Return a key that sorts `log10` behind `log9`."""
     parts = re.split(rb"(\d+)", name)
     return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)
 
 
 def parse_date(text: str, now: datetime, name: str) -> float:
-    """Return seconds UTC of a date, or a date and time, which is local if it names no zone; of `today`,
+    """Return the seconds UTC of a date, or a date and time, which is local if it names no zone; of `today`,
     `yesterday`, or a time ago (`90min`, `2h`, `3d`, `1w`).
 
     Raises:
-        UsageError: the text is no date; name: the option or argument that the error names.
+        UsageError: the text is not a date; name: the option or argument in the message.
     """
     midnight = datetime(now.year, now.month, now.day)
     ago = _AGO.fullmatch(text)
@@ -137,6 +137,6 @@ def parse_date(text: str, now: datetime, name: str) -> float:
         return datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
         raise UsageError(
-            f"{name} {text!r} is no date; write for example 2026-05-01, 2026-05-01T14:30, today, "
+            f"{name} {text!r} is not a date; write for example 2026-05-01, 2026-05-01T14:30, today, "
             "yesterday, 2h or 3d"
         ) from None

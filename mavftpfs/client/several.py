@@ -1,8 +1,9 @@
 """Several vehicles on one link, where SOURCE and the options name none of them. Layer: client.
 
-The vehicle whose heartbeat comes first is used. That is good enough for reading, if the user is told, but not
-for a change: which vehicle comes first is chance. So a command that changes something listens until each
-vehicle on the link had time to send a heartbeat, and is refused if there are several.
+mavftpfs uses the vehicle whose heartbeat arrives first. That is good enough for reading, if the user learns
+of it, but not for a change, because chance decides which vehicle is first. So a command that changes
+something listens until each vehicle on the link had time to send a heartbeat, and refuses if there are
+several.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from mavftpfs.link.peers import names_of, vehicles_in
 from mavftpfs.shared.errors import UsageError
 
 ON_COMMAND_LINE, IN_PYTHON = "-o target_system=", "target_system="
-"""How a vehicle is named."""
+"""The spellings of the option that names a vehicle."""
 
 _TICK = 0.25
-"""Seconds between two looks whether another vehicle was heard."""
+"""Seconds between two checks for another vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unnamed:
-    """The vehicles on a link, none of which was named.
+    """The vehicles on a link, of which the user named none.
 
     place: the link, for people. taken: the system id of the vehicle that is used. heard: returns a heartbeat
     of each component that was heard. listened: returns when each vehicle on the link had time to send a
@@ -43,7 +44,7 @@ class Unnamed:
         """Check that the vehicle is the only one on its link.
 
         Raises:
-            UsageError: it is not; the text names all of them, and `option`, which chooses one.
+            UsageError: there are others; the text names all of them, and `option`, which chooses one.
         """
         await self.listened()
         vehicles = vehicles_in(self.heard())
@@ -57,7 +58,7 @@ class Unnamed:
         )
 
     def note(self, option: str) -> str:
-        """Return a line about the other vehicles that were heard until now, or ""."""
+        """Return a line about the other vehicles that were heard so far, or ""."""
         others = [one for one in vehicles_in(self.heard()) if one.source.system != self.taken]
         if not others:
             return ""
@@ -68,7 +69,7 @@ class Unnamed:
 
     @asynccontextmanager
     async def noted(self, tell: Callable[[str], None], option: str) -> AsyncIterator[None]:
-        """Tell the note as soon as another vehicle is heard, at the end of the body at the latest."""
+        """Print the note as soon as another vehicle is heard, or at the end of the body."""
         told = False
 
         def look() -> None:

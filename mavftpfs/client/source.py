@@ -18,14 +18,15 @@ from mavftpfs.shared.options import Options
 
 
 def files_in_mount(source: str, paths: Sequence[str], *, lists: bool) -> tuple[str, list[str]] | None:
-    """Return (mountpoint, paths on it), if SOURCE is what a command is to read, and not where; else None.
+    """Return (mountpoint, paths on it) if SOURCE is itself a path to read, not a link or mount; otherwise
+    None.
 
-    That is so if SOURCE lies in a mount and is no directory: `crc ~/drone/log/*`, as a shell writes it. The
-    `paths` then have to lie in the same mount. A SOURCE without paths may be a directory, too, unless the
-    command `lists` that by itself.
+    A SOURCE in a mount that is not a directory is such a path: `crc ~/drone/log/*`, as a shell writes it.
+    Then all `paths` must be in the same mount. A SOURCE without paths may be a directory, too, unless the
+    command `lists` the root by default.
 
     Raises:
-        UsageError: one of the paths lies elsewhere, or the shell did not expand a `~` in SOURCE.
+        UsageError: one of the paths is elsewhere, or the shell did not expand a `~` in SOURCE.
     """
     require_expanded(source)
     mount = mountpoint_of(source)
@@ -54,12 +55,13 @@ async def _may_be_directory(mountpoint: str, path: bytes) -> bool:
 
 
 def target_of(source: str, options: Options) -> Target:
-    """Return what SOURCE names, for a command or a program.
+    """Return the target that SOURCE names, for a command or a program.
 
     Raises:
-        UsageError: it is no SOURCE, or contradicts the options.
+        UsageError: the text is not a SOURCE, or contradicts the options.
     """
-    # A mount keeps editors' swap files in memory. What a command or a program puts is meant for the card.
+    # A mount keeps editors' swap files in memory, but files from a command or a program are meant for the
+    # card.
     options = replace(options, local=False)
     mount = mountpoint_of(source)
     if mount is not None:

@@ -1,7 +1,7 @@
-"""The facts that a mount tells of itself. Layer: client; pure.
+"""The facts that a mount reports about itself. Layer: client; pure.
 
-A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys
-are those of `status --json`, which docs/json.md describes. client.mounts asks mounts for it.
+A mount builds its status from two plain dictionaries, `Connection.status()` and `Tree.status()`; the keys are
+those of `status --json`, which docs/json.md describes. client.mounts asks mounts for it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 Facts = Mapping[str, Any]
 
 MOST = 100
-"""Entries of each list, so that a status is never large. `held` counts them all."""
+"""Entries of each list, which keep a status small. `held` counts all files."""
 _TOLD = {"transfers", "errors", "broken", "reads"}
 """Keys of the cache's status that are in the snapshot's own lists."""
 
@@ -38,14 +38,14 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str
 
 
 def is_read_only(vehicle: Facts) -> bool:
-    """Return whether nothing is written to a vehicle, because it is armed."""
+    """Return whether a vehicle is read-only because it is armed."""
     return bool(vehicle["armed"]) and vehicle["when_armed"] == "ro"
 
 
 def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, Any]]:
-    """Return the files that are being read or written; those being sent come before those that wait.
+    """Return the files that are being read or written; those in flight come before those that wait.
 
-    moving: the vehicle is there; writing: it may also be written to.
+    moving: the vehicle is heard; writing: mavftpfs may write to it.
     """
     found = []
     for read in cache.get("reads", []):

@@ -1,4 +1,4 @@
-"""Records of what went over the link: FTP payloads as text, frames as .tlog. Layer: client.
+"""Records of the traffic on the link: FTP payloads as text, frames as .tlog. Layer: client.
 
 Only `-d` calls `text_line`, for each of the 251-byte payloads. If the disk is full, the log reports it once,
 and the .tlog ends there: a record must never break the transfer that it records.
@@ -30,11 +30,11 @@ _log = logging.getLogger(__name__)
 
 
 class TlogWriter:
-    """Writes frames in pymavlink's .tlog format, for every tool that reads these; without a buffer, and only
-    until the file fails. wall_clock: seconds since 1970.
+    """Writes frames in pymavlink's .tlog format, without a buffer, until the file fails. wall_clock: seconds
+    since 1970.
 
     Raises:
-        UsageError: it cannot be created.
+        UsageError: the file cannot be created.
     """
 
     def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
@@ -53,7 +53,7 @@ class TlogWriter:
         self._file.close()
 
     def frame(self, frame: bytes) -> None:
-        """Record a whole frame, received or sent; made to be Framer.on_frame."""
+        """Record a whole frame, received or sent; for Framer.on_frame."""
         if self._failed:
             return
         try:
@@ -90,7 +90,7 @@ def nak_name(code: int) -> str:
 
 
 def _data_that_counts(direction: str, payload: Payload) -> bytes:
-    # A reply's bytes behind `size` are stray memory; ReadFile's `size` is what it wants, not what it holds.
+    # A reply's bytes behind `size` are stray memory; ReadFile's `size` is the number of bytes to read.
     wants_data = payload.opcode in (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
     if direction != REPLY and wants_data:
         return b""

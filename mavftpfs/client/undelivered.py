@@ -1,7 +1,7 @@
-"""Files that did not reach a vehicle: where they lie on this computer, and their descriptions. Layer: client.
+"""Files that did not reach a vehicle: their places on this computer, and descriptions. Layer: client.
 
-A mount keeps undelivered bytes in a spool. When it ends it moves them to a recovery directory, with a
-`NAME.json` beside each file (cache.recovery). After a kill the next mount of the vehicle does that.
+A mount keeps pending changes in a spool. At its end it moves them to a recovery directory, with a `NAME.json`
+beside each file (cache.recovery). After a kill the next mount of the vehicle does that.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ log = logging.getLogger("mavftpfs.mount")
 
 
 def state_directory() -> Path:
-    """Return where this user's mounts keep files that must survive them (XDG base directories)."""
+    """Return the directory for files that must survive this user's mounts (XDG base directories)."""
     given = os.environ.get("XDG_STATE_HOME", "")
     base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
     return base / "mavftpfs"
 
 
 def recovered_directory() -> Path:
-    """Return where all mounts of this user leave files that did not reach a vehicle."""
+    """Return the directory where all mounts of this user leave files that did not reach a vehicle."""
     return state_directory() / "recovered"
 
 
 def recovery_directory(source: str) -> Path:
-    """Return a new name for what one mount leaves behind now."""
+    """Return a new name for the files that one mount leaves behind now."""
     what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
     return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
 
@@ -53,9 +53,9 @@ def recovery_directory(source: str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """The copy here of a file that did not reach the vehicle.
+    """The local copy of a file that did not reach the vehicle.
 
-    facts: the description that lies beside it as JSON.
+    facts: the description beside it, from JSON.
     """
 
     file: Path
@@ -63,7 +63,7 @@ class Recovered:
 
     @property
     def path(self) -> bytes | None:
-        """Its path on the vehicle, None if the description does not tell that."""
+        """Its path on the vehicle, None if the description lacks it."""
         path = self.facts.get("path")
         return normalise(os.fsencode(path)) if isinstance(path, str) and path else None
 
@@ -74,27 +74,27 @@ class Recovered:
 
     @property
     def vehicle(self) -> str:
-        """Its vehicle, for people; "" if the description does not tell that."""
+        """Its vehicle, for people; "" if the description lacks it."""
         system, uid = self.facts.get("system"), self.facts.get("uid")
         if system is None:
             return ""
         return f"vehicle {system} (id {uid})" if uid else f"vehicle {system}"
 
     def is_of_another(self, vehicle: Mapping[str, Any]) -> bool:
-        """Return whether the file is of another vehicle than this one (as in `status --json`). False if one
-        of them has no unique id.
+        """Return whether the file belongs to another vehicle than this one (as in `status --json`). False if
+        one of them has no unique id.
 
-        A board may have a long id and a short one, and only the short one goes over MAVLink 1. After one of
-        them the other counts as another board's.
+        A board may have a long id and a short one, and MAVLink 1 carries only the short one. If the file has
+        one of them and the vehicle the other, they count as different boards.
         """
         mine, other = self.facts.get("uid"), vehicle.get("uid")
         return bool(mine and other and mine != other)
 
     @property
     def hindrance(self) -> str:
-        """Why `recover` cannot put the file back, or ""."""
+        """The reason why `recover` cannot upload the file, or ""."""
         if self.path is None:
-            return "where it belongs was not written down"
+            return "its path on the vehicle is unknown"
         if "whole" not in self.facts:
             return "a program was still writing it, so it may be a part only"
         if self.facts.get("broken"):
@@ -106,7 +106,7 @@ def recovered_below(base: Path) -> list[Recovered]:
     """Return all files in the recovery directories, the oldest directory first.
 
     Raises:
-        UsageError: they cannot be read.
+        UsageError: the directories cannot be read.
     """
     try:
         directories = sorted(path for path in base.iterdir() if path.is_dir())
@@ -118,10 +118,10 @@ def recovered_below(base: Path) -> list[Recovered]:
 
 
 def recovered_in(directory: Path) -> list[Recovered]:
-    """Return the files in one recovery directory. The descriptions of files that a person removed go, too.
+    """Return the files in one recovery directory. Remove descriptions whose files a person removed.
 
     Raises:
-        UsageError: it cannot be read.
+        UsageError: the directory cannot be read.
     """
     try:
         paths = {path for path in directory.iterdir() if path.is_file() and not path.is_symlink()}
@@ -150,7 +150,7 @@ def _read_facts(path: Path) -> dict[str, Any]:
 
 
 def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
-    """Return the files that a person named: by their paths, or by a directory for all that is in it.
+    """Return the files that a person named: by their paths, or by a directory for all files in it.
 
     Raises:
         UsageError: there is no such file.
@@ -168,19 +168,20 @@ def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
 
 
 def what_to_do(source: str, directory: Path) -> str:
-    """Return the command for people that have a recovery directory: `recover` refuses parts."""
+    """Return the command for people who have a recovery directory; `recover` refuses parts of files."""
     found = recovered_in(directory)
     them = "it" if len(found) == 1 else "them"
     if all(copy.hindrance for copy in found):
-        return f"list {them} by: mavftpfs recover"
-    return f"put {them} back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
+        return f"list {them} with: mavftpfs recover"
+    return f"upload {them} with: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
 
 
 # -- spools ---------------------------------------------------------------------------------------
 
 
 def spool_base(vehicle: Address | None) -> Path:
-    """Return where the mounts of one vehicle have their spools: by its address, whatever the link."""
+    """Return the directory with the spools of one vehicle's mounts, which its address names, whatever the
+    link."""
     name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
     return state_directory() / "spool" / name
 
@@ -190,7 +191,7 @@ def left_by_killed_mounts() -> list[Path]:
     offers them."""
     try:
         slots = sorted((state_directory() / "spool").glob("*/slot*"))
-    except OSError:  # another user's, in whose environment this program runs
+    except OSError:  # the directory is another user's, in whose environment this program runs
         return []
     return [data for slot in slots for data in left_in(slot)]
 
@@ -202,7 +203,7 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
     try:
         spool = SpoolDirectory(base)
     except OSError as exc:
-        log.warning("what waits for the vehicle will not survive this process: %s: %s", base, exc)
+        log.warning("pending changes will not survive this process: %s: %s", base, exc)
         yield None
         return
     try:
@@ -213,7 +214,7 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
 
 def rescue(spool: SpoolDirectory, source: str) -> str:
     """Move the files that a killed mount of this vehicle, or of another one with its system id, left to a
-    recovery directory; return a line on them, or ""."""
+    recovery directory; return a line about them, or ""."""
     directory = recovery_directory(source)
     try:
         found = spool.rescue(directory)

@@ -1,7 +1,7 @@
-"""Putting local files and directories on the vehicle. Layer: client; prints nothing.
+"""Uploads local files and directories to the vehicle. Layer: client; prints nothing.
 
-A file counts as put when fsync says that it is on the card, checked. Until then progress counts the bytes
-that the vehicle has acknowledged.
+A file counts as uploaded when fsync returns, because then it is on the card, verified. Until then progress
+counts the bytes that the vehicle has acknowledged.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from mavftpfs.shared.model import join, normalise
 from mavftpfs.shared.readable import name_text, readable
 
 Tell = Callable[[bytes, int, str], None]
-"""Called with the path of a file that was put, its size, and how it was verified."""
+"""Called with the path of an uploaded file, its size, and how it was verified."""
 
 ASK_PERIOD = 0.25
-"""Seconds between two looks at how much the vehicle has acknowledged."""
+"""Seconds between two updates of the acknowledged bytes."""
 
 
 def collect(local: Path, *, recursive: bool) -> list[Path]:
-    """Return a file, or a directory with all below, parents first.
+    """Return a file, or a directory with everything below, parents first.
 
     Raises:
-        UsageError: it is not there or not readable, is neither file nor directory, or a directory without
-            `recursive`. Symbolic links to files count as files; cards have no links.
+        UsageError: the path does not exist or is not readable, is neither file nor directory, or is a
+            directory without `recursive`. Symbolic links to files count as files; cards have no links.
     """
 
     def fail(error: OSError) -> None:
@@ -60,7 +60,7 @@ def collect(local: Path, *, recursive: bool) -> list[Path]:
         if path.is_symlink() and path.is_dir() and path != local:
             raise UsageError(f"{path} is a link to a directory; a card cannot hold links")
         if not path.exists():
-            raise UsageError(f"{path} is not there")
+            raise UsageError(f"{path} does not exist")
         if not path.is_file() and not path.is_dir():
             raise UsageError(f"{path} is neither a file nor a directory")
     return found
@@ -75,20 +75,20 @@ async def put_paths(
     *,
     into: bool = False,
 ) -> None:
-    """Put what `collect` found to `path`: an existing directory, or a new name for one thing.
+    """Upload the files of `collect` to `path`: an existing directory, or a new name for one thing.
 
-    `tell`: called for each file that is there. into: `path` was written with a `/` at its end: a file goes
-    into that directory only.
+    `tell`: called for each uploaded file. into: `path` was written with a `/` at its end: a file goes into
+    that directory only.
 
     Raises:
-        NotADirectory: several things, or a file is to go into it, and `path` is no directory; NotFound: it is
-        not there. UsageError: of what is local, or two files would get one name. All that before anything is
-        sent. NotDelivered: a file did not get to the vehicle; the files that were told before are there.
+        NotADirectory: several things, or a file with `into`, and `path` is not a directory; NotFound: `path`
+        does not exist. UsageError: about local files, or two files would get one name. All these before the
+        first request. NotDelivered: a file did not reach the vehicle; the files reported before are there.
     """
     with _naming(session, path, progress):
         inside = await is_directory(session.files, path)
         if not inside and len(batches) > 1:
-            raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
+            raise NotADirectory(f"{name_text(path)} is not a directory, so only one thing can be put there")
         if into and not inside and not batches[0][0].is_dir():
             await require_directory(session.files, path)
     plan = _placed(batches, path, inside=inside)
@@ -108,7 +108,7 @@ def _placed(
     """Return the path on the vehicle for each local file, parents first; directories of one name become one.
 
     Raises:
-        UsageError: two would get one name.
+        UsageError: two files would get one name.
     """
     plan: dict[bytes, Path] = {}
     for local, found in batches:
@@ -130,7 +130,7 @@ async def put_alone(
     *,
     into: bool = False,
 ) -> None:
-    """Put one file under another name than its own, such as stdin; else as `put_paths`.
+    """Upload one file under another name than its own, such as stdin; otherwise as `put_paths`.
 
     Raises:
         IsADirectory: the path is a directory, or is written as one.
@@ -150,10 +150,11 @@ async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: 
 
 
 async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> tuple[int, str]:
-    """Put one file, and return its size, and how it was verified.
+    """Upload one file, and return its size, and how it was verified.
 
     Raises:
-        UsageError: it cannot be read. NotFound, NotADirectory: its directory is not there. NotDelivered.
+        UsageError: the file cannot be read. NotFound, NotADirectory: its directory does not exist.
+            NotDelivered.
     """
     try:
         with local.open("rb") as source:
@@ -186,7 +187,7 @@ def _naming(session: Session, remote: bytes, progress: Progress) -> Iterator[Non
 
 
 def _undelivered(session: Session, remote: bytes, error: MavftpfsError, progress: Progress) -> str:
-    """Return which file was not delivered, why, and how many were."""
+    """Return the words: which file was not delivered, the reason, and how many were."""
     name = name_text(session.on_vehicle(remote))
     reason = readable(str(error)).removeprefix(f"{name_text(remote)}: ")
     done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
@@ -213,7 +214,7 @@ async def _copy(source: BinaryIO, file: File) -> int:
 
 @asynccontextmanager
 async def watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
-    """Tell progress what the vehicle has acknowledged of a file while the body sends it."""
+    """Report to progress the bytes that the vehicle acknowledges while the body sends a file."""
 
     async def watch() -> None:
         while True:

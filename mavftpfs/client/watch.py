@@ -36,24 +36,24 @@ from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_size
 
 TICK = 0.25
-"""Seconds between two looks at what was heard: a vehicle that is armed gets no request a second later."""
+"""Seconds between two looks at heartbeats; a vehicle that arms gets no request a second later."""
 REOPEN = 5.0
-"""Seconds until a link that cannot be opened is tried again."""
+"""Seconds until the watch tries again to open a link."""
 SILENCE = 3600.0
 """Seconds after which the watch prints a line although nothing happened."""
 SPARE = 1 << 20
-"""Bytes that are left free on the local disk; they count as needed."""
+"""Bytes that must stay free on the local disk."""
 
 HandOn = Callable[[Path], Awaitable[str]]
 """Runs a command for a downloaded log; returns why the command failed, or ""."""
 
 
 class LocalTrouble(UsageError):
-    """The local directory is not there, or has no room."""
+    """The local directory does not exist, or has no room."""
 
 
 class Watch:
-    """Downloads the logs of each vehicle that comes, into a directory for each. say: gets lines for people.
+    """Downloads the logs of each vehicle that appears, into a directory for each. say: gets lines for people.
 
     Raises:
         UsageError: the directory cannot be used.
@@ -132,7 +132,7 @@ class Watch:
         is_mounted: returns whether a mount has the vehicle now.
 
         Raises:
-            LinkError: it was closed for good, or a mount has the vehicle now.
+            LinkError: the link was closed for good, or a mount has the vehicle now.
         """
         while True:
             settings = replace(connect_options(options), target_system=options.target_system or self._turn)
@@ -142,7 +142,8 @@ class Watch:
                 await self.serve(LinkContact(connection, spec, options, is_mounted))
 
     async def serve(self, contact: Contact) -> None:
-        """Listen, and sync the logs of one vehicle when that is due. Return when the contact is to be left.
+        """Listen, and sync the logs of one vehicle when that is due. Return when the watch should leave the
+        contact.
 
         Raises:
             LinkError: the contact broke.
@@ -182,7 +183,7 @@ class Watch:
             policy.uid = uid or policy.uid
 
     def _due(self, served: int | None, now: float) -> int | None:
-        """Return a vehicle whose logs are to be synced, None if there is none; `served` comes first."""
+        """Return a vehicle whose logs are due, None if there is none; `served` comes first."""
         due = sorted(system for system, policy in self._policies.items() if policy.due(now))
         return served if served in due else due[0] if due else None
 
@@ -194,7 +195,7 @@ class Watch:
     # --- what is heard
 
     def _hear(self, found: Sequence[Heard]) -> None:
-        """Take heartbeats, and tell people what is new."""
+        """Take heartbeats, and print the news."""
         now = trio.current_time()
         for one in found:
             policy = self._policies.setdefault(one.system, Policy())
@@ -217,7 +218,7 @@ class Watch:
                 self._tell_of(system, "is lost", now)
 
     def _break_silence(self) -> None:
-        """Tell from time to time that the watch is alive, and which vehicles are here."""
+        """Print from time to time that the watch is alive, and the vehicles that are here."""
         if trio.current_time() - self._said_at >= SILENCE:
             here = [f"vehicle {system} is {policy.state}" for system, policy in self._policies.items()]
             self._say(f"nothing new for an hour; {', '.join(here) or 'no vehicle was heard'}")
@@ -229,14 +230,14 @@ class Watch:
 
 
 class Complaints:
-    """Tells people each trouble once, until it is over or another one comes."""
+    """Tells people each trouble once, until the trouble ends or another one follows."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
         self._told: dict[str, str] = {}
 
     def tell(self, about: str, line: str) -> None:
-        """Say a line, unless it is empty or was the last one about the same thing."""
+        """Print a line, unless it is empty or equals the last one about the same thing."""
         if line and self._told.get(about) != line:
             self._told[about] = line
             self._say(line)
@@ -270,26 +271,26 @@ class Keeping:
         """Check that the directory is there, and has room for so many bytes.
 
         Raises:
-            LocalTrouble: it is not, or has not.
+            LocalTrouble: the directory is missing, or full.
         """
         if not self.manifest.is_there():
-            raise LocalTrouble(f"{self.local} is not there any more; waiting for it")
+            raise LocalTrouble(f"{self.local} does not exist; waiting for it")
         free = free_space(self.local)
         if free - SPARE < needed:
             wants = f"{readable_size(needed + SPARE)} are needed, {readable_size(free)} are free"
             raise LocalTrouble(f"{self.local} is full: {wants}; waiting for room")
 
     def look(self) -> None:
-        """Read the manifest again: another disk may be at the place now.
+        """Read the manifest again, because another disk may be mounted there now.
 
         Raises:
-            UsageError: it cannot be read.
+            UsageError: the manifest cannot be read.
         """
         with local_disk(self.local):
             self.manifest = Manifest(self.local)
 
     def note(self, log: Downloaded) -> None:
-        """Note a log that is here; a command is run for it, if there is one and the log is proven.
+        """Note a downloaded log, and have the command run for it, if there is one and the log is verified.
 
         Raises:
             OSError: the local disk refuses it.
@@ -300,7 +301,7 @@ class Keeping:
             self._to_hand_on.send_nowait(log)
 
     async def hand_on_all(self) -> None:
-        """Run the command for the logs that are here, one after the other; return only when there is none."""
+        """Run the command for the downloaded logs, one after the other; return when none is left."""
         if self._hand_on is None:
             return
         async for log in self._handed_over:
@@ -310,7 +311,7 @@ class Keeping:
     async def _hand_on_one(self, log: Downloaded, hand_on: HandOn) -> None:
         problem = await hand_on(self.local / log.file)
         if problem:
-            self._say(f"{log.file}: {problem}; it is tried again at the next start")
+            self._say(f"{log.file}: {problem}; the watch tries again at its next start")
         elif self.manifest.of(log.vehicle, log.path) == log:  # the log did not grow meanwhile
             try:
                 with local_disk(self.local):
@@ -321,8 +322,8 @@ class Keeping:
 
 @dataclass(slots=True)
 class VehicleSync(Reports):
-    """One sync of the logs of a vehicle. over: the sync came to its end; broken: the contact did not survive
-    that."""
+    """One sync of the logs of a vehicle. over: the sync came to its end; broken: the error that ended the
+    contact during the sync."""
 
     system: int
     policy: Policy
@@ -337,7 +338,7 @@ class VehicleSync(Reports):
     _vehicle: str = ""
 
     async def run(self, contact: Contact) -> None:
-        """Sync, and tell the policy how that went; without the contact the sync stays due."""
+        """Sync, and report the result to the policy; if the contact breaks, the sync stays due."""
         self.policy.begin()
         try:
             self.keeping.require_room(0)
@@ -349,7 +350,7 @@ class VehicleSync(Reports):
         except (LocalTrouble, LocalDiskFull) as exc:
             self.complaints.tell("local", str(exc))
             self.policy.local_trouble(trio.current_time())
-        except NotFound as exc:  # there is no directory of logs before the first flight
+        except NotFound as exc:  # before the first flight there is no directory of logs
             self._complain("logs", str(exc))
         except MavftpfsError as exc:
             self._complain("logs", str(exc))
@@ -391,8 +392,8 @@ class VehicleSync(Reports):
         return [replace(log, growing=chosen[log.remote]) for log in new if log.remote in chosen]
 
     async def _is_known(self, session: Session, log: Wanted) -> bool:
-        """Return whether a log was downloaded before. If the vehicle tells no times, its first bytes are
-        compared, once until the vehicle was away."""
+        """Return whether a log was downloaded before. If the vehicle reports no times, compare its first
+        bytes, once until the vehicle was away."""
         path = path_of(session, log)
         known = self.keeping.manifest.of(self._vehicle, path)
         if known is None or known.size != log.size or not known.proven:
@@ -441,7 +442,7 @@ class VehicleSync(Reports):
     def failed(self, name: str, error: MavftpfsError) -> None:
         """See Reports."""
         if not isinstance(error, StillGrowing | NotFound):
-            self._complain(name, f"{named(name, error)}; it is tried again")
+            self._complain(name, f"{named(name, error)}; the watch tries again")
 
     def says(self, line: str) -> None:
         """See Reports."""
@@ -455,12 +456,12 @@ class VehicleSync(Reports):
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a file is there."""
+    """Return whether the path is a file."""
     return path.is_file()
 
 
 def free_space(directory: Path) -> float:
-    """Return the bytes that are free on a local disk, infinite if it does not tell."""
+    """Return the free bytes of a local disk, infinite if unknown."""
     try:
         facts = os.statvfs(directory)
     except OSError:

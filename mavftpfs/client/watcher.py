@@ -14,18 +14,18 @@ from mavftpfs.shared.speed import Speed
 log = logging.getLogger("mavftpfs.vehicle")
 
 PERIOD = 0.25
-"""Seconds between two looks at the connection: a heartbeat holds until the next, about a second."""
+"""Seconds between two looks at the connection: a heartbeat is valid until the next, about a second."""
 
 
 class Watcher:
-    """Looks at a connection: logs each change that matters to a pilot, and measures the traffic.
+    """Watches a connection: logs each change that matters to a pilot, and measures the traffic.
 
     Attributes:
-        traffic: bytes per second, both ways, over the last seconds; None while too little was seen.
+        traffic: bytes per second, both ways, over the last seconds; None while unknown.
     """
 
     def __init__(self, status: Callable[[], Facts], *, writing: bool) -> None:
-        """`status`: Connection.status; `writing`: the mount is not a read-only one."""
+        """`status`: Connection.status; `writing`: the mount allows changes."""
         self._status = status
         self._writing = writing
         self._seen: tuple[str, int, bool, bool] | None = None

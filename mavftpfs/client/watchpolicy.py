@@ -1,4 +1,4 @@
-"""When the watch downloads the logs of a vehicle. Layer: client; pure.
+"""The policy of the watch: when to download the logs of a vehicle. Layer: client; pure.
 
 A flight ends when the vehicle is disarmed. Then the watch lists the logs, and downloads each that has not
 grown for QUIET. If a log still grows PATIENCE after the end of the flight, the watch downloads it up to its
@@ -15,28 +15,28 @@ from typing import NamedTuple
 QUIET = 10.0
 """Seconds without growth after which a log counts as whole."""
 PATIENCE = 60.0
-"""Seconds after the end of a flight in which a log may grow. ArduPilot logs on for 15 s."""
+"""Seconds after the end of a flight in which a log may grow. ArduPilot logs for 15 s more."""
 REFUSED = 60.0
 """Seconds without a transfer after a vehicle refused to arm: the load of a transfer may be the reason (MAVSDK
 issue 1636)."""
 LOST = 10.0
 """Seconds without a heartbeat after which a vehicle is lost."""
 RETRY, MOST_RETRY = 30.0, 600.0
-"""Seconds until the logs are listed again after a failure: the first time, and at most."""
+"""Seconds until the watch lists the logs again after a failure: the first time, and at most."""
 GROWN, MOST_GROWN = 60.0, 3600.0
-"""Seconds until a log that keeps growing is looked at again: as long as the flight is over, but at least and
-at most so long."""
+"""The least and most seconds until the watch looks again at a log that keeps growing; between them, as long
+as the flight is over."""
 
 
 class Log(NamedTuple):
-    """A log that is not here yet: its path, and its size as listed."""
+    """A missing log: its path, and its size as listed."""
 
     path: bytes
     size: int
 
 
 class _Sighting(NamedTuple):
-    """A log that was listed. since: when its size was listed first."""
+    """A listed log. since: the time when its size was listed first."""
 
     size: int
     since: float
@@ -49,7 +49,7 @@ class Policy:
     before that, it stays due.
 
     Attributes:
-        uid: the vehicle's unique id, as soon as it is told. unchanged: logs without a time whose first bytes
+        uid: the vehicle's unique id, None while unknown. unchanged: logs without a time whose first bytes
             need not be compared again.
     """
 
@@ -69,7 +69,7 @@ class Policy:
     # --- what the watch hears
 
     def heard(self, armed: bool, now: float) -> str:
-        """Take a heartbeat; return what is new: "here", "back", "armed", "disarmed", or ""."""
+        """Take a heartbeat; return the news: "here", "back", "armed", "disarmed", or ""."""
         before, was_lost = self._armed, self._lost
         self._armed, self._heard_at, self._lost = armed, now, False
         if before is armed and not was_lost:
@@ -83,16 +83,16 @@ class Policy:
         return "here" if before is None else "armed" if armed else "disarmed"
 
     def restarted(self, now: float) -> None:
-        """Note a restart: the vehicle may have other logs, and closed those that grew."""
+        """Note a restart: the vehicle may have other logs, and has closed those that grew."""
         self.unchanged.clear()
         self._flight_ended(now)
 
     def refused(self, now: float) -> None:
-        """Note that the vehicle refused to be armed."""
+        """Note that the vehicle refused to arm."""
         self._paused_until = now + REFUSED
 
     def newly_lost(self, now: float) -> bool:
-        """Return whether the vehicle is lost since the last call."""
+        """Return whether the vehicle was lost since the last call."""
         if self._lost or now - self._heard_at <= LOST:
             return False
         self._lost = True
@@ -106,20 +106,20 @@ class Policy:
         return "lost" if self._lost else "armed" if self._armed else "disarmed"
 
     def may_transfer(self, now: float) -> bool:
-        """Return whether the watch may ask the vehicle for something; if not, it cancels a sync."""
+        """Return whether the watch may send requests to the vehicle; if not, the watch cancels a sync."""
         return not self._lost and self._armed is False and now >= self._paused_until
 
     def due(self, now: float) -> bool:
-        """Return whether the logs are to be synced now."""
+        """Return whether a sync of the logs is due."""
         return self.may_transfer(now) and self._sync_at <= now
 
     def begin(self) -> None:
-        """Note that a sync begins: what happens from now on decides when the next one is due."""
+        """Note that a sync begins: later events decide when the next one is due."""
         self._next_at = inf
 
     def choose(self, logs: Iterable[Log], now: float) -> dict[bytes, bool]:
-        """Take the logs that are listed and not here; return those to download now, and whether they still
-        grow."""
+        """Take the listed logs that are not here; return those to download now, each with whether it still
+        grows."""
         before, self._seen = self._seen, {}
         chosen = {}
         for log in logs:
@@ -139,7 +139,7 @@ class Policy:
         return chosen
 
     def grew(self, path: bytes, now: float) -> None:
-        """Note that a log was not whole when it was downloaded."""
+        """Note that a log was incomplete when it was downloaded."""
         self._seen[path] = _Sighting(-1, now)
         self._look_again(path, now)
 
@@ -149,11 +149,11 @@ class Policy:
         self._failures = min(self._failures + 1, 10)
 
     def local_trouble(self, now: float) -> None:
-        """Note that the local disk takes nothing now."""
+        """Note that the local disk refuses data now."""
         self._next_at = min(self._next_at, now + RETRY)
 
     def arrived(self) -> None:
-        """Note that a log is here."""
+        """Note that a log was downloaded."""
         self._failures = 0
 
     def synced(self) -> None:
@@ -170,7 +170,7 @@ class Policy:
         self._growing.clear()
 
     def _look_again(self, path: bytes, now: float) -> None:
-        """Have the logs listed when this one may have become quiet."""
+        """Plan a listing for the time when this log may have stopped growing."""
         if path in self._growing:
             again = now + min(max(now - self._ended_at, GROWN), MOST_GROWN)
         else:

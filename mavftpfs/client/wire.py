@@ -1,12 +1,12 @@
-"""How commands and a mount's process speak about files: messages as bytes. Layer: client; pure.
+"""The messages about files between commands and a mount's process, as bytes. Layer: client; pure.
 
 A connection to the control socket begins with one line of JSON each way (client.control). The client's line
 asks for `files`. From then on the client sends requests, and the mount's process answers each of them, in
 order, with one reply. Both are messages: two lengths, a JSON object of the first length, and bytes of the
 second length.
 
-A connection has at most one open file. A request that arrives while the one before is being answered cancels
-that one. When a connection ends, what was written to its file and not released is taken back.
+A connection has at most one open file. A request that arrives while the process answers the previous one
+cancels that one. When a connection ends, the process discards the changes that were written and not released.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from mavftpfs.shared.errors import ListingIncomplete, MavftpfsError, RemoteProto
 from mavftpfs.shared.model import EntryKind
 
 VERSION = 1
-"""Of this protocol. Commands and mounts of different versions refuse each other; `status` and `umount`, which
-are lines of their own, stay as they are."""
+"""The version of this protocol. Commands and mounts of different versions refuse each other; `status` and
+`umount` are lines of their own, which never change."""
 
 BLOCK = 128 * 1024
 """Bytes of a file in one message."""
 MAX_REPLY = 64 << 20
-"""Bytes of a reply: a directory may be large."""
+"""Bytes of a reply, large enough for a large directory."""
 _MAX_FACTS = 64 * 1024
 _LENGTHS = struct.Struct(">II")
 
@@ -45,7 +45,7 @@ class Message(NamedTuple):
 class Messages:
     """Takes the bytes of a connection, and gives out messages.
 
-    most: bytes that `facts` or `data` of a message may have.
+    most: the largest number of bytes in `facts` or `data` of a message.
     """
 
     def __init__(self, *, most: int) -> None:
@@ -57,10 +57,10 @@ class Messages:
         self._received += data
 
     def next(self) -> Message | None:
-        """Return the next message, None if more bytes have to arrive first.
+        """Return the next message, None if more bytes must arrive first.
 
         Raises:
-            RemoteProtocolError: these bytes are no message.
+            RemoteProtocolError: these bytes are not a message.
         """
         start = _LENGTHS.size
         if len(self._received) < start:
@@ -78,12 +78,12 @@ class Messages:
 
 
 def requests() -> Messages:
-    """Return what takes a client's bytes."""
+    """Return a parser of a client's bytes."""
     return Messages(most=max(BLOCK, _MAX_FACTS))
 
 
 def replies() -> Messages:
-    """Return what takes the bytes of a mount's process."""
+    """Return a parser of the bytes from a mount's process."""
     return Messages(most=MAX_REPLY)
 
 
@@ -104,7 +104,7 @@ def encoded(facts: Facts, data: bytes | memoryview = b"") -> bytes:
 
 
 def text(path: bytes) -> str:
-    """Return a path as JSON can hold it."""
+    """Return a path in a form that JSON can carry."""
     return path.decode("utf-8", "surrogateescape")
 
 
@@ -112,10 +112,10 @@ def path(told: object) -> bytes:
     """Return a path that was sent as text.
 
     Raises:
-        RemoteProtocolError: it is no text.
+        RemoteProtocolError: the value is not text.
     """
     if not isinstance(told, str):
-        raise RemoteProtocolError("a path that is no text")
+        raise RemoteProtocolError("a path that is not text")
     return told.encode("utf-8", "surrogateescape")
 
 
@@ -123,7 +123,7 @@ def path(told: object) -> bytes:
 
 
 def told_stat(stat: Stat) -> list[Any]:
-    """Return attributes as JSON can hold them."""
+    """Return attributes in a form that JSON can carry."""
     return [stat.kind.value, stat.size, stat.mtime_ns, stat.valid_for]
 
 
@@ -153,7 +153,7 @@ _KINDS = {
 
 
 def told_error(error: MavftpfsError) -> Message:
-    """Return the reply that tells an error: its class, its text and its attributes."""
+    """Return the reply for an error: its class, its text and its attributes."""
     kind = next(kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS)
     known = {name: value for name, value in vars(error).items() if isinstance(value, int | str | None)}
     entries = told_entries(error.entries) if isinstance(error, ListingIncomplete) else b""

@@ -102,8 +102,8 @@ def test_since_says_first_that_a_vehicle_tells_no_times(field: Field, tmp_path: 
     write_log(vehicle.root / "APM/LOGS/00000001.BIN", 60_000, 1, 1)
     (vehicle.root / "APM/LOGS/LASTLOG.TXT").write_text("1")
     warning = (
-        "mavftpfs: --since does not leave out 1 of 2 logs (60.0 kB), because the vehicle tells no time for "
-        "them; use --newest N to fetch fewer\n"
+        "mavftpfs: --since does not leave out 1 of 2 logs (60.0 kB), because the vehicle reports no time for "
+        "them; use --newest N to download fewer\n"
     )
     words = ("sync", vehicle.source, tmp_path / "logs", "--since", "2h")
     out, err = run(*words, "--dry-run")
@@ -310,7 +310,7 @@ def test_a_growing_log_is_seen_through_a_mount(field: Field, tmp_path: Path) -> 
         finally:
             growing.kill()
     came = readable_size((local / "now.ulg.part").stat().st_size)
-    assert f"now.ulg is still growing: only its first {came} came" in said
+    assert f"now.ulg is still growing: only its first {came} are here" in said
     assert local_files(local) == {"now.ulg.part"}
 
 

@@ -23,7 +23,7 @@ from tests.support.vehicles import Process, SimVehicle
 MAVFTPFS = (sys.executable, "-m", "mavftpfs")
 QUICK = ("op_deadline=6",)
 RECOVERED = re.compile(
-    r"did not reach the vehicle; (?:it is|they are) (?:kept )?in (.+?); put (?:it|them) back by: "
+    r"did not reach the vehicle; (?:it is|they are) (?:kept )?in (.+?); upload (?:it|them) with: "
 )
 
 WRITER = """
@@ -147,7 +147,7 @@ def test_arming_in_mid_copy_refuses_and_puts_no_part_on_the_card(field: Field, s
     assert (
         f"1 file did not reach the vehicle, because a write failed; it is kept in {copy.parent}" in said_last
     )
-    assert "; list it by: mavftpfs recover\n" in said_last
+    assert "; list it with: mavftpfs recover\n" in said_last
     assert "the part that was written before" in command("recover")[0]
 
 

@@ -47,7 +47,7 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     place = os.fsdecode(directory)
     assert line == (
         f"2 files did not reach the vehicle; they are kept in {place}; "
-        f"put them back by: mavftpfs recover udpin:0.0.0.0:14550 {place}"
+        f"upload them with: mavftpfs recover udpin:0.0.0.0:14550 {place}"
     )
     assert Path(place).parent == state / "mavftpfs" / "recovered"
     assert place.endswith("-udpin_0.0.0.0_14550")
@@ -94,8 +94,8 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
 @pytest.mark.parametrize(
     ("facts", "told"),
     [
-        ('{"path": "/f", "whole": true}', "put it back by: mavftpfs recover tcp:x:1 "),
-        ('{"path": "/f", "whole": true, "broken": true}', "list it by: mavftpfs recover"),
+        ('{"path": "/f", "whole": true}', "upload it with: mavftpfs recover tcp:x:1 "),
+        ('{"path": "/f", "whole": true, "broken": true}', "list it with: mavftpfs recover"),
     ],
 )
 def test_a_part_is_listed_because_recover_does_not_put_it_back(state: Path, facts: str, told: str) -> None:

@@ -372,7 +372,7 @@ async def test_what_could_not_be_handed_on_is_tried_at_the_next_start(day: Day) 
     day.put("1.ulg", content(5000))
     day.problem = "--exec ended with exit code 1"
     async with day.watched():
-        await day.until("tried again at the next start")
+        await day.until("tries again at its next start")
         await trio.sleep(600.0)
     assert day.handed == ["1.ulg"]
     day.problem = ""
@@ -453,7 +453,7 @@ async def test_a_disk_that_is_pulled_in_mid_transfer(tmp_path: Path) -> None:
                 await day.until("begins")
                 await trio.sleep(3.0)
                 run("umount", "-l", place)
-                await day.until("is not there any more; waiting for it")
+                await day.until("does not exist; waiting for it")
                 await trio.sleep(600.0)
                 assert list(place.iterdir()) == []
                 run("mount", "--bind", disk, place)

@@ -115,7 +115,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("get", SOURCE, "/a*", "--to", "-", "--include", "*.ulg"), "leave out --include"),
         (("sim", "/proc/none/a b"), "mkdir -p '/proc/none/a b/fs/microsd/log'"),
         (("sim", "/proc/none/a", "--profile", "ardupilot"), "mkdir -p /proc/none/a/APM/LOGS"),
-        (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),
+        (("sync", SOURCE, "/tmp", "--since", "soon"), "not a date"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_1(
