@@ -21,6 +21,7 @@ from functools import partial
 import trio
 
 from mavftpfs.cache import reading, uploads
+from mavftpfs.cache.blocks import NEVER
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Event, File, State
 from mavftpfs.cache.reserved import require_writable
@@ -73,14 +74,16 @@ async def for_writing(card: Card, path: bytes, *, truncate: bool) -> File:
             card.maybe_forget(file)
             raise
         return file
-    # If the size is 0 there is nothing to do: so it has to be true, not remembered.
+    # The caller need not empty an empty file, so a size of 0 has to be the vehicle's answer of just now.
     size = entry.size or await card.store.stat_size(path)
     card.require_idle(path)
     file = card.need(path)
-    if not file.is_local:
+    if not file.is_local and (file.base is None or file.base.size != size):
+        # Nothing is proven: if the caller cannot empty the file, the next open asks the vehicle.
         file.base = Known(size)
         file.content.on_opened(size)
-        file.prove(card.clock())
+        file.proven_at = NEVER
+        file.in_kernel = False
     return file
 
 

@@ -14,7 +14,7 @@ import trio
 from mavftpfs.cache import reading
 from mavftpfs.cache.handles import ReadHandle
 from mavftpfs.cache.tree import OpenFile, Tree
-from mavftpfs.shared.errors import FileChanged
+from mavftpfs.shared.errors import Armed, FileChanged
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig
@@ -256,3 +256,29 @@ async def test_turns_of_two_readers_cost_few_listings(profile: str) -> None:
         assert got == [OLD] * 2
         asked = int(str(tree.status()["listings_asked"])) - before
         assert asked <= 2 * ((trio.current_time() - began) / 2.0 + 2)
+
+
+@pytest.mark.parametrize("profile", EVERY)
+@pytest.mark.parametrize("size", [len(OLD), len(OLD) - 1])
+async def test_an_open_for_writing_that_is_refused_proves_nothing_of_the_old_bytes(
+    profile: str, size: int
+) -> None:
+    """The vehicle is armed while the open waits for a listing, after others replaced the file."""
+    async with mounted(profile) as (here, tree):
+        assert await copy(tree) == OLD
+        await trio.sleep(30.0)
+        replace(here, NEW[:size])
+        async with trio.open_nursery() as nursery:
+
+            async def arm() -> None:
+                await trio.sleep(LINK.delay)
+                tree.armed_changed(True)
+
+            nursery.start_soon(arm)
+            with pytest.raises(Armed):
+                await tree.open(PATH, write=True, truncate=True)
+        tree.armed_changed(False)
+        handle = await tree.open(PATH)
+        assert not handle.keep_cache
+        assert await read_on(handle) == NEW[:size]
+        handle.close()
