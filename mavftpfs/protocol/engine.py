@@ -30,6 +30,9 @@ from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
 OP_DEADLINE = 30.0
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
+_SLACK = 0.01
+"""Seconds. Timers end no more precisely, so less does not make a wait shorter than usual."""
+
 _BURST = int(Opcode.BURST_READ_FILE)
 _NAK = int(Opcode.NAK)
 
@@ -364,7 +367,7 @@ class Engine:
             ledger.jump(op.on_burst_sent(first, now))
         else:
             self._due = min(self._due, timer)
-        return encode(requests, unheard=quiet > 2.0 * self._timers.timeout(manner))
+        return encode(requests, waits=(quiet + _SLACK) / self._timers.timeout(manner))
 
     # --- timers
 

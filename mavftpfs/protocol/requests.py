@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import inf
+from math import frexp, inf
 from struct import Struct
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -118,17 +118,20 @@ class Request:
         return reply.opcode == Opcode.NAK
 
 
-def encode(requests: Sequence[Request], *, unheard: bool) -> list[bytes]:
-    """Return the 251 wire bytes of each under its seq; its data must fit. unheard: answers were due for long.
+def encode(requests: Sequence[Request], *, waits: float) -> list[bytes]:
+    """Return the 251 wire bytes of each under its seq; its data must fit. waits: how many usual waits for an
+    answer passed without progress.
 
     After a frame whose length was damaged, a parser takes up to 255 bytes of the next frames for the rest of
-    it. So, where answers are overdue, two of four requests have full length, by a last byte that no server
-    reads. The others pass radios that drop long frames, also where long and short ones alternate.
+    it. Requests therefore have full length, by a last byte that no server reads, from the second to the
+    fourth wait, from the eighth to the sixteenth, and so on. They are short between, because some radios drop
+    long frames.
     """
+    long = waits >= 2.0 and frexp(waits)[1] % 2 == 0
     wires = []
     for r in requests:
         wire = _pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data)
-        if unheard and r.order & 2 and len(r.data) < MAX_DATA - 1:
+        if long and len(r.data) < MAX_DATA - 1:
             wire = wire[:-1] + b"\xff"
         wires.append(wire)
     return wires
