@@ -334,8 +334,10 @@ class ServerSession:
         """
         tried.resent |= nak.retransmitted
         alone = not self.vehicle.another_client_heard(self.clock())
-        doubled = self.in_doubt() and alone and not tried.closed  # a late copy of an older open may have come
-        ours = tried.opens and (nak.retransmitted or doubled)
+        # An earlier try may have opened a file (its refusal may have hidden that), or a late duplicate of an
+        # older open.
+        orphan = (tried.resent or (self.in_doubt() and alone)) and not tried.closed
+        ours = tried.opens and (nak.retransmitted or orphan)
         taken = nak.code in (_OPEN_TAKEN if tried.opens else _TAKEN)
         if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under our id
             taken = ours and self.engine.traits.ack_carries_own_session is not False

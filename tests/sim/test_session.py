@@ -12,7 +12,7 @@ import trio
 
 from mavftpfs.client.connect import _list_root
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.operations import OpenRequest
+from mavftpfs.protocol.operations import OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN
@@ -300,6 +300,18 @@ async def test_an_open_that_plainly_fails_costs_no_silence(may_be_ours: str) -> 
         opens = here.faults.times(Opcode.OPEN_FILE_RO)
         assert opens[-1] - opens[0] < SILENCE_ARDUPILOT
         assert bool(here.count(Opcode.TERMINATE_SESSION)) is bool(may_be_ours)
+
+
+async def test_an_open_whose_answer_was_lost_is_closed_also_where_the_refusal_hides_its_code() -> None:
+    """PX4 keeps no answer that begins with a 5, as that of this size does, and says 8 to all it refuses."""
+    here = Rig("px4", {b"/d/f": b"hello"}, LINK)
+    async with here.connected() as connection:
+        with pytest.raises(FtpNak):
+            await connection.driver.run(Simple(Opcode.CREATE_DIRECTORY, b"/d"))
+        here.faults.lose_reply_to(Opcode.OPEN_FILE_RO)
+        began = trio.current_time()
+        assert await read_file(connection, path("px4", "f")) == b"hello"
+        assert trio.current_time() - began < SILENCE_ARDUPILOT
 
 
 ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
