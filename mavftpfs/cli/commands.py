@@ -241,7 +241,7 @@ class _Delivery:
     def _explain(self, pid: int) -> None:
         self._explained = True
         from mavftpfs.client.undelivered import recovered_directory
-        from mavftpfs.mount.farewell import DRAIN_LIMIT
+        from mavftpfs.mount.drain import DRAIN_LIMIT
 
         say(
             f"uploading pending changes for up to {readable_time(DRAIN_LIMIT)}; files not uploaded by then "

@@ -1,9 +1,9 @@
 """The mount's side of the control socket (client.control has the commands' side). Layer: mount.
 
-Each client sends one line and gets one line, and that ends it; a line that asks for `files` is followed by
-the messages of client.wire, which mount.fileserver answers. The mount needs file descriptors for itself. So
-only MAX_CLIENTS clients are taken at once, and one that asks nothing is ended. Those that use files do not
-count as such, so `status` and `umount` are answered however many there are.
+Each client sends one line and receives one line, which ends the connection. After a line that asks for
+`files` the messages of client.wire follow, which mount.fileserver answers. The mount needs file descriptors
+for itself, so it serves only MAX_CLIENTS clients at once, and disconnects a client that sends nothing.
+Clients that use files do not count, so `status` and `umount` always get an answer.
 """
 
 from __future__ import annotations
@@ -29,26 +29,25 @@ log = logging.getLogger("mavftpfs.control")
 Command = Callable[[Reply], Awaitable[Reply]]
 
 ASKING_PATIENCE = 2.0
-"""Seconds for a client to send its line: a command of ours asks right after it has connected."""
+"""Seconds for a client to send its line; a command sends it right after it has connected."""
 REPLY_PATIENCE = 10.0
-"""Seconds for us to hand it the reply."""
+"""Seconds to send the reply."""
 QUEUE = 128
-"""Clients that wait in the kernel until they are taken."""
+"""Clients that may wait in the kernel's queue."""
 MAX_CLIENTS = 8
-"""Clients that are taken at once for a line; others wait in the kernel's queue."""
+"""Clients that are served at once; others wait in the kernel's queue."""
 LOOK_PERIOD = 2.0
-"""Seconds between two looks whether the socket is still in its place."""
+"""Seconds between two checks whether the socket still exists."""
 _NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 _PAUSE = 0.1
-"""Seconds until a connection is taken after there was no descriptor for it."""
+"""Seconds until the next attempt to accept a connection, after no descriptor was free."""
 _CREDENTIALS = struct.Struct("3i")
 
 
 class ControlServer:
     """Answers requests at a socket path: one `command` after its name, and those for files.
 
-    Attributes: path: where the socket is; it gets another place if its directory is removed, as systemd does
-    at logout.
+    Attributes: path: the socket's path; it changes if its directory is removed, as systemd does at logout.
     """
 
     def __init__(
@@ -60,8 +59,8 @@ class ControlServer:
         refusal: Callable[[int], str] = lambda uid: "",
         mode: int = 0o600,
     ) -> None:
-        """refusal: returns why a user (by number) is not served, or "". mode: of the socket. A command finds
-        the number of the user that asks in its request, as `uid`."""
+        """refusal: returns the reason why a user (by number) is refused, or "". mode: of the socket. A
+        command finds the number of the user in its request, as `uid`."""
         self.path = path
         self.files = files
         self._commands = commands
@@ -75,7 +74,7 @@ class ControlServer:
         self.closed = trio.Event()
 
     async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Serve until `close`, then until the clients at work have their replies.
+        """Serve until `close`, then until the present clients have their replies.
 
         Raises:
             OSError: the socket cannot be bound.
@@ -90,12 +89,12 @@ class ControlServer:
                         tasks.start_soon(self._stay_reachable)
                 self._stop_listening()
         finally:
-            if self._is_in_place():  # while we delivered, the next mount may have put its socket there
+            if self._is_in_place():  # the next mount may have bound its socket there meanwhile
                 self.path.unlink(missing_ok=True)
             self.closed.set()
 
     def close(self) -> None:
-        """Take no more clients."""
+        """Accept no more clients."""
         self._accepting.cancel()
 
     def _bind(self) -> None:
@@ -132,13 +131,13 @@ class ControlServer:
         old.socket.close()
 
     async def _accept(self, nursery: trio.Nursery) -> None:
-        """Take clients until cancelled, as many as there is room for."""
+        """Accept clients until cancelled, as many as there is room for."""
         while True:
             await self._room.acquire()
             nursery.start_soon(self._serve_client, await self._next())
 
     async def _next(self) -> trio.SocketStream:
-        """Return the next connection. The log says once in a mount that there was no descriptor for one."""
+        """Return the next connection. Log once per mount that no descriptor was free for one."""
         while True:
             try:
                 assert self._listener is not None
@@ -155,7 +154,9 @@ class ControlServer:
 
     async def _serve_client(self, stream: trio.SocketStream) -> None:
         try:
-            with suppress(trio.BrokenResourceError, trio.ClosedResourceError):  # it may go away at any time
+            with suppress(
+                trio.BrokenResourceError, trio.ClosedResourceError
+            ):  # the client may leave at any time
                 try:
                     wants_files, process = await self._serve_line(stream)
                 finally:
@@ -166,7 +167,7 @@ class ControlServer:
             await trio.aclose_forcefully(stream)
 
     async def _serve_line(self, stream: trio.SocketStream) -> tuple[bool, int]:
-        """Answer a client's line. Return whether it is to be served files, and its process."""
+        """Answer a client's line. Return whether it gets files, and its process."""
         process, uid, _ = _CREDENTIALS.unpack(
             stream.socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         )
@@ -179,7 +180,7 @@ class ControlServer:
         return wants_files, process
 
     async def _answer(self, line: bytes, uid: int) -> tuple[Reply, bool]:
-        """Return the reply to a line, and whether files are asked for and granted."""
+        """Return the reply to a line, and whether it asks for files and gets them."""
         try:
             request = json.loads(line)
             name = request["command"]
@@ -200,7 +201,7 @@ class ControlServer:
 
 def _bind(path: Path, mode: int) -> trio.SocketListener:
     """Bind and listen; the socket is never visible with wider permissions than `mode`."""
-    path.unlink(missing_ok=True)  # of a mount that was killed; a living one was refused before
+    path.unlink(missing_ok=True)  # left by a mount that was killed; a living one was refused before
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     mask = os.umask(0o777 & ~mode)
     try:
@@ -215,7 +216,7 @@ def _bind(path: Path, mode: int) -> trio.SocketListener:
 
 
 def failure(reason: str) -> Reply:
-    """Return the reply of a command that did not work."""
+    """Return the reply of a failed command."""
     return {"ok": False, "error": reason}
 
 

@@ -23,8 +23,8 @@ from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
-"""Called with (exit code, one line) for the command that waits for a mount: 0 and perhaps a notice once it is
-up, else why it failed. Only the first call counts."""
+"""Called with (exit code, one line) for the command that waits for a mount: 0 and perhaps a notice once the
+mount is up, otherwise the reason of the failure. Only the first call counts."""
 
 SYSLOG_SOCKET = "/dev/log"
 MAX_REPORT = 64 * 1024
@@ -44,7 +44,7 @@ class _Ended(BaseException):
 def in_background(work: Callable[[Report], int]) -> int:
     """Fork; run `work(report)` in the child, and return in the parent what the child reported.
 
-    The child never returns from here. After report(0, ...) it is detached: no terminal, cwd `/`.
+    The child never returns from here. After report(0, ...) the child is detached: no terminal, cwd `/`.
     """
     read_end, write_end = os.pipe()
     sys.stdout.flush()
@@ -95,7 +95,7 @@ class _Reporter:
 
 
 def _detach() -> None:
-    """Let go of the terminal and the working directory."""
+    """Detach from the terminal and the working directory."""
     os.chdir("/")
     null = os.open(os.devnull, os.O_RDWR)
     for fd in (0, 1, 2):
@@ -105,7 +105,7 @@ def _detach() -> None:
 
 
 def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
-    """Return what the child says; `mask`: the signals that were blocked before the fork."""
+    """Return the child's report; `mask`: the signals that were blocked before the fork."""
     try:
         with os.fdopen(read_end, "rb") as pipe, _ending_raises():
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -123,14 +123,14 @@ def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
 
 
 def ending_signals() -> list[signal.Signals]:
-    """Return the signals that end us. A shell that starts us by nohup, or a script by `&`, has us ignore
-    some."""
+    """Return the signals that end this program. A shell's nohup, or `&` in a script, makes it ignore some of
+    them."""
     return [n for n in _ENDING if n == signal.SIGTERM or signal.getsignal(n) != signal.SIG_IGN]
 
 
 @contextmanager
 def _ending_raises() -> Iterator[None]:
-    """Have the signals that end us raise _Ended."""
+    """Have these signals raise _Ended."""
 
     def end(number: int, _frame: object) -> NoReturn:
         raise _Ended(number)
@@ -141,7 +141,7 @@ def _ending_raises() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Delay the signals that end us until after the body: else what it starts would be left behind."""
+    """Delay these signals until after the body, because the processes that it starts would be left behind."""
     came: list[int] = []
     try:
         with _handled_by(lambda number, _: came.append(number)):
@@ -153,7 +153,7 @@ def signals_held() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Give the signals that end us to a handler."""
+    """Send these signals to a handler."""
     before = {number: signal.signal(number, handler) for number in ending_signals()}
     try:
         yield
@@ -171,7 +171,7 @@ def _explain_death(pid: int) -> int:
 
 
 def log_to_stderr(level: int) -> None:
-    """Log to the terminal, for foreground runs; with the time of day where it stands beside a trace (-d)."""
+    """Log to the terminal, for foreground runs; beside a trace (-d) with the time of day."""
     times = "%(asctime)s.%(msecs)03d " if level == logging.DEBUG else ""
     _install(logging.StreamHandler(), f"{times}mavftpfs: %(message)s", level, times="%H:%M:%S")
 
@@ -184,7 +184,7 @@ class _PrivateFile(logging.handlers.RotatingFileHandler):
 
 
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
-    """Log to syslog; if there is none, to a small file that is rotated."""
+    """Log to syslog; without one, to a small file that is rotated."""
     form = f"mavftpfs[{os.getpid()}]: %(levelname)s %(name)s: %(message)s"
     handler: logging.Handler
     if Path(socket).is_socket():  # the handler itself says nothing about a missing one
@@ -197,13 +197,13 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
 
 
 def warn_of_gone(options: Options) -> None:
-    """Log a line about each option of 0.2 that was given and is gone."""
+    """Log a line about each removed option of 0.2 that was given."""
     for line in options.gone:
         logging.getLogger("mavftpfs").warning("%s", line)
 
 
 class _Readable(logging.Formatter):
-    """Shows names as a person reads them; local names may be no valid text."""
+    """Shows names in readable form; local names may be invalid text."""
 
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""

@@ -1,7 +1,7 @@
 """Serves a mount's files to commands and programs by connections of its control socket. Layer: mount.
 
 client.wire has the protocol. A connection has at most one open file and one request at a time, so a client
-that stops reading holds at most a block of memory, and disturbs no other.
+that stops reading costs at most a block of memory, and disturbs no other.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from mavftpfs.shared.model import normalise
 log = logging.getLogger("mavftpfs.control")
 
 MAX_CONNECTIONS = 128
-"""At once: each open file of a program is one."""
+"""The most connections at once; each open file of a program is one."""
 _CANCELLED = wire.told_error(MavftpfsError("cancelled by the next request"))
 _PIECE = 256 * 1024
-"""Bytes that are received at once."""
+"""Bytes to receive at once."""
 
 Call = Callable[[Message], Awaitable[Message]]
 
@@ -45,7 +45,7 @@ class FileServer:
         return sorted({one.process for one in self._serving.values() if one.file is not None})
 
     def refusal(self) -> str:
-        """Return why no connection is served any more, or ""."""
+        """Return the reason why new connections are refused, or ""."""
         if self._closed:
             return "the vehicle is being unmounted"
         if len(self._serving) >= MAX_CONNECTIONS:
@@ -53,7 +53,7 @@ class FileServer:
         return ""
 
     async def serve(self, stream: trio.SocketStream, process: int) -> None:
-        """Answer a client until it goes away. process: its number."""
+        """Answer a client until it leaves. process: its number."""
         if self._closed:  # since it was granted
             return
         connection = _Connection(stream, process, self._files, self._status)
@@ -67,7 +67,7 @@ class FileServer:
                 self._ended.set()
 
     async def close(self) -> None:
-        """End all connections, and wait until what they did not release is taken back."""
+        """End all connections, and wait until their unreleased changes are discarded."""
         self._closed = True
         for scope in self._serving:
             scope.cancel()
@@ -76,13 +76,13 @@ class FileServer:
             await self._ended.wait()
 
     def hurry(self) -> None:
-        """Wait for nothing more: what is not taken back yet is kept as all that is not delivered."""
+        """Stop waiting: changes that are not discarded yet are saved like all undelivered ones."""
         for connection in self._serving.values():
             connection.ending.cancel()
 
 
 class _Connection:
-    """One client. file: what it has open. process: its number. ending: bounds the time of `end`."""
+    """One client. file: its open file. process: its number. ending: bounds the time of `end`."""
 
     def __init__(
         self,
@@ -109,13 +109,13 @@ class _Connection:
         }
 
     async def run(self) -> None:
-        """Answer until the client goes away, or sends what is no message."""
+        """Answer until the client leaves, or sends an invalid message."""
         request = await self._next()
         while request is not None:
             request = await self._answered(request)
 
     async def end(self) -> None:
-        """Close the file; take back what was written to it and not released."""
+        """Close the file, and discard its unreleased changes."""
         file, self.file = self.file, None
         with self.ending:
             self.ending.deadline = trio.current_time() + WITHDRAWAL_TIME
@@ -128,7 +128,7 @@ class _Connection:
                 log.exception("bug in closing a file of process %d", self.process)
 
     async def _answered(self, request: Message) -> Message | None:
-        """Answer a request; return the next one, None if there is none. The next one cancels this one."""
+        """Answer a request; return the next one, None after the last. The next one cancels this one."""
         following: Message | None = None
         async with trio.open_nursery() as nursery:
             with trio.CancelScope() as scope:
@@ -146,7 +146,7 @@ class _Connection:
         return following
 
     async def _next(self) -> Message | None:
-        """Return the next request, None if there is none any more."""
+        """Return the next request, None after the last."""
         try:
             while True:
                 request = self._requests.next()
@@ -157,7 +157,7 @@ class _Connection:
                     return None
                 self._requests.feed(data)
         except RemoteProtocolError as error:
-            log.debug("process %d sent what is no request: %s", self.process, error)
+            log.debug("process %d sent an invalid request: %s", self.process, error)
         except (trio.BrokenResourceError, trio.ClosedResourceError):
             pass
         return None
@@ -226,7 +226,7 @@ class _Connection:
 
     async def _read(self, request: Message) -> Message:
         offset, size = _number(request, "at"), _number(request, "size")
-        # A copy: the client may take its time, and the bytes may be dropped here meanwhile.
+        # A copy, because the client may take its time, and the bytes may be dropped here meanwhile.
         return Message({}, bytes(await self._open_file().read(offset, min(size, wire.BLOCK))))
 
     async def _write(self, request: Message) -> Message:
@@ -265,7 +265,7 @@ class _Connection:
 
 
 def _of_path(call: Callable[[bytes], Awaitable[None]]) -> Call:
-    """Return what answers a request by a call that takes a path and returns nothing."""
+    """Return a handler that calls a function with the request's path and returns nothing."""
 
     async def answer(request: Message) -> Message:
         await call(_path(request))
@@ -286,5 +286,5 @@ def _number(request: Message, name: str) -> int:
     """
     number = request.facts.get(name)
     if not isinstance(number, int) or number < 0:
-        raise LocalProtocolError(f"{name} is no number of bytes")
+        raise LocalProtocolError(f"{name} is not a number of bytes")
     return number

@@ -22,28 +22,28 @@ from mavftpfs.shared.errors import MavftpfsError
 log = logging.getLogger("mavftpfs.fuse")
 
 MARGIN = 3.0
-"""Seconds the tree gets beyond op_deadline to report its own, better error."""
+"""Seconds beyond op_deadline for the tree to report its own, better error."""
 
 CRC_BUDGET = 120.0
-"""Seconds for a checksum: the drone reads the whole file for it (promise 2)."""
+"""Seconds for a checksum, for which the vehicle reads the whole file (promise 2)."""
 
 DELIVERY_BUDGET = 4 * 3600.0
-"""Seconds for calls that move bytes. The tree itself ends them when there is no progress, so this only ends a
+"""Seconds for calls that move bytes. The tree itself ends calls without progress, so this ends only a
 trickle."""
 
 NAMESPACE_BUDGET = 240.0
-"""Seconds for a change of names: it may have to finish a delivery, and to look whether it was done."""
+"""Seconds for a change of names, which may have to finish a delivery, and to check whether it happened."""
 
 _DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
 _NAMING = frozenset({"create", "mknod", "mkdir", "rmdir", "unlink", "rename"})
 
 SLOWEST_RATE = 256
-"""Bytes/s of the slowest link worth waiting for. The tree ends a read without progress by itself; this
-only keeps a read that trickles from lasting for ever."""
+"""Bytes/s of the slowest link worth waiting for. The tree itself ends a read without progress; this ends a
+read that trickles."""
 
 
 class Guarded(Protocol):
-    """Has handlers. op_deadline: seconds without progress after which the tree gives up."""
+    """Has handlers. op_deadline: seconds without progress after which the tree raises an error."""
 
     op_deadline: float
 

@@ -2,12 +2,12 @@
 
 Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
-The kernel knows a file by number, and tells with forget how many of our answers it dropped. A number is a
-hash of the path at the time when it was given out. So it is the same after the kernel forgot it, and in the
-next mount: git's index and incremental backups compare st_ino, and read the file again over a radio if that
-changed. A number that is taken (a hash collision, or a file that was renamed or unlinked
-while the kernel knows it) is stepped over. `generation` is a counter, so that a (number, generation)
-pair never names two files.
+The kernel knows a file by number, and reports with forget how many answers it dropped. A number is a hash of
+the path at the time when it was given out. So the number stays the same after the kernel forgot it, and in
+the next mount, because git's index and incremental backups compare st_ino, and read the file again over a
+radio if that changed. A number in use (by a hash collision, or by a file that was renamed or unlinked while
+the kernel knows it) is skipped. `generation` is a counter, so that a (number, generation) pair never names
+two files.
 
 An inode lives while its lookup count is above zero; the root always does.
 
@@ -34,7 +34,7 @@ from mavftpfs.shared.model import ROOT, EntryKind, rename_keys
 
 @dataclass(frozen=True, slots=True)
 class Presentation:
-    """How entries are shown, and how long requests may take. Modes are permission bits; deadline in
+    """The presentation of entries, and the deadline of requests. Modes are permission bits; deadline in
     seconds."""
 
     uid: int
@@ -100,11 +100,11 @@ class HandleTable(Generic[HandleT]):
         self._handles: dict[int, HandleT] = {}
 
     def __len__(self) -> int:
-        """Return how many are open."""
+        """Return the number of open things."""
         return len(self._handles)
 
     def __iter__(self) -> Iterator[HandleT]:
-        """Yield what is open."""
+        """Yield the open things."""
         return iter(list(self._handles.values()))
 
     def add(self, handle: HandleT) -> int:
@@ -115,11 +115,11 @@ class HandleTable(Generic[HandleT]):
         return number
 
     def get(self, number: int) -> HandleT | None:
-        """Return what is open under a number, or None."""
+        """Return the thing that is open under a number, or None."""
         return self._handles.get(number)
 
     def remove(self, number: int) -> HandleT | None:
-        """Forget a number and return what was open under it, or None."""
+        """Forget a number and return the thing that was open under it, or None."""
         return self._handles.pop(number, None)
 
 
@@ -132,10 +132,10 @@ _INO_MASK = (1 << 63) - 1
 
 @dataclass(slots=True)
 class Inode:
-    """One number the kernel may use.
+    """A number that the kernel may use.
 
-    path: None once the name was removed. told_size: the size in bytes that the kernel last heard, if any.
-    believed_until: when the kernel asks for its attributes again (trio's clock).
+    path: None once the name was removed. told_size: the size in bytes that the kernel last received, if any.
+    believed_until: the time when the kernel asks for its attributes again (trio's clock).
     """
 
     ino: int
@@ -160,10 +160,10 @@ class InodeTable:
         self._by_path: dict[bytes, Inode] = {ROOT: root}
         self._absent: dict[tuple[int, bytes], float] = {}
         self.excess_forgets = 0
-        """Forgets beyond the count. They are a bug here or in the kernel, but no crash."""
+        """Forgets beyond the count. They are a bug here or in the kernel, but harmless."""
 
     def __len__(self) -> int:
-        """Return how many inodes are alive, the root included."""
+        """Return the number of inodes that exist, the root included."""
         return len(self._by_ino)
 
     def get(self, ino: int) -> Inode | None:
@@ -171,12 +171,12 @@ class InodeTable:
         return self._by_ino.get(ino)
 
     def known(self, path: bytes) -> int | None:
-        """Return the number the kernel knows this path by, or None."""
+        """Return the number by which the kernel knows this path, or None."""
         inode = self._by_path.get(path)
         return None if inode is None else inode.ino
 
     def reserve(self, path: bytes) -> Inode:
-        """Return the path's inode, made if need be, without counting a lookup."""
+        """Return the path's inode, made if necessary, without counting a lookup."""
         inode = self._by_path.get(path)
         if inode is None:
             self._generation += 1
@@ -186,11 +186,11 @@ class InodeTable:
         return inode
 
     def count(self, inode: Inode) -> None:
-        """Count one answer that told the kernel about this inode."""
+        """Count one answer that named this inode to the kernel."""
         inode.lookups += 1
 
     def discard(self, inode: Inode) -> None:
-        """Drop a reserved inode of which the kernel was not told."""
+        """Drop a reserved inode that no answer named to the kernel."""
         if inode.lookups == 0:
             self._free(inode)
 
@@ -201,7 +201,7 @@ class InodeTable:
         return inode
 
     def forget(self, ino: int, lookups: int) -> None:
-        """Take back `lookups` answers; at zero the inode is freed. Never raises, because forget has no
+        """Subtract `lookups` answers; at zero the inode is freed. Never raises, because forget has no
         reply."""
         inode = self._by_ino.get(ino)
         if inode is None:
@@ -214,8 +214,8 @@ class InodeTable:
             self._free(inode)
 
     def absent(self, parent: int, name: bytes, valid_for: float, now: float) -> float:
-        """Note that a name is absent, and return for how long the kernel may believe it: not at all if there
-        are too many to note."""
+        """Note that a name is absent, and return for how long the kernel may believe it; 0 if there are too
+        many to note."""
         if len(self._absent) >= MAX_ABSENT:
             self._absent = {known: until for known, until in self._absent.items() if until > now}
         if len(self._absent) >= MAX_ABSENT:
@@ -224,19 +224,19 @@ class InodeTable:
         return valid_for
 
     def believed(self, now: float) -> tuple[list[int], list[tuple[int, bytes]]]:
-        """Return what the kernel answers by itself now: inodes with attributes, and absent names with their
+        """Return what the kernel now answers by itself: inodes with attributes, and absent names with their
         directory's inode."""
         inodes = [ino for ino, inode in self._by_ino.items() if inode.believed_until > now]
         return inodes, [known for known, until in self._absent.items() if until > now]
 
     def unlink(self, path: bytes) -> None:
-        """The name is gone; the kernel may still hold the inode (an open file)."""
+        """Note that the name is gone; the kernel may still have the inode (an open file)."""
         inode = self._by_path.pop(path, None)
         if inode is not None:
             inode.path = None
 
     def rename(self, old: bytes, new: bytes) -> None:
-        """Move a name and everything below it; what was at `new` becomes nameless."""
+        """Move a name and everything below it; the file at `new` becomes nameless."""
         if old == new:
             return
         self.unlink(new)
@@ -291,7 +291,7 @@ class UserAttributes:
     changed_ns: int | None = None
 
     def show(self, entry: Any, found: Stat) -> None:
-        """Put what was set into `entry` (pyfuse3.EntryAttributes); found: what the tree says."""
+        """Put the set attributes into `entry` (pyfuse3.EntryAttributes); found: the tree's own."""
         if self.mode is not None:
             entry.st_mode = stat_bits.S_IFMT(entry.st_mode) | self.mode
         if self.uid is not None:
@@ -318,11 +318,11 @@ class UserAttributeTable:
         self._kept: OrderedDict[bytes, UserAttributes] = OrderedDict()
 
     def get(self, path: bytes) -> UserAttributes | None:
-        """Return what was set on a path, or None."""
+        """Return the attributes set on a path, or None."""
         return self._kept.get(path)
 
     def at(self, path: bytes) -> UserAttributes:
-        """Return what was set on a path, to be changed."""
+        """Return the attributes set on a path, for changing them."""
         kept = self._kept.get(path)
         if kept is None:
             kept = self._kept[path] = UserAttributes()
@@ -332,15 +332,16 @@ class UserAttributeTable:
         return kept
 
     def entries_changed(self, directory: bytes, now_ns: int) -> None:
-        """An entry was made, removed or renamed in a directory: a time that was set holds no longer."""
+        """Note that an entry was made, removed or renamed in a directory, so that a set time is no longer
+        valid."""
         kept = self.at(directory)
         kept.mtime_ns, kept.changed_ns = None, now_ns
 
     def drop(self, path: bytes) -> None:
-        """Forget a path, because it is gone."""
+        """Forget a path, because the file is gone."""
         self._kept.pop(path, None)
 
     def move(self, old: bytes, new: bytes) -> None:
-        """The path, and everything below it, has another name."""
+        """Note that the path, and everything below it, has another name."""
         self.drop(new)
         rename_keys(self._kept, old, new)

@@ -17,14 +17,15 @@ from mavftpfs.shared.model import split
 log = logging.getLogger("mavftpfs.mount")
 
 MAX_DROPS = 16
-"""Files of which the kernel is told at once to drop its pages; each takes a thread."""
+"""The most files whose pages the kernel drops at once; each takes a thread."""
 
 
 class Invalidator:
-    """Tells the kernel, by its calls `notify(ino, attr_only)` and `notify_name(parent ino, name)`.
+    """Tells the kernel to drop cached data, by its calls `notify(ino, attr_only)` and `notify_name(parent
+    ino, name)`.
 
-    These run in a worker thread. In them the kernel waits for pages that are being read and for names that
-    are being looked up, and the event loop has to answer those.
+    The calls run in a worker thread, because in them the kernel waits for reads and look-ups in progress,
+    which the event loop must answer.
     """
 
     def __init__(
@@ -50,7 +51,8 @@ class Invalidator:
         return bool(self._calls)
 
     def end(self) -> None:
-        """Tell nothing any more: the kernel's mount is about to go, and commands still end their files."""
+        """Make no further calls, because the kernel's mount is about to end while commands still close their
+        files."""
         self._ended = True
 
     def on_changed(self, path: bytes) -> None:
@@ -71,8 +73,8 @@ class Invalidator:
                     nursery.start_soon(self._drop, ino)
 
     async def _drop(self, ino: int) -> None:
-        """Make the kernel drop a file's pages and attributes. Other files do not wait for it, since one of
-        its pages may be read from a lost vehicle just now."""
+        """Make the kernel drop a file's pages and attributes. Other files do not wait for this, because one
+        of the pages may be in a read from a lost vehicle."""
         async with self._drops:
             await self._tell(ino, attr_only=False)
 
@@ -94,13 +96,13 @@ class Invalidator:
         )
 
     async def forget_file(self, path: bytes) -> None:
-        """Make the kernel drop all that it knows of a path, its name too; return when it has dropped it."""
+        """Make the kernel drop everything about a path, its name too; return when it has done so."""
         await self.forget_pages(path)
         await self.forget_name(path)
 
     async def forget_beliefs(self) -> None:
-        """Make the kernel ask again for all that it would answer by itself; return when it has forgotten
-        it."""
+        """Make the kernel ask again for everything that it would answer by itself; return when it has dropped
+        that."""
         inodes, absent = self._inodes.believed(trio.current_time())
         calls = [partial(self._notify, ino, True) for ino in inodes]
         await self._in_thread(calls + [partial(self._notify_name, *name) for name in absent])

@@ -1,6 +1,7 @@
 """The kernel's side of a mount: mount, answer its requests, unmount. Layer: mount.
 
-While mounted, nothing in the event loop may make a system call on the mountpoint: it would wait for itself.
+While mounted, no code in the event loop may make a system call on the mountpoint, because it would wait for
+itself.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ log = logging.getLogger("mavftpfs.mount")
 
 MIN_TASKS = 10
 MAX_TASKS = 2000
-"""Requests under way at once. With pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
+"""The most requests at once. With pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
 
 
 GRACE = 2.0
-"""Seconds that requests under way get to finish once no new ones are taken. A read may wait for a lost
-vehicle as long as op_deadline."""
+"""Seconds for running requests to finish once no new ones are taken. A read may wait for a lost vehicle as
+long as op_deadline."""
 
 
 class FuseLoop:
@@ -40,7 +41,8 @@ class FuseLoop:
         self._scope = trio.CancelScope()
 
     async def run(self) -> None:
-        """Answer until the kernel's mount is gone, or `stop`; then the requests under way may end."""
+        """Answer until the kernel's mount is gone, or `stop` is called; then let the running requests
+        finish."""
         try:
             with self._scope, never_blocking(on_gone=self.stop):
                 await pyfuse3.main(min_tasks=MIN_TASKS, max_tasks=MAX_TASKS)
@@ -67,7 +69,7 @@ def kernel_mount(
     words: options for FUSE. busy: returns whether a thread is inside a call of the library.
 
     Raises:
-        MountFailed: with what libfuse or fusermount3 said.
+        MountFailed: the text is libfuse's or fusermount3's.
     """
     with stderr_of() as said:
         try:
@@ -87,7 +89,7 @@ def kernel_mount(
 
 
 def presentation(options: Options) -> Presentation:
-    """Return how entries look for these options, with this process's user and umask for what is not given."""
+    """Return the presentation for these options, with this process's user and umask as defaults."""
     umask = os.umask(0o022)
     os.umask(umask)
     return Presentation(
@@ -106,13 +108,13 @@ def presentation(options: Options) -> Presentation:
 def never_blocking(on_gone: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Have pyfuse3.main read /dev/fuse without blocking for the length of the body.
 
-    It waits until there is a request, and then reads it with a call that blocks, in the event loop's thread.
-    In between the request may be gone: the kernel takes it back when its caller is killed. Then everything
-    would stand still, the link included, until the next request. So the descriptor is made non-blocking, it
-    is checked once more right before each read, and a worker that found nothing starts again. (It loses its
-    buffer then: 1 MiB of addresses, of which little was touched.)
+    pyfuse3 waits until there is a request, and then reads it with a call that blocks, in the event loop's
+    thread. In between the request may vanish, because the kernel withdraws it when its caller is killed. Then
+    the whole program would stop, the link included, until the next request. So the descriptor is made
+    non-blocking and checked once more right before each read, and a worker without a request starts again.
+    (The worker then loses its buffer: 1 MiB of addresses, of which little was touched.)
 
-    The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`.
+    The seam is the one that pyfuse3's own asyncio support uses: its variable for the module `trio`.
     """
     setattr(pyfuse3, "trio", _Trio(on_gone))  # noqa: B010 (which its types do not tell)
     try:
@@ -137,14 +139,14 @@ class _LowLevel(_Delegate):
         self._on_gone = on_gone
 
     async def wait_readable(self, fd: int) -> None:
-        """Wait until a read finds something, as far as that can be known."""
+        """Wait until a read finds a request, as far as that can be known."""
         os.set_blocking(fd, False)
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         await trio.lowlevel.wait_readable(fd)
         while not (found := poll.poll(0)):
             await trio.lowlevel.wait_readable(fd)
-        if any(events & select.POLLERR for _, events in found):  # Linux: the mount has no kernel any more
+        if any(events & select.POLLERR for _, events in found):  # on Linux: the kernel's mount is gone
             self._on_gone()
 
 
@@ -161,7 +163,7 @@ class _Trio(_Delegate):
 
 
 class _Workers:
-    """Starts workers that outlive a read which found nothing."""
+    """Starts workers that survive a read without a request."""
 
     def __init__(self, nursery: trio.Nursery) -> None:
         self._nursery = nursery

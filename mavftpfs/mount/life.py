@@ -1,9 +1,9 @@
 """The life of a mount: its state, the signals, and the programs that wait for its end. Layer: mount.
 
-What ends a mount in which state is a table of docs/processes.md. The first SIGINT, SIGTERM or SIGHUP makes it
-leave, the next one makes it hurry.
+docs/processes.md has a table of the events that end a mount in each state. The first SIGINT, SIGTERM or
+SIGHUP makes the mount leave, the next one makes it hurry.
 
-What leaving is, is said by the two kinds of mount: `mount.single` and `mount.supervisor`.
+The two kinds of mount, `mount.single` and `mount.supervisor`, define how to leave.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from mavftpfs.shared.options import Options
 log = logging.getLogger("mavftpfs.mount")
 
 LAST_REPLIES = 3.0
-"""Seconds to hand the programs that wait for the end their reply."""
+"""Seconds to send their reply to the programs that wait for the end."""
 
 
 class State(Enum):
@@ -49,9 +49,9 @@ class State(Enum):
     MOUNTED = "mounted"
     """Programs get answers."""
     LEAVING = "leaving"
-    """Programs get no answers any more. What they wrote is delivered, or kept."""
+    """Programs get no more answers. The mount uploads pending changes, or saves them."""
     ENDED = "ended"
-    """The exit code is known; the programs that waited for it are told."""
+    """The exit code is known; the programs that waited for it get their reply."""
 
 
 NEXT = {
@@ -94,32 +94,33 @@ class Life(ABC):
 
     @abstractmethod
     async def serve(self, nursery: trio.Nursery) -> None:
-        """Mount, serve until the mount has left. nursery: for what runs until the mount has ended."""
+        """Mount, and serve until the mount has left. nursery: for tasks that run until the mount has
+        ended."""
 
     @abstractmethod
     async def unmount(self, *, lazy: bool) -> None:
-        """Unmount, and leave; lazy: also if it is in use.
+        """Unmount, and leave; lazy: even if programs use the mount.
 
         Raises:
-            MountFailed: it is in use, and goes on.
+            MountFailed: programs use the mount, which continues.
         """
 
     @abstractmethod
     def leave(self) -> None:
-        """Leave, also if it is in use."""
+        """Leave, even if programs use the mount."""
 
     @abstractmethod
     def hurry(self) -> None:
-        """Deliver nothing more: keep what is left."""
+        """Upload no more: save the remaining pending changes."""
 
     @abstractmethod
     def status(self) -> Mapping[str, Any]:
-        """Return facts beside those that every mount has; JSON-able."""
+        """Return the facts beside those of every mount; JSON-able."""
 
     # -- from start to end
 
     async def run(self) -> int:
-        """Live; returns the exit code."""
+        """Live; return the exit code."""
         async with trio.open_nursery() as nursery:
             await nursery.start(self._watch_signals)
             try:
@@ -139,7 +140,7 @@ class Life(ABC):
         return self._code
 
     def enter(self, state: State) -> None:
-        """Be in another state from now on."""
+        """Enter another state."""
         assert state in NEXT[self.state], (self.state, state)
         self.state = state
 
@@ -148,7 +149,7 @@ class Life(ABC):
         self._scope.cancel()
 
     def tell_mounted(self, notice: str) -> None:
-        """Tell the command that waits for the mount that it is up; notice: what its user should know."""
+        """Tell the command that waits for the mount that it is up; notice: a line for its user."""
         if notice:
             log.warning("%s", notice)
         report, self._report = self._report, None
@@ -161,7 +162,7 @@ class Life(ABC):
         self._last_words += [words] if words else []
 
     def _fail(self, code: ExitCode, reason: str) -> None:
-        """Tell the command that waits for the mount; once that has its answer, the log."""
+        """Report a failure to the command that waits for the mount; once that has its answer, to the log."""
         self.note_end(code, "")
         if self._report is not None:
             self._report(code, reason)
@@ -184,7 +185,7 @@ class Life(ABC):
                         self.hurry()
 
     async def start_control(self, nursery: trio.Nursery, files: FileServer | None = None) -> None:
-        """Answer `mavftpfs status`, `umount`, and commands and programs that use files."""
+        """Answer `mavftpfs status` and `umount`, and serve files to commands and programs."""
         path = self.request.control
         if path is None:
             return
@@ -205,7 +206,7 @@ class Life(ABC):
             self._control = server
 
     def _refusal(self, uid: int) -> str:
-        """Return why a user may not use the mount by commands, or ""."""
+        """Return the reason why a user may not use the mount by commands, or ""."""
         served = uid in (0, os.getuid(), self.request.options.uid)
         return "" if served else FOREIGN
 
@@ -230,8 +231,8 @@ class Life(ABC):
         return {"exit_code": int(self._code), "pid": os.getpid(), "message": "; ".join(self._last_words)}
 
     def identity(self) -> dict[str, Any]:
-        """Return what any program that may look at the mount is told of it, JSON-able: which mount this is,
-        and where it can be asked."""
+        """Return the facts for any program that may look at the mount, JSON-able: the mount's identity and
+        its control socket."""
         if self._control is not None:
             self._control.be_reachable()
         return {

@@ -1,4 +1,4 @@
-"""Which vehicles a mount of all of them has, and in which state each is. Layer: mount; pure.
+"""The vehicles of a mount of all of them, and their states. Layer: mount; pure.
 
 A vehicle is known by its system id.
 """
@@ -13,12 +13,12 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Heartbeat
 from mavftpfs.shared.errors import ExitCode
 
 HEARD_LATELY = 10.0
-"""Seconds after its last heartbeat in which a vehicle's mount is worth starting."""
+"""Seconds after its last heartbeat for which starting a vehicle's mount is worthwhile."""
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
-"""Seconds before a mount that failed is started again; doubled each time."""
+"""Seconds before a failed mount is started again; doubled each time."""
 MOST = 64
-"""Vehicles of one mount. A limit, because any program can send heartbeats with any id."""
+"""The most vehicles of one mount, because any program can send heartbeats with any id."""
 
 
 class MemberState(Enum):
@@ -43,7 +43,7 @@ NEXT = {
 
 @dataclass(slots=True)
 class Member:
-    """A vehicle. problem: why its mount failed, or "". due_at: when its mount is started again."""
+    """A vehicle. problem: why its mount failed, or "". due_at: the time when its mount is started again."""
 
     system: int
     state: MemberState = MemberState.HEARD
@@ -94,7 +94,7 @@ class Members:
         return len(self._members)
 
     def hear(self, heartbeat: Heartbeat, now: float) -> None:
-        """Note a heartbeat. One of an autopilot makes its vehicle known, unless there are too many."""
+        """Note a heartbeat. An autopilot's heartbeat makes its vehicle known, unless there are too many."""
         system = heartbeat.source.system
         is_new = system not in self._members and heartbeat.autopilot != MAV_AUTOPILOT_INVALID
         if system and is_new and len(self._members) < MOST:
@@ -103,7 +103,7 @@ class Members:
             self._members[system].heard_at = now
 
     def due(self, now: float) -> list[Member]:
-        """Return those whose mount is to be started now."""
+        """Return the vehicles whose mount is due now."""
         return [
             member
             for member in self

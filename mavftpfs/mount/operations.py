@@ -1,13 +1,13 @@
 """pyfuse3's handlers: translate, delegate to the tree, map errors. Layer: mount.
 
-Inodes are touched only between awaits: reserve, reply and count form one atomic step. What has no handler
-here is ENOSYS for the kernel, which knows what to make of it: an fsync of a directory succeeds, and no
-extended attribute can be set.
+Inodes are touched only between awaits: reserve, reply and count form one atomic step. A call without a
+handler here is ENOSYS for the kernel, which handles that: an fsync of a directory succeeds, and no extended
+attribute can be set.
 
-flush is called for every closed descriptor, also of programs that wrote nothing. So it asks the handle, and a
-handle for reading has nothing to deliver. A program asks for fsync, and means the file: any handle will do
-(`sync FILE` opens for reading). release cannot report errors; undelivered bytes stay with the tree. A mount
-with `ro` is refused changes by the kernel, and by the tree.
+The kernel calls flush for every closed descriptor, even of programs that wrote nothing. So flush asks the
+handle, and a handle for reading has nothing to deliver. A program asks for fsync, and means the file, so any
+handle will do (`sync FILE` opens for reading). release cannot report errors; pending changes stay with the
+tree. With `ro` both the kernel and the tree refuse changes.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ _ANY_DIRECTORY = Stat(EntryKind.DIRECTORY, 0, 0, 0.0)
 BLOCK_SIZE = 4096
 STAT_BLOCK = 512
 UNKNOWN_SPACE = 1000 << 30
-"""Bytes shown as total and free where the vehicle did not say: programs refuse to copy into 0 free bytes."""
+"""Bytes shown as total and free if the vehicle reports none, because programs refuse to copy into 0 free
+bytes."""
 
 Refresh = Callable[[int], Awaitable[None]]
 """Makes the kernel forget an inode's attributes (not its pages)."""
@@ -85,8 +86,8 @@ class Operations(pyfuse3.Operations):
         told: Callable[[], dict[str, Any]] = dict,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`told()`: what the attribute of the mount tells, JSON-able. `now_ns()`: the time of day,
-        nanoseconds since 1970 UTC."""
+        """`told()`: the value of the mount's attribute, JSON-able. `now_ns()`: the time of day, nanoseconds
+        since 1970 UTC."""
         super().__init__()
         self._tree = tree
         self.op_deadline = presentation.op_deadline
@@ -101,7 +102,7 @@ class Operations(pyfuse3.Operations):
         self.directories: HandleTable[DirectoryHandle] = HandleTable()
 
     def counts(self) -> dict[str, int]:
-        """Return how many inodes and handles the kernel has; excess forgets are a bug, here or there."""
+        """Return the kernel's numbers of inodes and handles; excess forgets are a bug, here or there."""
         return {
             "inodes": len(self.inodes),
             "open_files": len(self.files),
@@ -113,17 +114,17 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def lookup(self, parent_inode: int, name: bytes, ctx: RequestContext) -> EntryAttributes:
-        """Find a name; one that is not there is cached by the kernel too (st_ino 0)."""
+        """Find a name; the kernel caches its absence, too (st_ino 0)."""
         path = self._child(parent_inode, name)
         try:
             found = await self._tree.stat(path)
         except NotFound:
             return self._negative(parent_inode, name, path)
-        # The parent may have got another path meanwhile.
+        # The parent may have another path by now.
         return self._attributes(self.inodes.lookup(self._child(parent_inode, name)), found)
 
     async def forget(self, inode_list: Sequence[tuple[int, int]]) -> None:
-        """Take back lookup counts. Must not raise."""
+        """Subtract lookup counts. Must not raise."""
         for ino, lookups in inode_list:
             self.inodes.forget(ino, lookups)
 
@@ -131,7 +132,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def opendir(self, inode: int, ctx: RequestContext) -> int:
-        """Open a directory, if it is still there; it is listed by the first readdir."""
+        """Open a directory, if it still exists; the first readdir lists it."""
         if (await self._tree.stat(self._path(inode))).kind is not EntryKind.DIRECTORY:
             raise FUSEError(errno.ENOTDIR)
         return self.directories.add(DirectoryHandle(inode))
@@ -140,9 +141,9 @@ class Operations(pyfuse3.Operations):
     async def readdir(self, fh: int, start_id: int, token: pyfuse3.ReaddirToken) -> None:
         """Reply with entries and attributes, as many as the kernel takes.
 
-        Offsets count in a snapshot, so a change of the directory in the meantime neither skips nor
-        repeats a name; rewinding takes a new one. If a directory could not be listed to its end, the known
-        part is shown, and then the program gets an error: `rsync --delete` believes what it sees.
+        Offsets count in a snapshot, so a change of the directory in the meantime neither skips nor repeats a
+        name; rewinding takes a new one. If a directory could not be listed to its end, the program gets the
+        known part, and then an error, because `rsync --delete` believes what it sees.
         """
         handle = self._directory(fh)
         if start_id == 0:
@@ -188,7 +189,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def open(self, inode: int, flags: int, ctx: RequestContext) -> FileInfo:
-        """Open a file; O_TRUNC comes in the flags and no setattr follows it."""
+        """Open a file; O_TRUNC is in the flags, and no setattr follows."""
         truncate, append = bool(flags & os.O_TRUNC), bool(flags & os.O_APPEND)
         writing = truncate or flags & os.O_ACCMODE != os.O_RDONLY
         known = self._inode(inode)
@@ -230,7 +231,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def read(self, fh: int, off: int, size: int) -> bytes | memoryview:  # type: ignore[override]
-        """Read; fewer bytes than asked only at the end of the opened size.
+        """Read; fewer bytes than requested only at the end of the opened size.
 
         A short reply in mid-file would look like the end: `cp` would exit 0 with half a file.
         """
@@ -253,7 +254,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def write(self, fh: int, off: int, buf: bytes) -> int:
-        """Take bytes, and keep them until it is proven that the card has them."""
+        """Take bytes, and keep them until the card is proven to have them."""
         handle = self._file(fh)
         file = handle.file
         if not file.writable:
@@ -262,18 +263,20 @@ class Operations(pyfuse3.Operations):
         told, stop = known.told_size or 0, off + len(buf)
         known.told_size = max(told, stop)  # the kernel counts on without asking
         if handle.flags & os.O_APPEND and not is_mapped_page(off, stop, told):
-            off = file.size  # the size that the kernel knows may be older than ours
+            off = file.size  # the kernel's size may be older than the tree's
         return await file.write(off, buf)
 
     @handler
     async def flush(self, fh: int) -> None:
-        """A descriptor was closed: 0 means that everything written is on the card, checked.
+        """Deliver the file, because a descriptor was closed. 0 means that everything written is on the card,
+        verified.
 
-        But a file that was only emptied, or made, is delivered by fsync or release.
+        Exception: fsync or release delivers a file that was only emptied, or made.
 
-        The program that closed a descriptor for reading may have been interrupted. The kernel's reads for it
-        would hold the handle open, and go on for minutes on a slow link, so they end. That is no error for
-        another program that shares the handle: the kernel asks again, page by page. It is done only once.
+        A program that closes a descriptor for reading may have been interrupted. The kernel's reads for it
+        would keep the handle open, and last for minutes on a slow link, so flush ends them. For another
+        program that shares the handle this is no error: the kernel asks again, page by page. flush ends them
+        only once.
         """
         handle = self._file(fh)
         if handle.file.writable:
@@ -284,14 +287,16 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:
-        """0 means that everything written is on the card, checked, whichever handle wrote it. The kernel also
-        calls fsync after each write to a file with O_SYNC, and the write returns its error."""
+        """Deliver the file: 0 means that everything written is on the card, verified, whichever handle wrote
+        it. The kernel also calls fsync after each write to a file with O_SYNC, and the write returns its
+        error."""
         handle = self._file(fh)
         await handle.file.fsync(ends_write=bool(handle.flags & os.O_DSYNC))
 
     @handler
     async def release(self, fh: int) -> None:
-        """The last descriptor was closed. No program gets errors any more, but the tree keeps the bytes."""
+        """Close the handle, because its last descriptor was closed. Errors reach no program, but the tree
+        keeps the bytes."""
         handle = self.files.remove(fh)
         if handle is None:
             return
@@ -304,7 +309,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
-        """Return attributes by number, also of a file that has no name any more."""
+        """Return attributes by number, even of a file whose name was removed."""
         return await self._attributes_of(inode)
 
     @handler
@@ -348,7 +353,7 @@ class Operations(pyfuse3.Operations):
     async def mknod(
         self, parent_inode: int, name: bytes, mode: int, rdev: int, ctx: RequestContext
     ) -> EntryAttributes:
-        """Make an empty regular file; there are no devices on a card."""
+        """Make an empty regular file; a card has no devices."""
         if not stat_bits.S_ISREG(mode):
             raise FUSEError(errno.EPERM)
         path = self._child(parent_inode, name)
@@ -406,7 +411,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def statfs(self, ctx: RequestContext) -> StatvfsData:
-        """Return the space the vehicle told of, else constants; never a round trip."""
+        """Return the vehicle's reported space, otherwise constants; never a round trip."""
         space = self._space() or Space(UNKNOWN_SPACE, UNKNOWN_SPACE)
         data = StatvfsData()
         data.f_bsize = data.f_frsize = BLOCK_SIZE
@@ -417,7 +422,7 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def getxattr(self, inode: int, name: bytes, ctx: RequestContext) -> bytes:
-        """Return a file's checksum, or which mount this is; unknown names never touch the link."""
+        """Return a file's checksum, or the mount's identity; unknown names never touch the link."""
         path = self._path(inode)
         if name == XATTR_STATUS:  # of any directory: a part of the mount may be mounted elsewhere, too
             return json.dumps(self._told(), default=str).encode()
@@ -429,14 +434,14 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def listxattr(self, inode: int, ctx: RequestContext) -> list[bytes]:
-        """List the root's attribute only: if checksums were listed, `cp -a` would ask for that of every
-        log."""
+        """List the root's attribute only, because `cp -a` would ask for the checksum of every log if
+        checksums were listed."""
         return [XATTR_STATUS] if inode == ROOT_INO else []
 
     # -- what changed, through the kernel or not --------------------------------------------------
 
     def note_entry(self, path: bytes) -> None:
-        """Note that a name came or went; the kernel asks for its directory's attributes again by itself."""
+        """Note that a name was made or removed; the kernel asks for its directory's attributes by itself."""
         self._set_by_users.entries_changed(split(path)[0], self._now_ns())
 
     def note_gone(self, path: bytes) -> None:
@@ -455,8 +460,8 @@ class Operations(pyfuse3.Operations):
     # -- helpers ----------------------------------------------------------------------------------
 
     def _lose_name(self, inode: Inode) -> None:
-        """Take the path from an inode if a file is open under it that lost the name: others replaced it, or a
-        write of it failed. The path gets another inode, because the kernel has one page cache for each."""
+        """Take the path from an inode if an open file lost the name: another client replaced the file, or a
+        write failed. The path gets another inode, because the kernel has one page cache for each."""
         for handle in self.files:
             if handle.ino == inode.ino and inode.path is not None and not handle.file.has_name:
                 self.inodes.unlink(inode.path)

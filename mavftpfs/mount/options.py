@@ -1,9 +1,9 @@
-"""The words of `-o`: options, and words for others than mavftpfs. Layer: mount; pure.
+"""The words of `-o`: options, and words for the kernel, mount(8) and systemd. Layer: mount; pure.
 
 `-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
-Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,
-and any other word that is not in the table is an error that names it. The commands without a mount take the
-same words, so that a line of /etc/fstab can be given to them.
+Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored, and any
+other unknown word is an error that names it. The commands without a mount take the same words, so that they
+accept a line of /etc/fstab.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NO_MEANING = {
     ),
     *("lazytime", "nolazytime", "nodirsync"),
 }
-"""VFS words that change nothing: most are for access times, which no vehicle keeps. libfuse knows only some
+"""VFS words that change nothing: most are about access times, which no vehicle keeps. libfuse knows only some
 of them, and fewer with each version (3.15 refuses `atime`)."""
 
 _FOR_OTHERS = {
@@ -68,9 +68,9 @@ def parse_options(texts: Iterable[str]) -> Options:
 
 
 def permissions(options: Options, full: int, own_mask: int | None, default_umask: int) -> int:
-    """Return the permission bits of files, or of directories: those of `full` that no mask takes away.
+    """Return the permission bits of files, or of directories: those of `full` without those of a mask.
 
-    own_mask: the mask of that kind, which comes before umask=. A read-only mount has no write bits.
+    own_mask: the mask of that kind, which takes precedence over umask=. A read-only mount has no write bits.
     """
     masks = (own_mask, options.umask, default_umask)
     bits = full & ~next(mask for mask in masks if mask is not None)
@@ -78,7 +78,7 @@ def permissions(options: Options, full: int, own_mask: int | None, default_umask
 
 
 def fuse_words(options: Options, source: str) -> set[str]:
-    """Return the options that go to FUSE's init."""
+    """Return the options for FUSE's init."""
     words = {f"fsname={_escape(source)}", f"subtype={SUBTYPE}", _ALWAYS_ON, *options.kernel_words}
     words.add("ro" if options.read_only else "rw")
     if options.allow_other:
@@ -87,7 +87,7 @@ def fuse_words(options: Options, source: str) -> set[str]:
 
 
 def option_help() -> dict[str, str]:
-    """Return each option as it is written -> what it does, with its default."""
+    """Return each option's spelling -> its help, with its default."""
     return {", ".join(row.names): f"{row.help} (default: {row.default})" for row in TABLE.rows}
 
 
@@ -120,7 +120,7 @@ def _refusal(name: str, word: str) -> str:
 
 
 def _replace_word(word: str, words: list[str]) -> None:
-    """Keep one of a word and its opposite: libfuse would apply both in the order of a set."""
+    """Keep one of a word and its opposite, because libfuse would apply both in the order of a set."""
     opposite = {"sync": "async", "async": "sync"}.get(
         word, word[2:] if word.startswith("no") else "no" + word
     )
@@ -131,6 +131,6 @@ def _replace_word(word: str, words: list[str]) -> None:
 
 
 def _escape(name: str) -> str:
-    """Make a name fit for one ASCII option of a comma-separated list."""
+    """Escape a name for one ASCII option of a comma-separated list."""
     ascii_name = name.encode("ascii", "backslashreplace").decode("ascii").replace("\n", " ")
     return ascii_name.replace("\\", "\\\\").replace(",", "\\,")

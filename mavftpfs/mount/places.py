@@ -2,8 +2,8 @@
 
 The mountpoint of `-o all` is a plain directory of this computer. A vehicle's directory in it has mode 0300:
 nobody but root can list it. So `ls` and `rsync --delete` get "Permission denied" while the vehicle is not
-mounted, and never an empty directory. It stays until the supervisor ends. The mount of a process that was
-killed stays, too, and answers with ENOTCONN, until the next mount of that vehicle is ready.
+mounted, and never an empty directory. The directory stays until the supervisor ends. The mount of a process
+that was killed stays, too, and answers with ENOTCONN, until the next mount of that vehicle is ready.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def check(place: str) -> None:
 
 
 def make(place: str, name: str) -> None:
-    """Make a vehicle's directory, if it is not there.
+    """Make a vehicle's directory, if it does not exist.
 
     Raises:
-        MountFailed: it cannot be made.
+        MountFailed: the directory cannot be made.
     """
     path = os.path.join(place, name)
     try:
@@ -55,7 +55,7 @@ def remove(place: str) -> None:
     for name in os.listdir(place):
         path = os.path.join(place, name)
         if path not in mounts() and _is_vehicles(path):
-            with suppress(OSError):  # somebody put something into it
+            with suppress(OSError):  # somebody put a file into it
                 os.rmdir(path)
 
 

@@ -1,4 +1,4 @@
-"""Which program a request of the kernel is from. Layer: mount."""
+"""The program behind a request of the kernel. Layer: mount."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _GROUP, _STARTED = b"Tgid:", 19
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A process, told from all others, also from a later process with its number, by its start time."""
+    """A process, identified by its start time, because a later process may have its number."""
 
     number: int
     started: int
@@ -22,7 +22,7 @@ class Process:
 
 
 def program_of(thread: int) -> Process | None:
-    """Return a thread's process; None if it cannot be seen here (another container's)."""
+    """Return a thread's process; None if it is invisible here (another container's)."""
     folder = Path(f"/proc/{thread}")
     try:
         lines = (folder / "status").read_bytes().splitlines()

@@ -1,7 +1,7 @@
 """The mount of one vehicle: composition root. Layer: mount.
 
-Order matters. The vehicle must have answered before the kernel mount appears. At the end the kernel mount
-goes first; then what programs wrote is delivered, or kept; then the server's session is closed.
+Order matters. The kernel mount appears only after the vehicle has answered. At the end the kernel mount goes
+first; then pending changes are uploaded, or saved; then the server's session is closed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
 from mavftpfs.client.mounts import also_mounted
 from mavftpfs.mount.daemon import Report
-from mavftpfs.mount.farewell import say_goodbye
+from mavftpfs.mount.drain import drain_or_keep
 from mavftpfs.mount.fileserver import FileServer
 from mavftpfs.mount.handles import InodeTable
 from mavftpfs.mount.invalidator import Invalidator
@@ -32,14 +32,14 @@ from mavftpfs.mount.toldfiles import ToldFiles
 from mavftpfs.shared.errors import ExitCode, MountFailed
 
 ASKING_TIME = 2.0
-"""Seconds for other mounts to tell which vehicle they have."""
+"""Seconds for other mounts to report their vehicle."""
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
 """Connects to the vehicle. Its argument is called for paths whose bytes changed."""
 
 
 def run_mount(request: MountRequest, report: Report) -> int:
-    """Mount and serve until unmounted; returns the exit code."""
+    """Mount and serve until unmounted; return the exit code."""
 
     def attach(invalidate: Callable[[bytes], None]) -> AbstractAsyncContextManager[Attached]:
         return attached(
@@ -69,7 +69,7 @@ class SingleMount(Life):
         """See Life.serve."""
         inodes = InodeTable()
         invalidator = Invalidator(inodes)
-        async with self._attach(invalidator.on_changed) as vehicle, self._goodbye(vehicle.tree):
+        async with self._attach(invalidator.on_changed) as vehicle, self._drained(vehicle.tree):
             self._attached = vehicle
             nursery.start_soon(vehicle.watcher.run)
             operations = Operations(
@@ -95,7 +95,7 @@ class SingleMount(Life):
                     invalidator.end()
 
     async def _notes(self, vehicle: Attached) -> list[str]:
-        """Return what a user should know of this computer's kernel and mounts."""
+        """Return the notes for the user about this computer's kernel and mounts."""
         notes = [timeout_note()]
         ask = partial(also_mounted, self.request.spec, vehicle.status()["vehicle"])
         with trio.move_on_after(ASKING_TIME):  # a mount may have been stopped
@@ -103,8 +103,8 @@ class SingleMount(Life):
         return notes
 
     @asynccontextmanager
-    async def _goodbye(self, tree: Tree) -> AsyncIterator[None]:
-        """Deliver or keep what was written in the body, once the kernel mount is gone."""
+    async def _drained(self, tree: Tree) -> AsyncIterator[None]:
+        """Upload the changes of the body, or save them, once the kernel mount is gone."""
         try:
             yield
         finally:
@@ -113,14 +113,16 @@ class SingleMount(Life):
                     await self._files.close()
             finally:
                 if self.state is not State.STARTING:
-                    await say_goodbye(tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED))
+                    await drain_or_keep(
+                        tree, self.request.source, partial(self.note_end, ExitCode.UNDELIVERED)
+                    )
 
     async def _answer(self, invalidator: Invalidator, notice: Callable[[], str]) -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(invalidator.run)
             gc.collect()
-            gc.freeze()  # else a full collection would go through all imported modules during a transfer
-            # Move old files only now. If mounting failed afterwards, nobody would hear where they are.
+            gc.freeze()  # otherwise a full collection would go through all imported modules during a transfer
+            # Move old files only now, because after a failed mount nobody would read where they are.
             self.tell_mounted(notice())
             await self._loop.run()
             self.leave()
@@ -154,7 +156,7 @@ class SingleMount(Life):
         self.stop()
 
     def identity(self) -> dict[str, Any]:
-        """See Life.identity; also of which vehicle."""
+        """See Life.identity; with the vehicle."""
         vehicle = self._status().get("vehicle", {})
         return {
             **super().identity(),
@@ -172,5 +174,5 @@ class SingleMount(Life):
 
 
 def _together(*lines: str) -> str:
-    """Return what a user should know in one line."""
+    """Return several notes as one line."""
     return "; ".join(filter(None, lines))

@@ -1,8 +1,8 @@
 """A mount of all vehicles on a link: one ordinary mount for each, in a process of its own. Layer: mount.
 
 This process has no vehicle, and no mount. It hears heartbeats through the hub, and starts, watches and ends
-the mounts of the vehicles, each on a directory below the mountpoint (`mount.places`). If it is killed they go
-on.
+the mounts of the vehicles, each on a directory below the mountpoint (`mount.places`). If this process is
+killed, the mounts continue.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ log = logging.getLogger("mavftpfs.mount")
 
 PERIOD = 0.1
 END_PATIENCE = 3600.0
-"""Seconds for a vehicle's mount to deliver and end."""
+"""Seconds for a vehicle's mount to upload pending changes and end."""
 
 Command = Callable[[Member], list[str]]
 """Returns the words that mount one vehicle below the mountpoint, in the foreground."""
 
 
 def run_all(request: MountRequest, command: Command, report: Report) -> int:
-    """Mount all vehicles and serve until unmounted; returns the exit code."""
+    """Mount all vehicles and serve until unmounted; return the exit code."""
     return trio.run(Supervisor(request, command, report).run)
 
 
 class Supervisor(Life):
-    """The mount of all vehicles. To leave is to have all of theirs deliver and end."""
+    """The mount of all vehicles. To leave, it has every vehicle's mount upload its changes and end."""
 
     def __init__(self, request: MountRequest, command: Command, report: Report) -> None:
         super().__init__(request, report)
@@ -89,7 +89,7 @@ class Supervisor(Life):
         self._members.hear(heartbeat, trio.current_time())
 
     async def _keep_members(self, nursery: trio.Nursery) -> None:
-        """Start a mount for each vehicle that is heard and has none."""
+        """Start a mount for each heard vehicle without one."""
         while True:
             if self.state is State.MOUNTED:
                 for member in self._members.due(trio.current_time()):
@@ -102,7 +102,7 @@ class Supervisor(Life):
         place = self._place(member)
         try:
             await trio.to_thread.run_sync(places.make, self.request.mountpoint, member.name)
-            # In a session of its own: Ctrl-C reaches only us, and we end it in order.
+            # In a session of its own: Ctrl-C reaches only this process, which ends the mount in order.
             process = await trio.lowlevel.open_process(
                 self._command(member),
                 stdin=subprocess.DEVNULL,
@@ -170,8 +170,8 @@ class Supervisor(Life):
         self._left.set()
 
     async def _end_members(self, *, lazy: bool) -> dict[str, str]:
-        """Have all vehicles' mounts deliver and end, at the same time; return for each name why it did not,
-        or "". If lazy, all do."""
+        """Have all vehicles' mounts upload their changes and end, at the same time; return for each name the
+        reason why it did not, or "". If lazy, all do."""
         outcomes = {member.name: "" for member in self._members if member.name in self._processes}
         async with trio.open_nursery() as nursery:
             for member in self._members:
@@ -190,7 +190,7 @@ class Supervisor(Life):
             if not lazy and not isinstance(exc, control.NobodyThere):
                 outcomes[member.name] = str(exc)
                 return
-            process.send_signal(signal.SIGTERM)  # it is still starting, or cannot unmount
+            process.send_signal(signal.SIGTERM)  # the mount is still starting, or cannot unmount
         else:
             self.note_end(reply["exit_code"], reply["message"])
         await process.wait()
@@ -205,12 +205,12 @@ class Supervisor(Life):
 
 
 def _is_up(place: str) -> bool:
-    """Return whether a vehicle is mounted there; a killed mount may still be in its place."""
+    """Return whether a vehicle is mounted there; a killed mount may still be at that place."""
     return is_ours(place) and not is_dead(place)
 
 
 async def _collect(process: trio.Process, said: list[str]) -> None:
-    """Keep the last line that a mount said, and pass all on."""
+    """Keep a mount's last line, and pass all lines on."""
     assert process.stderr is not None
     rest = b""
     async for data in process.stderr:

@@ -1,10 +1,10 @@
 """The files of a mount for commands and programs that use its control socket. Layer: mount.
 
-They change the mount's tree with no kernel in between. So the kernel is told: names at once, because the
-kernel believes for a while that a name is absent; pages and attributes, because it keeps those of the old
-content. The kernel is told after the change, when no lock is held, and an answer waits TELLING_TIME for that
-at most: the kernel itself waits for look-ups and reads that are under way. Programs that watch by inotify
-hear nothing.
+They change the mount's tree without the kernel. So the mount notifies the kernel: of names at once, because
+the kernel believes for a while that a name is absent; of pages and attributes, because the kernel keeps those
+of the old content. The mount notifies after the change, when no lock is held, and an answer waits for that
+TELLING_TIME at most, because the kernel itself waits for look-ups and reads in progress. Programs that watch
+by inotify receive nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mavftpfs.shared.errors import NotSupported
 from mavftpfs.shared.readable import name_text
 
 TELLING_TIME = 1.0
-"""Seconds for the kernel to forget what it knows, before a change is answered."""
+"""Seconds for the kernel to drop its caches, before the answer to a change."""
 
 
 class ToldFiles:
@@ -50,7 +50,7 @@ class ToldFiles:
     async def open(
         self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
     ) -> ToldFile:
-        """See Files. The kernel drops its pages before: to the tree, whoever opens a file has read it."""
+        """See Files. The kernel drops its pages first, because the tree treats every opener as a reader."""
         if write or truncate:
             _require_on_card(path)
         await _told(self._invalidator.forget_pages, path)
@@ -169,7 +169,7 @@ class ToldFile:
                 self._invalidator.on_changed(self._path)
 
     async def _tell(self) -> None:
-        """Return when programs that open the file, or look at it, see what it is now."""
+        """Return when programs that open the file, or look at it, see its present state."""
         if self._file.writable:
             await _told(self._invalidator.forget_file, self._path)
 
@@ -180,7 +180,7 @@ async def _told(tell: Callable[..., Awaitable[None]], *paths: bytes) -> None:
 
 
 def _require_on_card(path: bytes) -> None:
-    """Check that a name is not one that a mount keeps in memory.
+    """Check that a name is not one of those that a mount keeps in memory.
 
     Raises:
         NotSupported.

@@ -127,7 +127,7 @@ async def test_a_session_left_by_a_killed_client_is_got_over(profile: str) -> No
     with trio.CancelScope():
         async with here.connected(seed=3) as connection:
             await begin_to_read(connection, path(profile, "big"), 1000)
-            here.link.cut()  # so that the farewell does not arrive: kill -9
+            here.link.cut()  # so that the last requests do not arrive: kill -9
     here.link.restore()
     async with here.connected(seed=7) as connection:  # which asks for another session id
         assert await read_file(connection, path(profile, "big")) == data

@@ -19,7 +19,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.throttle import UNMEASURED
 from mavftpfs.cache.tree import Tree
-from mavftpfs.mount.farewell import keep_the_rest
+from mavftpfs.mount.drain import keep_the_rest
 from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for

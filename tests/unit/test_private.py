@@ -13,7 +13,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.client.trace import TlogWriter
 from mavftpfs.mount.daemon import log_in_background
-from mavftpfs.mount.farewell import keep_the_rest
+from mavftpfs.mount.drain import keep_the_rest
 from tests.support.rigs import Rig
 from tests.unit.test_daemon import restored_logging
 

@@ -1,4 +1,4 @@
-"""farewell: what is said and kept at the end of a mount, and what an earlier one left."""
+"""The end of a mount: its message and the files that it keeps, and the files of an earlier mount."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import undelivered
 from mavftpfs.link.messages import Address
-from mavftpfs.mount import farewell
+from mavftpfs.mount import drain
 from tests.ops.faketree import FakeTree
 
 
@@ -27,7 +27,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 async def end_of(tree: FakeTree) -> list[str]:
     said: list[str] = []
-    await farewell.say_goodbye(cast(Tree, tree), "udpin:0.0.0.0:14550", said.append)
+    await drain.drain_or_keep(cast(Tree, tree), "udpin:0.0.0.0:14550", said.append)
     return said
 
 

@@ -1,4 +1,4 @@
-"""The end of a mount that was written to: deliver, or keep. Layer: mount."""
+"""The end of a writable mount: upload pending changes, or save them here. Layer: mount."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mavftpfs.shared.readable import count_files
 log = logging.getLogger("mavftpfs.mount")
 
 BREAK_LIMIT = 5.0
-"""Seconds for calls that are under way to let go of the files that they write."""
+"""Seconds for running calls to end their writes."""
 DRAIN_LIMIT = 300.0
-"""Seconds to go on delivering after the kernel mount is gone; a second signal ends it sooner."""
+"""Seconds to upload pending changes after the kernel mount is gone; a second signal ends this sooner."""
 
 
 def keep_the_rest(tree: Tree, directory: Path) -> str:
-    """Move what is still undelivered to a local directory; return the line that says so, or ""."""
+    """Move undelivered files to a local directory; return a line about them, or ""."""
     broken = tree.broken()
     left = [*tree.undelivered(), *broken]
     if not left:
@@ -44,15 +44,15 @@ def keep_the_rest(tree: Tree, directory: Path) -> str:
     )
 
 
-async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> None:
-    """Deliver, or keep what is left; `tell` gets the line that goes with exit code 4. When cancelled,
-    keep."""
+async def drain_or_keep(tree: Tree, source: str, tell: Callable[[str], None]) -> None:
+    """Upload pending changes, and keep the rest here; `tell` gets the line for exit code 4. When cancelled,
+    keep all."""
     try:
         with trio.move_on_after(BREAK_LIMIT, shield=True):
             await tree.break_unfinished()
         waiting = tree.undelivered()
         if waiting:
-            log.warning("delivering %s to the vehicle before ending", count_files(len(waiting)))
+            log.warning("uploading %s to the vehicle before ending", count_files(len(waiting)))
             await tree.drain(DRAIN_LIMIT)
     finally:
         directory = recovery_directory(source)
