@@ -44,10 +44,11 @@ class Background:
         return [file for file in self._card.live if file.undelivered]
 
     async def break_unfinished(self) -> None:
-        """See Tree.break_unfinished. A file that was closed in vain (its error is known) is whole."""
+        """See Tree.break_unfinished. A file that did not change since a close or an fsync of it failed is
+        whole."""
         reason = LinkClosed("the mount was taken away while a program wrote it")
         for file in list(self._card.live):
-            if file.writers and file.undelivered and file.error is None:
+            if file.writers and file.undelivered and file.failed_at != file.changes:
                 async with file.lock:
                     if file.undelivered and file.state is State.DIRTY:
                         await writing.break_off(self._card, file, reason)

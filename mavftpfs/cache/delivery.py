@@ -272,7 +272,7 @@ def on_delivered(card: Card, file: File, sent: Known) -> None:
 
 def _note_failure(card: Card, file: File, error: MavftpfsError) -> None:
     """Remember the error for the next close, and make the bytes survive a loss of power."""
-    known, file.error = file.error, error
+    known, file.error, file.failed_at = file.error, error, file.changes
     level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
     log.log(level, "%r is not delivered: %s", file.path, error)  # once: each close tries again
     writing.persist(card, file)

@@ -110,7 +110,7 @@ class File(Entry):
         proven_at: when the vehicle was last seen to have that, by the caches' clock.
         attempt: the try to send it that is under way.
         unsure: what this mount was placing under the name when it was interrupted.
-        changes: counts the changes of the content.
+        changes: counts the changes of the content. failed_at: that count when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
         handles: how many are open; writers: how many of them may write. changers: the open handles that
             changed the file since the vehicle last had all of it.
@@ -138,6 +138,7 @@ class File(Entry):
         self.changers: set[object] = set()
         self.unsure: Unsure | None = None
         self.changes = 0
+        self.failed_at = -1
         self.verified = ""
         self.delivered_since_open = False
         self.start_after = NEVER

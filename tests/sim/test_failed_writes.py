@@ -214,6 +214,19 @@ async def test_what_a_program_was_writing_when_the_mount_went_away_gets_no_name(
     assert here.files() == {FILE: OLD, FRESH: PART}
 
 
+async def test_what_is_written_after_a_refused_fsync_gets_no_name_when_the_mount_goes_away(here: Rig) -> None:
+    tree = await mount(here)
+    file = await part_of(tree, FILE)
+    here.faults.refuse(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.ENOSPC)
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+    await file.write(len(PART), PART)
+    await tree.break_unfinished()
+    assert await tree.drain(60.0) == []
+    assert tree.broken() == [FILE]
+    assert here.files() == {FILE: OLD}
+
+
 async def test_a_new_file_that_is_too_large_at_once_can_be_written_smaller(here: Rig) -> None:
     tree = await mount(here)
     file = await tree.create(FRESH, exclusive=True)
