@@ -4,9 +4,16 @@
 Otherwise it raises the reason. Bytes that are not delivered stay held, and the next call goes on with them.
 During a delivery no program changes the file (`File.lock`), so the verified bytes are the sent bytes.
 
-There is one way to the card: the whole file is sent to a temporary file, verified there, and renamed into
-place. In doubt it is then compared once more. A card that cannot rename gets the file under its own name. If
-placing a file was interrupted, the vehicle is looked at before anything else is done (`File.unsure`).
+There is one way to the card (`_send`): fetch the bytes of the old file that stay (`writing.make_whole`), send
+the whole file to a temporary file (`uploads.need_attempt`), verify it there, and check that others left the
+name alone (`_compare_and_look`), rename it into place (`_place`). If the ACK of the rename proves too little,
+the file is compared under its name (`_compare_again`). A card that cannot rename gets the file under its own
+name. If placing a file was interrupted (`File.unsure`), the delivery first finds out what has the name
+(`look`).
+
+A delivery that is cancelled or fails keeps its attempt if the error may pass (`uploads.PASSING`), so that the
+next delivery sends only the missing bytes. A placing that began is finished even if the caller is cancelled.
+The comparison after it may be cancelled: then the file stays unsure.
 """
 
 from __future__ import annotations

@@ -273,8 +273,8 @@ class Directories:
         return Found(entry, directory)
 
     async def ask_entry(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
-        """Return what the vehicle has at a path, whatever drafts say. It is listed now, or was listed at most
-        `within` seconds ago; longer where listings take long (LOOK_FACTOR).
+        """Return what the vehicle has at a path, without pending changes. Its directory is listed now, or was
+        listed at most `within` seconds ago; longer where listings take long (LOOK_FACTOR).
 
         Raises:
             As ask, but None where its directory is gone. ListingIncomplete: see Directory.has.
@@ -335,7 +335,7 @@ class Directories:
     # --- listing
 
     async def _list(self, path: bytes, *, until_lost: bool = False) -> Directory:
-        """Check that a path is a directory, list it, and have leftovers in it repaired.
+        """Check that a path is a directory, list it, and have temporary files in it repaired.
 
         until_lost: wait for the listing only until the vehicle is lost. The listing goes on for the next
         caller.

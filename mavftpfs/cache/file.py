@@ -4,14 +4,14 @@ A file has one content, a state, and a base: what the vehicle is known to have u
 handles of a file share them. TRANSITIONS is the table of the states.
 
     CLEAN    the vehicle has the content
-    DIRTY    the vehicle lacks some of it
-    STALE    others replaced the vehicle's file. If this mount had changed the file, it keeps its name here,
-             until it is emptied or removed; otherwise it lost the name
+    DIRTY    the vehicle lacks some of the content: the changes are pending
+    STALE    others replaced the vehicle's file. With pending changes the file keeps its name here until a
+             program empties or removes it, but its deliveries fail; otherwise it lost the name
     BROKEN   a program was told that a write failed, so nothing of the file is ever placed; it lost its name
 
-Two facts beside the state say how an interruption is to be cleared up: `unsure` is what this mount was
-placing under the name when it was interrupted, and a proof is a time: `proven_at` is void if it is older than
-the file's last opening on the vehicle, or than the mount's epoch (`card`).
+Two facts stand beside the state. `unsure`: what this mount was placing under the name when an interruption
+hid the outcome; `looking` finds it out. `proven_at`: when the vehicle last proved that it has the base. That
+proof is void if it is older than the file's last opening on the vehicle, or than the mount's epoch (`card`).
 
 Locks: see `pathlocks`. A file's lock is taken before the path lock.
 """
@@ -48,7 +48,7 @@ class Event(Enum):
     """An event in the life of a file.
 
     CHANGED: a program made it, wrote or truncated it. EMPTIED: a program truncated it to nothing, so the base
-    matters no more. PLACED: the vehicle has all of it under its name, verified. REPLACED: others replaced the
+    does not matter. PLACED: the vehicle has all of it under its name, verified. REPLACED: others replaced the
     vehicle's file, and bytes of that matter. FAILED: a write was answered with an error after others had been
     taken.
     """
@@ -97,7 +97,8 @@ class Attempt:
     begun_at: float
 
     def fits(self, *, in_place: bool) -> bool:
-        """Return whether the bytes that it sent are still right, and the place that they go to."""
+        """Return whether a delivery may continue the attempt: no program changed a byte that was sent, and
+        the card still takes the file at the same place."""
         return not self.sending.overtaken and in_place == self.in_place
 
 
@@ -108,7 +109,7 @@ class File(Entry):
         content: its bytes. state: see State.
         base: what the vehicle is known to have under its name; None if it has nothing there.
         proven_at: when the vehicle was last seen to have that, by the caches' clock.
-        attempt: the try to send it that is under way.
+        attempt: the attempt to send it that is under way.
         unsure: what this mount was placing under the name when it was interrupted.
         changes: counts the changes of the content. failed_at: that count when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
@@ -181,8 +182,8 @@ class File(Entry):
 
     @property
     def lies_in_place(self) -> bool:
-        """Whether the card may have bytes of it under its own name, or an old file that this mount may have
-        emptied (cards that cannot rename)."""
+        """Whether an upload to the file's own name (on a card that cannot rename) may have begun to write:
+        the name may have a part of the new file, or an old file that this mount emptied."""
         if self.unsure is not None and self.unsure.in_place:
             return True
         if self.attempt is None or not self.attempt.in_place:

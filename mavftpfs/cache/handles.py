@@ -181,8 +181,8 @@ class WriteHandle(ReadHandle):
 
     @asynccontextmanager
     async def _changing(self, size: int, *, empties: bool = False) -> AsyncIterator[File]:
-        """Hold the file's lock while the body changes the file. If the body fails, or there is no room for
-        it, the file breaks, if this handle changed it before.
+        """Hold the file's lock while the body changes the file. If the body fails, or the wait for room
+        does, and this handle changed the file before, the file breaks (`_break`).
 
         size: bytes that the file will have at least. empties: the body empties the file: an upload
         that is under way is cancelled, and the change needs no room.

@@ -83,10 +83,10 @@ class OpenFile:
         """
 
     async def release(self) -> None:
-        """Deliver, and close in any case: the last descriptor was closed. Twice is harmless.
+        """Deliver, and close in any case: the last descriptor was closed. A second call is harmless.
 
         Raises:
-            As flush; what could not be delivered stays held.
+            As flush; changes that could not be delivered stay pending.
         """
         self.close()
 
@@ -100,5 +100,5 @@ class OpenFile:
         return True
 
     def close(self) -> None:
-        """Close without delivering; what was not delivered stays held. Twice is harmless."""
+        """Close without delivering; pending changes stay pending. Closing twice is harmless."""
         raise NotImplementedError

@@ -1,15 +1,17 @@
 """Which paths are being changed: the second of three locks. Layer: cache.
 
-In the order in which they are taken:
-1. The *node's lock*, `nodes.Node.lock`. A writer or a delivery of a file has it, and a call that takes its
-   name or content away (`Node.claim`).
-2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
-   Opening or delivering a file holds its path `shared`: beside others that share it, but not during a change
-   of its name: then it would find neither the old file nor the new one.
-3. `versions.BlockCache.reads`, which bounds the memory of reads that wait for bytes. A delivery takes it
-   below both, to fetch what its draft lies over. A reader that has it takes its path `shared`, to open the
-   file. That waits only for a call that holds the path alone, and such a call never reads through the cache.
-A listing may be asked for under any lock: the repair that follows it (`repair`) takes none.
+Tasks take the locks in this order:
+1. The *file's lock*, `file.File.lock`. A writer or a delivery of a file holds it, and so does a call that
+   removes, renames or empties the file (`File.claim`).
+2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone. A
+   call that opens or delivers a file holds its path `shared`: beside others that share it, but not during a
+   change of its name, because the call would then find neither the old file nor the new one.
+3. `blocks.BlockCache.reads`, which bounds the memory of reads that wait for bytes. A delivery that holds both
+   takes it to fetch the bytes of the old file that stay. A read that holds it takes its path `shared`, to
+   open the file. The read waits only for a call that holds the path alone, and such a call never reads
+   through the cache.
+Every task may list a directory, whatever it holds, because the repair that follows a listing (`repair`) takes
+none of these locks.
 
 Two changes concern one another if they name the same path, whatever its case, or one names a directory above
 the other's. All other changes go on side by side, so a change that is not answered does not delay them.

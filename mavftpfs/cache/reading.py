@@ -338,7 +338,8 @@ async def _prove(card: Card, file: File, *, at_end: bool) -> None:
 
 
 def _is_own(file: File) -> bool:
-    """Return whether a delivery is under way, which compares the vehicle's file itself."""
+    """Return whether a file has pending changes and is locked. Then a delivery may be under way, which
+    compares the vehicle's file itself, and may be just replacing it."""
     return file.is_local and file.lock.locked()
 
 
@@ -367,8 +368,11 @@ def on_listed(card: Card, path: bytes, directory: Directory) -> None:
 
 
 def on_replaced(card: Card, file: File) -> None:
-    """Note that another file has the name on the vehicle, or none, unless a delivery is under way. Open
-    handles never read that one. Pending changes that need no byte of the old file go on."""
+    """Note that another file, or none, has the name on the vehicle, unless a delivery may have caused that.
+
+    Open handles get FileChanged, and never read the other file. Exception: pending changes that need no byte
+    of the old file are kept, and the next delivery replaces the other file.
+    """
     if file.has_name and not _is_own(file):
         lose_base(card, file)
 

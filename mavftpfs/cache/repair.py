@@ -1,4 +1,4 @@
-"""What becomes of temporary names that an interruption left on the card. Layer: cache.
+"""Removal or renaming of temporary files that an interruption left on the card. Layer: cache.
 
 Each listing of a directory shows them, and `due_in` says in how many seconds which one is repaired:
 
@@ -13,7 +13,7 @@ What this mount still needs is left alone. An old file that tells no name become
 computer's upload to a FAT card shows a size of 0 until its file is closed, which each upload does at least
 once a minute where the server keeps the content: so 600 s without a change say that nobody uploads.
 
-The mount lists these directories by itself (`Repair.later`), so that no program has to.
+The mount lists these directories by itself (`Repair.list_later`), so that no program has to.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Repair:
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """Repair what a listing shows. Raises no MavftpfsError: the listing is valid even if this fails."""
         if directory is not self._directories.known(path):
-            return  # it began before a change of ours that was interrupted, and proves nothing
+            return  # the listing began before an interrupted change of this mount, and proves nothing
         found = self._see(path, directory)
         waits = [seconds for _, _, seconds in found if seconds > 0.0]
         if waits:
@@ -231,5 +231,5 @@ class Repair:
         except (NotFound, NotADirectory):
             pass
         except MavftpfsError as error:
-            log.info("%r is mended at a later listing: %s", directory, error)
+            log.info("%r is repaired at a later listing: %s", directory, error)
             self.list_later(directory, AGAIN_AFTER)

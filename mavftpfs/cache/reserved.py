@@ -1,14 +1,14 @@
-"""Our own names on the card. Layer: cache; pure.
+"""The names of temporary files on the card. Layer: cache; pure.
 
 A temporary name is `.mavftpfs-OOOOOOOkSSS` or `.mavftpfs-OOOOOOOkSSS-NAME`: OOOOOOO is the token of the mount
 that made it (35 random bits; mounts before version 0.3 have four characters), SSS counts, and the kind k is
-  n  what is sent of a file, perhaps incomplete;
+  n  a file that is being sent, perhaps incomplete;
   o  the old file of NAME, moved aside until the new one has its name.
 It lies beside the file that it belongs to. Only o tells its NAME, if that fits: a rename carries both paths
 in one request of 238 bytes. No temporary name is used twice, so a duplicate of a request that arrives late
 harms none.
 
-`repair` says what becomes of those that an interruption left.
+`repair` removes or renames temporary files that an interruption left.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Where bytes wait that are not proven to be on the vehicle. Layer: cache.
+"""Local files that keep pending changes until the vehicle has them. Layer: cache.
 
-From its first byte a draft has a local file in a 0700 directory, with the same bytes at the same offsets;
-all of them together hold at most `spool_max` bytes. A description beside the file says which file of which
-vehicle it is, as long as the vehicle lacks something of it. `persist` writes down all that is known, with
-fsync. So the next mount of the vehicle finds the file after a kill -9 (`recovery`).
+From its first changed byte on, a file has a local file in a 0700 directory, with the same bytes at the same
+offsets; all of these hold at most `spool_max` bytes. A description beside the local file says which file of
+which vehicle it belongs to, as long as the vehicle lacks something of it. `persist` writes down all that is
+known, with fsync. So the next mount of the vehicle finds the file after a kill -9 (`recovery`).
 
 If the local disk fails, the file whose bytes it had gets the error (SpoolFailed), never the whole mount.
 
@@ -34,7 +34,7 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class Spool:
-    """The budget that all drafts share, in bytes.
+    """The budget that the pending changes of all files share, in bytes.
 
     Attributes:
         held: bytes of all files. full: there was no room for more, and nothing was freed since.
@@ -75,7 +75,7 @@ class Spool:
 
 
 class SpoolContent:
-    """The held bytes of one draft; implements cache.draft.Content.
+    """The local file with the held bytes of one file (`content.Content`).
 
     Attributes:
         name: the file's path on the vehicle, None once no program wants it any more.

@@ -1,9 +1,8 @@
 """Keeps programs from writing more than the link carries. Layer: cache.
 
 A program in close() cannot be killed, so the bytes that a close may wait for are limited: to those of about
-ten seconds at the measured rate, shared by the uploads under way. When a part of a
-file is changed, the whole file is sent again. So a change is refused (EFBIG) if fetching and sending would
-take longer than two minutes.
+ten seconds at the measured rate, shared by the uploads under way. A change of a part is refused (EFBIG) if it
+would take longer than two minutes, because the whole file is fetched and sent again.
 """
 
 from __future__ import annotations
@@ -106,8 +105,8 @@ class Throttle:
         return False
 
     async def while_full(self, file: File, deliver: Callable[[], Awaitable[None]]) -> None:
-        """Have a delivery say what is wrong, if anything is. It is cancelled once bytes move again: what it
-        would give its name is half a file, whose program is writing on.
+        """Run a delivery only for its error. Once bytes move again it is cancelled: the program is still
+        writing, so a completed delivery would place half a file.
 
         Raises:
             What the delivery failed with.

@@ -396,6 +396,6 @@ class Tree:
         reading.on_listed(self._card, remote, directory)
 
     async def _on_swept(self, remote: bytes, directory: Directory) -> None:
-        """A listing is to be given out: leftovers in it are repaired first."""
+        """A listing is to be given out: the temporary files in it are repaired first."""
         if not self._options.read_only:
             await self._card.repair.on_swept(remote, directory)

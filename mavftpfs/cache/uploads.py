@@ -1,8 +1,8 @@
 """Sending files: the attempts that are under way, and what they leave on the card. Layer: cache.
 
 A file is sent as a whole to a temporary file beside it; on a card that cannot rename, under its own name.
-`push` begins that while a program still writes, and bytes that are appended meanwhile join it. `attempt`
-gives the delivery what is under way, or begins anew.
+`push` begins an attempt while a program still writes, and bytes that are appended meanwhile join it.
+`need_attempt` returns to the delivery the attempt that is under way, or begins a new one.
 """
 
 from __future__ import annotations
