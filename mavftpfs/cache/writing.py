@@ -131,8 +131,14 @@ def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None
         NoSpace, SpoolFailed: nothing changed.
     """
     if len(data):
+        was_local = file.is_local
         file.content.spool(card.spool, file.path)
-        file.content.write(offset, data)
+        try:
+            file.content.write(offset, data)
+        except MavftpfsError:
+            if not was_local:  # otherwise later opens would not ask the vehicle
+                file.content.forget()
+            raise
         _on_changed(card, file, offset, Event.CHANGED)
 
 

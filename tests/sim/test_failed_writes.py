@@ -17,7 +17,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, FileTooLarge, MavftpfsError, NotFound, WriteFailed
+from mavftpfs.shared.errors import Armed, FileTooLarge, MavftpfsError, NoSpace, NotFound, WriteFailed
 from tests.support.rigs import KINDS, Rig, card, read_file, rig, write_file
 from tests.support.transfers import content
 
@@ -183,6 +183,25 @@ async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
     await here.disarm()
     await trio.sleep(60.0)
     assert here.data(FRESH) == PART
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
+async def test_a_first_write_that_the_local_disk_refused_leaves_a_file_that_is_read_as_before(
+    profile: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever opens the file later gets the one that others put there since."""
+    async with rig(profile, {FILE: OLD}) as here:
+        tree = await mount(here)
+        assert await read_file(tree, FILE) == OLD
+        file = await tree.open(FILE, write=True)
+        await failing_disk(errno.ENOSPC)(here, monkeypatch)
+        with pytest.raises(NoSpace):
+            await file.write(0, b"new")
+        assert not list(tree.undelivered())
+        here.replace(FILE, OLD[::-1], 1_700_000_000)
+        await trio.sleep(60.0)
+        assert await read_file(tree, FILE) == OLD[::-1]
+        file.close()
 
 
 async def test_a_new_file_of_which_the_first_write_failed_gets_no_name(here: Rig) -> None:
