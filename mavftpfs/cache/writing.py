@@ -298,11 +298,14 @@ def describe(file: File, wall: Callable[[], float]) -> dict[str, object]:
 
 
 def undo(card: Card, file: File) -> None:
-    """Forget what a failed call changed: programs see the vehicle's file again. The caller has the lock."""
-    size = 0 if file.base is None else file.base.size
+    """Forget what a failed call changed: programs see the vehicle's file again. If the call noticed that
+    others replaced that, open handles get FileChanged. The caller has the lock."""
+    size, stale = 0 if file.base is None else file.base.size, file.state is State.STALE
     file.content.forget()
     file.content.on_opened(size)
     file.state, file.error = State.CLEAN, None
     file.changers.clear()
     file.blocks.close_reader()
     card.tell_changed(file.path)
+    if stale:
+        reading.lose_base(card, file)

@@ -17,7 +17,7 @@ from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import Armed, FileChanged
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.rigs import Rig, rig
+from tests.support.rigs import Rig, rig, write_file
 from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("fault replaced file")
@@ -281,4 +281,20 @@ async def test_an_open_for_writing_that_is_refused_proves_nothing_of_the_old_byt
         handle = await tree.open(PATH)
         assert not handle.keep_cache
         assert await read_on(handle) == NEW[:size]
+        handle.close()
+
+
+async def test_a_truncation_by_name_that_notices_another_file_tells_those_who_read_the_old_one() -> None:
+    """A checksum tells it, where listings tell no times."""
+    async with rig("px4") as here:
+        tree = here.mount()
+        await write_file(tree, PATH, OLD)
+        handle = await tree.open(PATH)
+        assert await handle.read(0, STEP) == OLD[:STEP]
+        replace(here)
+        with pytest.raises(FileChanged):
+            await tree.truncate(PATH, STEP)
+        with pytest.raises(FileChanged):
+            await read_on(handle, STEP)
+        assert await copy(tree) == NEW[: len(OLD)]
         handle.close()
