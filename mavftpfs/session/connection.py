@@ -56,8 +56,8 @@ MOST_HEARD = 32
 HEARD_SOON = 1.2
 """Seconds within which a vehicle that is there is heard: it sends one heartbeat a second."""
 TERMINATE_ON_EXIT, WHERE_SILENT = 5.0, 1.0
-"""Seconds to spend at most on closing the server's session when we leave; the second where the vehicle is not
-heard."""
+"""Seconds for closing the server's session at the end of a connection, at most; the second if the vehicle is
+not heard."""
 
 SILENT_ON_EXIT = 2.5
 """Seconds without a heartbeat after which it is not: two of them, or more, did not come."""
@@ -209,7 +209,8 @@ class Connection:
         }
 
     def _link_state(self, now: float) -> str:
-        """Return `fine`, `lossy`, `lost`, or `replaced` where another vehicle answers in place of ours."""
+        """Return `fine`, `lossy`, `lost`, or `replaced` if another vehicle answers in place of the known
+        one."""
         if self.vehicle.identity.standing is Standing.STRANGER:
             return "replaced"
         silent = self.vehicle.heartbeat_at is not None and self.vehicle.silence(now) > SILENCE_LIMIT
@@ -241,7 +242,7 @@ class Connection:
     def _move_away(self) -> None:
         """Take the next component id: another program uses this one, and replies could not be told apart."""
         own = self.vehicle.own
-        # More are more likely our own echo than neighbours.
+        # If even the sixth id is taken, the messages are more likely this connection's echo.
         if own.component - OWN_COMPONENT <= 5:
             self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
 
@@ -262,10 +263,11 @@ class Connection:
     # --- what runs as long as the connection
 
     async def _beat(self) -> None:
-        """Each second: send a heartbeat, tell the window whether there are other clients, note when the
-        vehicle is lost.
+        """Each second, send a heartbeat, tell the flow control whether other clients are heard, and note when
+        the vehicle is lost.
 
-        Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
+        The heartbeats are an onboard controller's, because those of a GCS would feed the GCS-loss failsafe
+        (promise 6).
         """
         driver = self.driver
         while True:

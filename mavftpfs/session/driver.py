@@ -31,17 +31,19 @@ _IGNORED = (
 )
 
 QUIET = 0.5
-"""Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
-for a retransmission, serial ports do not pause inside a frame."""
+"""Seconds of silence after which the driver stops waiting for the rest of a stream's frame. TCP may pause for
+a retransmission; serial ports do not pause inside a frame."""
 
 REFILL_AT = 32
 """Replies after which room in the window is used at once: the server works meanwhile."""
 
 LONGEST_DRAIN = 5.0
-"""Seconds to wait for requests under way before falling silent: a long listing keeps nobody else out."""
+"""Seconds for which a silence waits for running operations to end. After that there is no silence, because no
+new operation can begin meanwhile, and a listing may be long."""
 
 BACKLOG_LIMIT = 16 * 1024
-"""Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
+"""Unsent bytes in the link above which the engine is asked for no more, because an urgent request could not
+overtake them."""
 
 
 PayloadSink = Callable[[float, str, bytes], None]
@@ -119,7 +121,8 @@ class Driver:
             self.kick()
 
     def _on_reopened(self, now: float) -> None:
-        """Begin anew: half a frame is lost, our place on the port may be another, and so may the vehicle."""
+        """Start afresh on a reopened link: half a frame is lost, the hub may have given this connection
+        another seat, and another vehicle may answer."""
         self.framer.reset()
         if self.link.seat is not None:
             self.vehicle.own = self.framer.source = self.link.seat.own
@@ -127,7 +130,7 @@ class Driver:
         self.vehicle.identity.reopened(now)
 
     async def run(self, operation: Operation) -> None:
-        """Carry an operation out; a cancelled caller takes it with it.
+        """Carry out an operation; cancelling the caller cancels the operation.
 
         Raises:
             MavftpfsError: what the operation failed with.
@@ -147,9 +150,11 @@ class Driver:
         on_finished: Callable[[], None],
         on_batch: Callable[[float], None] | None = None,
     ) -> None:
-        """Begin an operation, once nobody wants silence any more; not if it was cancelled by then.
-        `on_finished` is called from the pump when it is done or failed, and `on_batch` until then after each
-        batch of input, with the time."""
+        """Begin an operation as soon as no task keeps a silence, unless the operation is cancelled first.
+
+        on_finished: called when the operation is done or has failed. on_batch: called until then after each
+            batch of input, with the time.
+        """
         self._to_begin.add(operation)
         try:
             while self._silences:
@@ -171,10 +176,10 @@ class Driver:
             self.kick()
 
     async def be_silent(self, seconds: float) -> bool:
-        """Begin nothing, wait until what is under way has ended, and then say nothing for so long.
+        """Let no operation begin, wait until the running ones have ended, then send nothing for `seconds`.
 
         Returns:
-            False: something lasted too long, so there was no silence. It keeps nobody else out any longer.
+            False: an operation did not end within LONGEST_DRAIN, so there was no silence.
         """
         self._silences += 1
         try:
@@ -190,8 +195,8 @@ class Driver:
             self._changed.unpark_all()
 
     def kick(self) -> None:
-        """Send what can go out now, and tell whose operations ended. Call it after anything that may have
-        given the engine work."""
+        """Send the requests that may go out now, and call `on_finished` of operations that ended. Call this
+        after anything that may have given the engine work."""
         now = self._clock()
         self._refill(now)
         for operation in self.engine.take_finished():
@@ -204,7 +209,7 @@ class Driver:
         due = self.engine.next_deadline()
         deadline = inf if due is None else due
         if self.link.backlog >= BACKLOG_LIMIT:
-            # Nobody tells us that the link drained, and before that nothing can go out.
+            # The link does not report that it drained, and before that nothing can go out.
             deadline = now + 0.01
         elif not self._may_send:
             deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
@@ -249,7 +254,7 @@ class Driver:
         self._gathered = []
         self.vehicle.identity.heard(now)
         if self.vehicle.identity.standing is not Standing.TRUSTED:
-            return  # requests are repeated when the vehicle has told its id
+            return  # the requests time out, and go out again when the vehicle has told its id
         if self._on_payload is not None:
             for wire in wires:
                 self._on_payload(now, "reply", wire)
@@ -258,7 +263,7 @@ class Driver:
             self.last_reply_at = now
 
     def _is_from(self, source: Address, sender: NetAddress, now: float) -> bool:
-        """Return whether a message counts that came from a network address; follow the vehicle that moves."""
+        """Return whether a message from this network address counts; follow the vehicle if it moved there."""
         is_vehicle = source == self.vehicle.address
         moves = is_vehicle and source in self._addresses
         if not self._addresses.accepts(source, sender, now):

@@ -1,8 +1,8 @@
 """Did a change of names happen? Layer: session; pure.
 
-A change says what each of its names has afterwards. A listing of the directory tells what each has, and the
-evidence for all names together is the verdict. An incomplete listing shows what is there, and proves no
-absence.
+A change defines the state of each of its names afterwards (`After`). A listing of the directory is evidence
+for each name, and the evidence for all names together is the verdict. An incomplete listing shows which names
+exist, and proves no absence.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ class Outcome(Enum):
     HAPPENED = "happened"
     """The server carried it out."""
     DID_NOT = "did not"
-    """The server did not."""
+    """The server did not carry it out."""
     CONFLICT = "conflict"
-    """They fit neither. Something else has a name, or both names of a rename are there or gone."""
+    """The listings fit neither: another kind of entry has a name, or both names of a rename exist, or
+    none."""
     UNKNOWN = "unknown"
-    """They failed, or are incomplete."""
+    """The listings failed, or are incomplete."""
 
 
 class After(Enum):

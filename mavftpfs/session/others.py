@@ -34,15 +34,15 @@ _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
 
 
 class OtherClients:
-    """Records what was heard of other clients.
+    """Records the requests of other clients, and the answers to them.
 
     Attributes:
-        session: the id that was used last, or closed; None while none was.
+        session: the id that another client used or closed last; None before the first.
         closed_at: when one of them was last heard to close a file.
     """
 
     def __init__(self, rng: random.Random) -> None:
-        """rng: draws for how long we wait after a file was closed."""
+        """rng: draws for how long this connection waits after another client closed its file."""
         self._rng = rng
         self._paused_until = -inf
         self.session: int | None = None
@@ -50,7 +50,7 @@ class OtherClients:
         self._has_file = False
         self._asks = False  # an open of theirs is not answered yet
         self._heard_at = self._answered_at = -inf
-        self._answered_since = inf  # without a gap in which its session may have gone
+        self._answered_since = inf  # since then its answers show no pause that loses a session
 
     def hear(self, payload: bytes, now: float) -> int | None:
         """Take a request of another client, or an answer to one; return the id of the session that it uses.
@@ -88,16 +88,17 @@ class OtherClients:
         self._has_file, self.closed_at = False, now
 
     def on_ours_opened(self) -> None:
-        """Note that a file of ours was opened: in the only session there is, or beside theirs."""
+        """Note that this connection opened a file, so no other client has the session, or there are
+        several."""
         self._has_file = self._asks = False
 
     @property
     def file_open_until(self) -> float:
-        """Until when another client may have a file open."""
+        """The time until which another client may have a file open."""
         return self._heard_at + LEFT_OPEN if self._has_file or self._asks else self._paused_until
 
     def has_session(self, since: float, now: float) -> bool:
-        """Return whether a session was another client's all that time, as its answers show."""
+        """Return whether the answers to another client show that it had a session from `since` until now."""
         return self._answered_since <= since and now - self._answered_at < STAYS_ITS_OWN
 
 

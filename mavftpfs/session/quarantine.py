@@ -1,8 +1,8 @@
-"""How long a name that was changed is not changed again: late duplicates. Layer: session; pure.
+"""The quarantine of a name: for how long a changed name is not changed again. Layer: session; pure.
 
-A duplicate of a request that is executed late does to the name's next file what was meant for the last one: a
-REMOVE removes it, a RENAME takes it away, a CreateFile empties it. Some links deliver a request twice, and
-what this session repeats is on its way twice.
+If the server executes a late duplicate of a request, the request hits the name's next file: REMOVE removes
+it, RENAME moves it away, CreateFile empties it. Some links deliver a request twice, and a request that this
+session repeated is in flight twice.
 """
 
 from __future__ import annotations
@@ -10,28 +10,30 @@ from __future__ import annotations
 from math import inf
 
 LASTS = 600.0
-"""Seconds for which replies stay suspect, and for which a duplicate that came late counts: a second radio or
+"""Seconds for which replies stay suspect, and for which a measured lateness counts, because a second radio or
 another client stays for a while."""
 
 MOST = 10.0
 """Seconds for which a name is in quarantine at most."""
 
 LEAST_IF_REPEATED = 1.0
-"""Seconds for which a name is in quarantine at least after a request that was repeated. The first
-transmission may be held up in a buffer for longer than the repetition's answer took."""
+"""Seconds for which a name is in quarantine at least after a request that was repeated, because a buffer may
+hold up the first transmission for longer than the answer to the repetition took."""
 
 UNKNOWN_LATENESS = 0.5
-"""Seconds by which a duplicate counts as late if its request is not remembered any more."""
+"""Seconds by which a duplicate counts as late if the engine has forgotten its request."""
 
 
 class Quarantine:
-    """Tells for how long a name is not to be changed again. All times are of the session's clock.
+    """Tells for how long each name stays in quarantine. All times are of the session's clock.
 
-    One number is measured: the largest lateness of the last ten minutes, from the first transmission of a
-    request to the answer of a duplicate of it. While there is one, each name that was changed or made is in
-    quarantine for twice that long. So that is at least two round trips. If this session repeated the request,
-    or got no answer, it is twice the time that the answer took, or did not come, and a second at least, on
-    any link.
+    | the change | seconds in quarantine, 10 at most |
+    |---|---|
+    | answered, sent once | none; twice the lateness, if duplicates were seen in the last ten minutes |
+    | repeated, or not answered | the same, and at least 1 and twice the time that was waited |
+
+    The lateness is the largest time, in the last ten minutes, from the first transmission of a request to the
+    answer to a duplicate of it.
 
     Names that differ by case alone count as one, as on many cards.
     """
@@ -43,8 +45,8 @@ class Quarantine:
         self._changed: dict[bytes, tuple[float, float]] = {}
 
     def saw(self, lateness: float | None, now: float) -> None:
-        """Note a duplicate that was answered so many seconds after its request first went out (None: not
-        known)."""
+        """Note the answer to a duplicate. lateness: seconds since its request first went out, None if that is
+        not known."""
         largest = self._lateness if self._is_fresh(now) else 0.0
         self._lateness = max(largest, UNKNOWN_LATENESS if lateness is None else lateness)
         self._seen_at = now
@@ -52,7 +54,8 @@ class Quarantine:
     def on_changed(self, path: bytes, now: float, took: float = 0.0) -> None:
         """Note a request that made, emptied or took away the file of this name, or may have done so.
 
-        took: how many seconds its answer took, or did not come, if the session repeated it; else 0.
+        took: seconds from its first transmission to its answer or time-out, if the session repeated it or
+            got no answer; otherwise 0.
         """
         name, took = path.lower(), min(max(took, LEAST_IF_REPEATED / 2), MOST / 2) if took else 0.0
         since, before = self._changed.pop(name, (now, 0.0))
@@ -61,7 +64,7 @@ class Quarantine:
             del self._changed[next(iter(self._changed))]
 
     def left(self, path: bytes, now: float) -> float:
-        """Return for how many seconds more the name is not to be changed."""
+        """Return the seconds for which the name is still in quarantine."""
         since, took = self._changed.get(path.lower(), (-inf, 0.0))
         lateness = max(took, self._lateness if self._is_fresh(now) else 0.0)
         return max(0.0, since + min(MOST, 2 * lateness) - now)

@@ -21,15 +21,15 @@ _OFTEN = 0.25
 
 
 class FileStream(SessionUser):
-    """Implements cache.remote.Reader. It outlives the server's session on its file: what is wanted and did
-    not come is for the transfer of its next turn.
+    """Implements cache.remote.Reader. A stream outlives the server's session on its file: ranges that did not
+    arrive remain pending for the transfer of its next turn.
 
     expected_size: in bytes, if the file need not be opened to know it.
 
     Attributes:
         size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK came, or with the
             error of the open.
-        closed: the sink is told nothing any more, except that what it got is in doubt.
+        closed: the sink is called no more, except that its bytes are suspect.
     """
 
     def __init__(self, path: bytes, sink: ReadSink, expected_size: int | None, scheduler: Scheduler) -> None:
@@ -62,7 +62,7 @@ class FileStream(SessionUser):
         if self._removed:
             self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
-        if self._transfer is not None:  # which knows what is on its way
+        if self._transfer is not None:  # which knows what is in flight
             self._transfer.want(start, stop, demand)
         else:
             self._wants.add(self._sink.missing(start, stop), demand=demand)
@@ -72,13 +72,14 @@ class FileStream(SessionUser):
         self._server.wake()
 
     def drop(self, *, demand: bool = True) -> None:
-        """Ask for nothing more; demand: False: no readahead. What is on its way still comes."""
+        """Drop all pending ranges; demand: False: only readahead. Requests in flight still bring their
+        bytes."""
         self._wants.drop(demand=demand)
         if self._transfer is None and self._wants.demand.todo.empty and self.opened.ended:
             self.waiting_since = None
 
     def close(self) -> None:
-        """No more wants; what is still wanted, or on its way, is forgotten."""
+        """Close the stream: drop all pending ranges, and cancel the requests in flight."""
         self.closed = True
         self.drop()
         self._changed.unpark_all()
@@ -102,7 +103,7 @@ class FileStream(SessionUser):
         self._sink.on_queued()
 
     def on_removed(self) -> None:
-        """Stop reading: the file lost its name, and the next file of that name is another one."""
+        """Stop reading with an error, because the next file of that name is another one."""
         self._removed = True
         self._fail(FileChanged(f"{self.path!r} was removed or replaced"))
 
@@ -112,7 +113,7 @@ class FileStream(SessionUser):
             self._sink.on_suspect(reason)
 
     def _fail(self, error: MavftpfsError) -> None:
-        """Raise an error in the reads that wait, and forget what they want."""
+        """Raise an error in the reads that wait, and drop their ranges."""
         self.drop()
         self._lost = 0  # the next read has as many turns
         self.waiting_since = None
@@ -124,7 +125,7 @@ class FileStream(SessionUser):
     # --- its task
 
     async def run(self) -> None:
-        """Take turns, as long as it is open and something is wanted."""
+        """Take turns whenever ranges are pending, until the stream is closed."""
         server = self._server
         while not self.closed:
             if self.idle:
@@ -146,12 +147,12 @@ class FileStream(SessionUser):
                 self.waiting_since = server.clock()
 
     async def _open(self, turn: Turn) -> None:
-        """Have the file open. Give the caller that waited for that a moment to ask for its bytes, before
-        another file takes its turn.
+        """Open the file unless it is open. After the first open, wait FIRST_WANT for the first read before
+        another file may have the turn.
 
         Raises:
-            FileChanged: it is smaller than what was opened. A larger one only grew: it is served at its
-                opened size.
+            FileChanged: the file is smaller than at its first open. A larger one only grew, and is served at
+                its first size.
         """
         server, session, first = self._server, self._server.session, not self.opened.ended
         if session is None or not self.goes_on(session):
@@ -175,7 +176,7 @@ class FileStream(SessionUser):
     async def _read(self, turn: Turn) -> None:
         server, session = self._server, self._server.session
         if session is None or self.idle:
-            return  # it was abandoned meanwhile, or nothing is wanted
+            return  # `distrust` left the session meanwhile, or nothing is pending
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
         driver, engine = server.driver, server.engine
@@ -192,7 +193,8 @@ class FileStream(SessionUser):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
                     # burst what the link holds, and the answer finds no room there.
                     transfer.by_requests = engine.serves_others(transfer)
-                # What woke us may be a new want, and with nothing in flight no answer would send for it.
+                # A new range may have woken this task, and with nothing in flight no answer sends a request
+                # for it.
                 driver.kick()
                 await server.sleep(_OFTEN)
                 if server.is_stalled(transfer):
@@ -205,7 +207,7 @@ class FileStream(SessionUser):
             raise transfer.error
 
     def _on_batch(self, now: float) -> None:
-        """Tell the sink, once for each batch of replies, how many bytes came."""
+        """Report to the sink, once for each batch of replies, how many bytes arrived."""
         transfer = self._transfer
         if transfer is None:
             return

@@ -3,14 +3,14 @@
     async with scheduler.turn(user) as turn:
         session = await turn.open()
 
-A task that waits for a turn looks itself whether it is next: whenever something changed
-(`ServerSession.changed`), and when its own timer ends. Readers and uploads have a task each, single requests
-are made in the caller's own. Between turns the janitor closes what nobody needs open, so that no caller is
-cancelled in a Terminate.
+A task that waits for a turn checks itself whether it is next: whenever something changed
+(`ServerSession.changed`), and when its own timer ends. Readers and uploads have a task each; a single request
+runs in the caller's task. Between turns the janitor closes files that nobody needs open. The janitor has a
+task of its own, so that no cancelled caller interrupts a Terminate.
 
-The user with the least score is next: seconds of use in the recent past, which count up to 0.3, less a tenth
-of the seconds that it waited. So an editor or `head` goes before a copy at once, and one small file after
-another keeps a copy waiting for three seconds at most.
+The user with the least score is next. Its score is its recent usage in seconds, at most 0.3, less a tenth of
+the seconds that it waited. So an editor or `head` goes before a copy at once, and a row of small files keeps
+a copy waiting for three seconds at most.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from mavftpfs.shared.model import renamed
 ReadMode = Literal["window", "burst"]
 
 MOST_USE = 0.3
-"""Seconds of use in the recent past that count at most."""
+"""Seconds of recent usage that count at most."""
 
 USE_MEMORY = 10.0
 """Seconds after which use no longer counts."""
 
 WAITED = 0.1
-"""How much a second of waiting counts, in seconds of use."""
+"""Seconds of usage that a second of waiting makes up for."""
 
 LEAST_TURN, LONGEST_TURN = 0.5, 2.5
 TURN_TRIPS = 10.0
@@ -58,14 +58,14 @@ RECENT = 10.0
 noticed late, because servers answer it on its own link, and a router may pass on only some of that."""
 
 IDLE_CLOSE = 1.5
-"""Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
-buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
+"""Seconds for which a file stays open on the server without being read. PX4 frees its buffers after 2 s, and
+ArduPilot gives the session away after 3 s, so a session that is still open here is open there, too."""
 
 MAYBE_OPEN_CLOSE = 5.0
-"""Seconds after the last use, or the last try, after which what may be open is closed."""
+"""Seconds after the last turn, or the last try, after which the janitor closes the files in `maybe_open`."""
 
 _KEPT = "the vehicle's only session is kept by another transfer"
-_OTHERS = "another client of the vehicle may have a file open, which is not ended for ours"
+_OTHERS = "another client of the vehicle may have a file open, and opening one could end its transfer"
 
 
 class Future:
@@ -81,7 +81,7 @@ class Future:
         return self._event.is_set()
 
     def end(self, error: MavftpfsError | None = None) -> None:
-        """Let those that wait go on, with an error where it failed; the first time counts."""
+        """Wake the tasks that wait, with an error if the work failed; only the first call counts."""
         if not self.ended:
             self._error = error
             self._event.set()
@@ -98,8 +98,8 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        waiting_since: when it began to want more than readahead; None if it does not. The user sets it;
-            `Scheduler.turn` clears it, however it ends.
+        waiting_since: when it began to need a turn for more than readahead; None if it needs none. The user
+            sets it; `Scheduler.turn` clears it at its end.
         writing: its turns are refused while nothing may be written.
     """
 
@@ -112,8 +112,8 @@ class SessionUser:
 
     @property
     def awaited_since(self) -> float | None:
-        """When a caller began to wait for this user: it gets a turn in time, or an error. None if none waits,
-        as for an upload in the background."""
+        """When a caller began to wait for this user, so that it gets a turn or an error in time. None if no
+        caller waits, as for an upload in the background."""
         return self.waiting_since
 
     @property
@@ -126,7 +126,8 @@ class SessionUser:
         return False
 
     def on_queued(self) -> None:
-        """Note that it goes on waiting for others, and that its time is not up."""
+        """Note that this user still waits for its turn. Called at least each quarter of `op_deadline`, so
+        that the reads that wait for it do not time out."""
 
     def on_removed(self) -> None:
         """Note that the file of its path was removed or replaced."""
@@ -138,17 +139,17 @@ class SessionUser:
         """Note that the vehicle was armed or disarmed."""
 
     def on_turn(self, began: float, now: float) -> None:
-        """Note that it had the session since then."""
+        """Note that this user's turn began then and ends now."""
         self._used = self.used(began) + now - began
         self._until = now
 
     def used(self, now: float) -> float:
-        """Return the seconds of use that still count: they fade, but not while it waits."""
+        """Return the recent usage in seconds: it fades within USE_MEMORY, but not while the user waits."""
         until = now if self.waiting_since is None else min(now, self.waiting_since)
         return self._used * min(1.0, max(0.0, 1.0 - (until - self._until) / USE_MEMORY))
 
     def score(self, now: float) -> float:
-        """Return its place among the users that wait: the least is next."""
+        """Return the score by which waiting users are ordered: the least is next."""
         waited = 0.0 if self.waiting_since is None else now - self.waiting_since
         return min(self.used(now), MOST_USE) - WAITED * waited
 
@@ -157,7 +158,8 @@ class Turn:
     """The session, while one user has it.
 
     Attributes:
-        user, task: whose it is. granted_at: since when. began: when its file was opened, or went on.
+        user, task: whose turn it is. granted_at: when it began. began: when its file was opened; that is
+        granted_at if the file was open already.
     """
 
     def __init__(self, scheduler: Scheduler, user: SessionUser) -> None:
@@ -169,7 +171,7 @@ class Turn:
         self._waited = self.began - since
 
     async def open(self, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
-        """Close what is open and open the user's file. While another client has a file open, others may have
+        """Close the open file and open the user's. While another client has a file open, other users may have
         the turn. Raises what ServerSession.open and Scheduler.turn do."""
         scheduler = self._scheduler
         while True:
@@ -188,17 +190,17 @@ class Turn:
         return bool(self._scheduler.waiting(self._scheduler.clock()))
 
     @property
-    def light_waits(self) -> bool:
-        """Whether another user waits that used little, so that this turn is short."""
+    def interactive_waits(self) -> bool:
+        """Whether an interactive user waits, one with little recent usage, so that this turn is short."""
         now = self._scheduler.clock()
         return any(rival.used(now) < MOST_USE for rival in self._scheduler.waiting(now))
 
     def is_over(self) -> bool:
-        """Return whether another user is to go first now, or the path is about to change.
+        """Return whether another user is next now, or the path is about to change.
 
-        A turn that lasted a while ends for any user with a lower score; before that only for one that used
-        little. Half a second is left in any case to a user that waited for longer than its use counts: else
-        the next small file would send it away at once.
+        A turn that lasted long (ten round trips, 0.5 to 2.5 s) ends for any user with a lower score; a
+        shorter one only for an interactive user. In its first half second, the time that a user waited before
+        its turn still lowers its score. Otherwise the next small file would end a copy's turn at once.
         """
         scheduler, user = self._scheduler, self.user
         now, rtt = scheduler.clock(), scheduler.server.engine.rtt
@@ -218,7 +220,7 @@ class Turn:
 
 @dataclass(eq=False)
 class _Excluded:
-    """Paths that are about to change. below: with all that lies below the first."""
+    """Paths that are about to change. below: all paths below the first, too."""
 
     paths: tuple[bytes, ...]
     below: bool
@@ -230,12 +232,12 @@ class _Excluded:
 class Scheduler:
     """Serialises all use of the server session.
 
-    op_deadline: seconds in which a user gets the session, or is told that it is not to be had.
+    op_deadline: seconds in which a user that a caller waits for gets the session, or an error.
     patient: see ConnectOptions.
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
-        users: the readers and uploads there are.
+        users: the readers and uploads that are registered.
         holder: the turn that was granted and is not over. serving: set once `serve` runs.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
@@ -273,7 +275,7 @@ class Scheduler:
     # --- turns
 
     def add(self, user: SessionUser, run: Callable[[], Awaitable[None]]) -> None:
-        """Run the task of a reader or an upload, until it ends or the connection does."""
+        """Register a reader or an upload, and run its task until that or the connection ends."""
         assert self._nursery is not None
         self.users[user] = None
         self._nursery.start_soon(run)
@@ -296,14 +298,15 @@ class Scheduler:
 
     @asynccontextmanager
     async def turn(self, user: SessionUser) -> AsyncIterator[Turn]:
-        """Wait for the session, and have it for the length of the body.
+        """Wait for the session, and keep it for the length of the body.
 
-        The body must not wait for a path, a node or memory for reads: a task that has one of these may be
-        waiting for the session. If the body is cancelled while it opens or closes a file, the janitor closes
-        what may be open.
+        The body must not wait for a path, a file or memory for reads, because a task that holds one of these
+        may be waiting for the session. If the body is cancelled while it opens or closes a file, the janitor
+        closes the files in `maybe_open`.
 
         Raises:
-            VehicleLost, Armed: it cannot be used now. RequestTimeout, SessionBusy: others keep it.
+            VehicleLost, Armed: the session cannot be used now. RequestTimeout: other users keep it.
+            SessionBusy: another client may have a file open.
         """
         turn: Turn | None = None
         try:
@@ -341,15 +344,15 @@ class Scheduler:
                 if now >= self._deadline(user):
                     raise SessionBusy(_OTHERS) if now < others_until else RequestTimeout(_KEPT)
                 user.on_queued()
-                until = min(self._deadline(user), now + self._op_deadline / 4)  # it is told that it goes on
+                until = min(self._deadline(user), now + self._op_deadline / 4)  # for the next `on_queued`
                 await self.server.sleep((min(until, others_until) if others_until > now else until) - now)
         finally:
             del self._queue[user]
             self.server.wake()
 
     def _deadline(self, user: SessionUser) -> float:
-        """Return until when a user waits. Its time begins when the vehicle last answered in somebody's turn,
-        or when another client last closed a file."""
+        """Return when a waiting user gets an error: `op_deadline` after the vehicle last answered in a turn,
+        or after another client last closed a file; never if no caller waits."""
         since = user.awaited_since
         if since is None:
             return inf
@@ -359,7 +362,7 @@ class Scheduler:
 
     @property
     def _moved(self) -> float:
-        """When the vehicle last answered in somebody's turn. Listings are also answered outside of turns."""
+        """When the vehicle last answered during a turn. Answers to listings outside of turns do not count."""
         answered_at, holder = self._driver.last_reply_at, self.holder
         return answered_at if holder is not None and answered_at >= holder.granted_at else self._moved_at
 
@@ -368,22 +371,22 @@ class Scheduler:
         self.server.wake()
 
     def assert_no_turn(self) -> None:
-        """Assert that the caller has no turn: it would wait for itself, or make others wait for long."""
+        """Assert that the caller has no turn, because it would wait for itself, or keep others waiting."""
         assert self.holder is None or self.holder.task is not trio.lowlevel.current_task(), "not in a turn"
 
     def waiting(self, now: float) -> list[SessionUser]:
-        """Return the users that want more than readahead, and could use the session now."""
+        """Return the users that need more than readahead, and could use the session now."""
         return [user for user in self._queue if user.waiting_since is not None and self._may_use(user, now)]
 
     def _is_next(self, user: SessionUser) -> bool:
-        """Return whether a user has its turn now: it is first, and no other file is open."""
+        """Return whether a user's turn begins now: it is next, nobody has a turn, no other file is open."""
         session = self.server.session
         closed = session is None or session.path == user.path
         return closed and self.holder is None and not self._tidying and self.next_user() is user
 
     def next_user(self) -> SessionUser | None:
-        """Return the user that is to have the session now. Readahead comes only if nothing waits, and that of
-        the open file first."""
+        """Return the user that gets the session next. Readahead runs only if no user waits, that of the open
+        file first."""
         now = self.clock()
         if waiting := self.waiting(now):
             return min(waiting, key=lambda user: user.score(now))
@@ -397,7 +400,8 @@ class Scheduler:
         return first
 
     def _may_use(self, user: SessionUser, now: float) -> bool:
-        """Return whether nothing keeps it from its file: a change of names, or another client's open file."""
+        """Return whether a user may use its file now: no change of names and no other client's file bars
+        it."""
         if self._queue.get(user) is not None or self.is_excluded(user.path):
             return False
         session = self.server.session
@@ -405,22 +409,23 @@ class Scheduler:
 
     @property
     def others_until(self) -> float:
-        """Until then nothing is opened: that might end another client's session."""
+        """The time until which this connection opens no file, because that might end another client's
+        session."""
         several = self._driver.engine.traits.several_sessions
         return -inf if several else self.server.others.file_open_until
 
     # --- paths that are about to change
 
     def is_excluded(self, path: bytes) -> bool:
-        """Return whether somebody changes this path now."""
+        """Return whether this path is about to change."""
         return bool(self._excluded) and any(excluded.covers(path) for excluded in self._excluded)
 
     @asynccontextmanager
     async def excluded(self, *paths: bytes, below: bool = False) -> AsyncIterator[None]:
-        """Keep the session off paths for the length of the body; below: off all below the first, too.
+        """Keep files with these paths closed for the length of the body; below: all below the first, too.
 
         Raises:
-            RequestTimeout: it could not be closed in time.
+            RequestTimeout: an open one could not be closed in time.
         """
         self.assert_no_turn()
         excluded, server = _Excluded(paths, below), self.server
@@ -431,14 +436,14 @@ class Scheduler:
                 while any(map(excluded.covers, self._used_paths())):
                     await server.changed.park()
             if scope.cancelled_caught:
-                raise RequestTimeout("our own session on these paths could not be closed")
+                raise RequestTimeout("a file with this path, or below it, is open and could not be closed")
             yield
         finally:
             self._excluded.remove(excluded)
             server.wake()
 
     def _used_paths(self) -> list[bytes]:
-        """Return where something is open, may be open, or may be opened at any time."""
+        """Return the paths of files that are open, may be open, or may be opened at any time."""
         used = [path for _, path in self.server.maybe_open]
         if self.server.session is not None:
             used.append(self.server.session.path)
@@ -459,7 +464,7 @@ class Scheduler:
                 user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
-        """Note that the file of this name was removed or replaced: its readers get no more of it."""
+        """Note that the file of this name was removed or replaced, so its readers get an error."""
         for user in list(self.users):  # a user may be closed by that
             if user.path == path:
                 user.on_removed()
@@ -467,12 +472,13 @@ class Scheduler:
     # --- news
 
     def _on_reads_distrusted(self, why: str) -> None:
-        """Tell all users that what was read lately may be another file's, also of files closed since."""
+        """Tell all users, also those that were removed since, that bytes read lately may be another
+        file's."""
         for user in [*self.users, *(user for _, user in self._gone)]:
             user.on_suspect(why)
 
     def on_armed_changed(self) -> None:
-        """End uploads while the vehicle is armed, and go on with them afterwards (promise 9)."""
+        """Stop uploads when the vehicle arms, and resume them when it disarms (promise 9)."""
         for user in self.users:
             user.on_armed_changed()
         self.server.wake()
@@ -496,7 +502,7 @@ class Scheduler:
                     await self.tidy()
 
     async def tidy(self) -> None:
-        """Close what is open, or may be. A task that waits for that is told of a failure by its time-out."""
+        """Close the open file, or those in `maybe_open`. If that fails, tasks that wait for it time out."""
         server = self.server
         self._tidying = True
         try:
@@ -509,10 +515,11 @@ class Scheduler:
             server.wake()
 
     def _closes_in(self, now: float) -> float:
-        """Return in how many seconds the janitor closes what is open, or may be.
+        """Return in how many seconds the janitor closes the open file, or those in `maybe_open`.
 
-        At once if another user is next, or the path is about to change. Else that is counted from the last
-        use, not from the last news: there may always be news, and an orphan of ours keeps other clients out.
+        The janitor closes at once if another user is next, or the path is about to change. Otherwise the wait
+        is counted from the last turn, not from the last wake-up: wake-ups may never cease, and an orphaned
+        session keeps other clients out.
         """
         server, session = self.server, self.server.session
         if self.holder is not None:
@@ -533,11 +540,12 @@ class Scheduler:
         return max(0.0, self._used_at + MAYBE_OPEN_CLOSE - now)
 
     def _is_kept(self, path: bytes) -> bool:
-        """Return whether a file stays open a moment longer: not in flight, if nobody has it open here."""
+        """Return whether the janitor leaves a file open for IDLE_CLOSE seconds. While the vehicle is armed,
+        it does so only for a reader or an upload that still exists."""
         return not self.server.vehicle.armed or any(user.path == path for user in self.users)
 
     async def close(self) -> None:
-        """Terminate the session, best effort: a server forgets it by itself, sooner or later. The caller
-        bounds the wait and cancels `serve` first."""
+        """Terminate the session, and ignore failures, because most servers close an idle session by
+        themselves. The caller bounds the wait and cancels `serve` first."""
         await self.server.close_quietly()
         await self.server.close_maybe_open()

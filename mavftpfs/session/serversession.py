@@ -2,7 +2,8 @@
 
 Two facts say what this connection opened: `session` is the file that is open, and `maybe_open` holds the
 files of which that is not known. One of them is always empty. The task that has the turn opens, uses and
-closes a file. Between turns the scheduler's janitor closes it. `distrust` may leave it at any time.
+closes a file. Between turns the scheduler's janitor closes it. At any time `distrust` may move the open file
+to `maybe_open`, because another file may be open in its place.
 
 Requests that carry a path and need no session (`ask`) run beside it, and carry its id (docs/servers.md 1).
 """
@@ -49,10 +50,11 @@ SILENCE_PX4 = 10.5
 """Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
 
 TERMINATE_LIMIT = 5.0
-"""Seconds to wait for a Terminate of whose failure no caller is told."""
+"""Seconds to wait for the answer to a Terminate if no caller waits for its result."""
 
 STALL = 2.0
-"""Seconds without a reply, while a file is read or written, after which its session is not believed in."""
+"""Seconds without a reply, while a file is read or written, after which the file is opened anew, because the
+server may have closed its session."""
 
 REOPENS = 5
 """How often a reader or an upload may lose the session without progress before it fails."""
@@ -65,7 +67,7 @@ _OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
 """NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
 
 _NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
-"""What servers say to a Terminate of a session that is not there; 8 is PX4's sticky errno."""
+"""Refusals of a Terminate if no such session exists; 8 is PX4's sticky errno."""
 
 _IN_USE = "the vehicle's only FTP session is in use by another client"
 
@@ -93,9 +95,9 @@ class OpenSession:
 class _Tried:
     """Remedies that were tried, since `began`, while one request is refused because the session is taken.
 
-    opens: the request opens a file. resent: the request was sent more than once. listed: a listing cleared
-    PX4's sticky errno. closed: a file that an open of ours may have left was closed. silences: those that are
-    left, in seconds. reset: ResetSessions was sent.
+    opens: the request opens a file. resent: one of the tries was sent more than once. listed: a listing
+    cleared PX4's sticky errno. closed: a file that an open of this connection may have left was closed.
+    silences: those that are left, in seconds. reset: ResetSessions was sent.
     """
 
     began: float
@@ -110,21 +112,22 @@ class _Tried:
 class ServerSession:
     """Opens and closes files, and knows what is open.
 
-    op_deadline: seconds to wait for a Terminate of whose failure a caller is told.
+    op_deadline: seconds to wait for the answer to a Terminate if a caller waits for its result.
     patient: see ConnectOptions.
 
     Attributes:
-        session: what is open; None if nothing is, or if it is not believed any more. transfer: what reads or
-        writes it now.
-        maybe_open: (session id, path) of each file that this connection may have open: a request was not
-        answered yet, or never, or the session is not believed any more.
-        file_since: when the last open went out, and once its ACK came, when that was. What went out before
-        concerns an earlier file.
-        epoch: when what was read lately last came into doubt; each time is later than the one before.
+        session: the open file; None if none is open, or if it was moved to `maybe_open`. transfer: the
+        operation that reads or writes it now.
+        maybe_open: (session id, path) of each file that this connection may have open: its open or its
+        Terminate is not answered (yet), or `distrust` moved it here.
+        file_since: when the last open went out; from its ACK on, when that came. Requests that went out
+        before concern an earlier file.
+        epoch: the time of the last `distrust` of reads, always later than the one before. Bytes that were
+        read before it, and not long before, may be another file's.
         quarantine: of names that were changed.
         others: other clients of this server.
         on_reads_distrusted: called with the reason whenever the epoch is raised.
-        changed: where tasks park until something changed: turns, what is open, what is wanted.
+        changed: where tasks park until turns, open files or the wishes of users change.
     """
 
     def __init__(
@@ -156,11 +159,11 @@ class ServerSession:
     # --- trust
 
     def distrust(self, why: str, *, reads: bool) -> None:
-        """Stop believing ACKs: for ten minutes the caches compare what was written.
+        """Make ACKs suspect: for ten minutes the caches compare each file that they write.
 
         Servers share session ids between clients, requests name a session and no file, and some links deliver
-        a request twice, the second time late. reads: what was read lately may be another file's, too. So the
-        transfer is cancelled, its file counts as perhaps open, and the epoch is raised.
+        a request twice, the second time late. reads: bytes that were read lately may be another file's, too,
+        so the transfer is cancelled, its file moves to `maybe_open`, and the epoch is raised.
         """
         self._distrusted_at = self.clock()
         if reads:
@@ -169,42 +172,48 @@ class ServerSession:
             self.on_reads_distrusted(why)
 
     def in_doubt(self, since: float = inf) -> bool:
-        """Return whether ACKs were distrusted in the last ten minutes, or after that time."""
+        """Return whether ACKs are suspect: there was a `distrust` in the last ten minutes, or after
+        `since`."""
         return self.clock() - self._distrusted_at <= LASTS or self._distrusted_at > since
 
     def on_another_client(self, payload: bytes, *, newcomer: bool) -> None:
-        """Note another FTP client's payload. newcomer: the first one for a while, so earlier ones may have
-        been missed, and have taken the session from a reader. After a request to open, the answer or the next
-        request tells. An upload goes on: its file is compared."""
+        """Note another FTP client's payload, and distrust reads if that client may have the shared session.
+
+        newcomer: none was heard for a while, so this client may have taken the session by earlier payloads
+            that this connection missed. Exceptions: its request to open takes nothing before the server
+            answers, and an upload goes on because its file is compared afterwards.
+        """
         traits, used, session = self.engine.traits, self.others.hear(payload, self.clock()), self.session
         # Where servers echo ids, each client has one of its own.
         shared = not traits.ack_carries_own_session or used == self.engine.home_session
         took = shared and took_session(payload)
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
-        # If no file was opened since the last such news, nothing more is in doubt.
+        # If no file was opened since reads were last distrusted, no more bytes are suspect.
         opened = session is not None or self.file_since >= self.epoch
         self.distrust("another FTP client is active", reads=(took or missed) and opened)
         self.wake()
 
     def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
-        """Take an answer that no request of this session explains.
+        """Take an answer beyond those that the requests of this connection account for: the network doubled
+        the answer or the request, and the server executed the request twice.
 
-        lateness: seconds since its request went out, None if that is not known. The ACK of another open shows
-        that the server executed that open once more, and MAVSDK's then has its file in the place of the
-        present one.
+        lateness: seconds since its request went out, None if that is not known. If the answer is the ACK of
+        another open than the present file's, reads are distrusted, because MAVSDK then has that file open in
+        place of the present one.
         """
         self.quarantine.saw(lateness, self.clock())
-        self.distrust("an answer came that no request of ours explains", reads=self._is_older_open(reply))
+        self.distrust("an answer came that no request explains", reads=self._is_older_open(reply))
 
     def on_late(self, reply: Payload, sent_at: float) -> None:
-        """Take an ACK that nothing waits for any more: its request was repeated, or its operation cancelled.
+        """Take an ACK that no operation waits for, because another transmission was answered or the operation
+        was cancelled.
 
-        sent_at: when the request went out first. An open of an earlier file may have put that in the place of
-        the present one, or left it open; a WriteFile to an earlier file may have put its bytes into a later
-        one. Names that were changed are in quarantine.
+        sent_at: when the request went out first. A late open may have replaced the present file by an earlier
+        one, or left that open. A late WriteFile may have put its bytes into a later file. Other requests need
+        nothing here, because the names that they change are in quarantine.
         """
         if sent_at >= self.file_since:
-            return  # the open that is closed next, or a WriteFile to the last file
+            return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
         if reply.req_opcode in OPENING:
             if self.session is None or self.session.seq != reply.seq:
                 self.on_unexplained(reply, self.clock() - sent_at)
@@ -217,22 +226,23 @@ class ServerSession:
         return opened and self.session is not None and self.session.seq != reply.seq
 
     def leave(self) -> None:
-        """Stop using what is open: cancel its transfer, and close the file before the next open. The server
-        may have restarted meanwhile."""
+        """Stop using the open file: cancel its transfer, and move it to `maybe_open`, so that it is closed
+        before the next open. The server may have restarted meanwhile."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
         self._leave()
         self.wake()
 
     def lose(self, lost: SessionLost) -> None:
-        """Leave the session that its user found lost."""
+        """Leave the session that its user found lost; distrust reads if the server said so, because then
+        another client may have had the session."""
         if lost.by_server:
             self.distrust(str(lost), reads=True)
         else:
             self.leave()
 
     def _leave(self) -> None:
-        """Count what is open as perhaps open."""
+        """Move the open file to `maybe_open`."""
         if self.session is not None:
             self.maybe_open.add((self.session.id, self.session.path))
             self.session, self.engine.session = None, self.engine.home_session
@@ -245,11 +255,11 @@ class ServerSession:
     # --- waiting
 
     def wake(self) -> None:
-        """Have everyone look again that sleeps here: something changed."""
+        """Wake all tasks that sleep here, because something changed."""
         self.changed.unpark_all()
 
     async def sleep(self, seconds: float) -> None:
-        """Wait until something changed, for so long at most."""
+        """Wait until something changes, at most `seconds`."""
         with trio.move_on_after(seconds):
             await self.changed.park()
 
@@ -260,7 +270,7 @@ class ServerSession:
 
         Raises:
             FtpNak: the server refused. SessionTaken: another client has a file open. SessionBusy: the session
-                stayed taken. SessionLost: the file was opened, and is not believed to be any more.
+                stayed taken. SessionLost: the file was opened, and `distrust` left it at once.
                 RequestTimeout: no answer, to this open or to the close of an earlier file.
         """
         await self.close_quietly()
@@ -271,7 +281,8 @@ class ServerSession:
                 pass
         finally:
             if opcode == Opcode.CREATE_FILE:
-                # Where nothing can be renamed a file is not compared once more under its final name.
+                # If a server renames nothing, the caches compare the file only once, and a duplicate of this
+                # request may empty it after that.
                 repeated = self.session is None or self.session.resent
                 counts = repeated and self.engine.traits.rename_works is False
                 now = self.clock()
@@ -285,7 +296,7 @@ class ServerSession:
         asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
         operation = OpenRequest(opcode, wire_path(path), session=asked)
         operation.on_opened = partial(self._on_opened, path, tried)
-        # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
+        # After a time-out or a cancellation these stay: the server may have opened the file, under either id.
         if echoes is not False:
             self.maybe_open.add((asked, path))
         if not echoes:
@@ -299,8 +310,8 @@ class ServerSession:
         return True
 
     def _on_opened(self, path: bytes, tried: _Tried, operation: OpenRequest) -> None:
-        """Note the ACK of an open, at once: what shows that another file is open there may come right behind
-        it, before the task that opened the file goes on."""
+        """Note the ACK of an open at once, because an answer right behind it may show that another file is
+        open, before the task that asked runs again."""
         self.maybe_open.clear()
         self.others.on_ours_opened()
         self.session = OpenSession(
@@ -317,14 +328,14 @@ class ServerSession:
     # --- when the session is taken
 
     async def _remedy(self, nak: FtpNak, tried: _Tried) -> None:
-        """Do the next thing about a refusal, so that the request may be sent again.
+        """Apply the next remedy for a refusal, and return if the request may be sent again.
 
         | who has the session | NAK | what is done |
         |---|---|---|
-        | a copy of our own open, whose ACK was lost | 4, 5, 8; of an ArduPilot 1 | close it |
+        | this connection: an open whose ACK was lost | 4, 5, 8; of an ArduPilot 1 | close it |
         | nobody: PX4's sticky errno hides another code | 8 | list a directory to its end, once |
         | another client that was heard | 4, 5 | the caller waits for that client |
-        | a client that is gone | 4, 5 | be silent for 3.5 s, then for 10.5 s; then reset, if we are alone |
+        | a client that is gone | 4, 5 | be silent for 3.5 s, then 10.5 s; then reset if no client is heard |
 
         Asking sooner keeps a stale session alive (docs/servers.md 1).
 
@@ -339,7 +350,7 @@ class ServerSession:
         orphan = (tried.resent or (self.in_doubt() and alone)) and not tried.closed
         ours = tried.opens and (nak.retransmitted or orphan)
         taken = nak.code in (_OPEN_TAKEN if tried.opens else _TAKEN)
-        if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under our id
+        if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under the same id
             taken = ours and self.engine.traits.ack_carries_own_session is not False
         if tried.opens and not (taken and ours):
             self.maybe_open.clear()
@@ -366,8 +377,8 @@ class ServerSession:
         await self._try(Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session))
 
     def busy_at(self, since: float) -> float:
-        """Return when a caller that waits for other clients since then is told that the session is busy: they
-        closed no file for `op_deadline`."""
+        """Return when a caller that waits for other clients since then gets SessionBusy: `op_deadline` after
+        they last closed a file; never if the connection is patient."""
         return inf if self.patient else max(since, self.others.closed_at) + self.op_deadline
 
     async def wait_for_others(self, since: float) -> None:
@@ -384,14 +395,15 @@ class ServerSession:
     # --- closing
 
     async def close(self, limit: float | None = None) -> bool:
-        """Terminate; return False if the server had closed it before, by itself.
+        """Terminate the session; return False if the server had closed it by itself before.
 
-        "No such session" in answer to a repeated Terminate means that the first one closed it. After 8 s it
-        may mean that the server closed it as idle. limit: seconds to wait for the answer; None: as for any
-        request.
+        If the server answers a repeated Terminate with "no such session", the first transmission closed it.
+        Exception: after 8 s the server may have closed the session because it was idle. limit: seconds to
+        wait for the answer; None: op_deadline.
 
         Raises:
-            FtpNak: closing failed over there. RequestTimeout: no answer; it may be open now.
+            FtpNak: the server could not close the file. RequestTimeout: no answer; the file is in
+                `maybe_open`.
         """
         session = self.session
         if session is None:
@@ -414,21 +426,21 @@ class ServerSession:
         return True
 
     async def close_quietly(self) -> None:
-        """Close where no caller is to be told of a failure."""
+        """Close the open file; a failure leaves it in `maybe_open`."""
         with suppress(MavftpfsError):
             await self.close(TERMINATE_LIMIT)
 
     async def close_maybe_open(self) -> None:
-        """Close what may be open by our doing. Where that fails it may be open as before."""
+        """Close the files in `maybe_open`; a failure leaves them there."""
         with suppress(MavftpfsError):
             await self._close_maybe_open()
 
     async def _close_maybe_open(self) -> bool:
-        """Close what may be open by our doing, but not what another client may own; return whether something
-        was closed, or was not there.
+        """Close the files in `maybe_open`, and forget those in whose place another client may have a file
+        open; return whether a Terminate was answered.
 
         Raises:
-            RequestTimeout: no answer; it may be open as before.
+            RequestTimeout: no answer; the files stay in `maybe_open`.
         """
         closed = False
         for session in {session for session, _ in self.maybe_open}:
@@ -440,12 +452,13 @@ class ServerSession:
         return closed
 
     def require_open(self, session: OpenSession) -> None:
-        """Raise SessionLost unless what was opened then is still open."""
+        """Raise SessionLost unless this session is still open."""
         if self.session is not session:
             raise _lost()
 
     def is_stalled(self, transfer: Operation) -> bool:
-        """Return whether answers to a transfer are due, and none of any kind came for a while."""
+        """Return whether a transfer waits for answers, and the server sent none of any kind for STALL seconds
+        or four round trips."""
         # Requests of the transfer that wait for `bwlimit=` are no silence.
         heard_at = max(self.driver.last_reply_at, transfer.progress_at)
         return not transfer.idle and self.clock() - heard_at > max(STALL, 4.0 * (self.engine.rtt or 0.0))
@@ -453,16 +466,16 @@ class ServerSession:
     # --- requests beside the session
 
     async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
-        """Carry out a request that needs no session of its own, and carries a path.
+        """Carry out a request that carries a path and needs no session of its own.
 
-        ArduPilot refuses it while another client has a session: then a new one is made and sent when that
-        client has closed its file, or after a silence.
+        ArduPilot refuses such a request while another client has a session. Then `make` makes a new one,
+        which is sent when that client has closed its file, or after a silence.
 
-        changes: it changes the card. If it was sent twice, a refusal may answer the second execution, and is
-            raised at once.
+        changes: the request changes the card. If it was sent twice, a refusal is raised at once, because it
+            may answer the second execution.
 
         Raises:
-            VehicleLost. SessionBusy: that session did not go away. Else what the request fails with.
+            VehicleLost. SessionBusy: the other client kept its session. The errors of the request.
         """
         tried = _Tried(self.clock(), opens=False)
         while True:
@@ -500,10 +513,10 @@ class ServerSession:
         self.wake()
 
     async def _try(self, operation: Operation) -> None:
-        """Run a remedy whose refusal changes nothing.
+        """Run a remedy, and ignore its refusal.
 
         Raises:
-            RequestTimeout: that is the caller's news.
+            RequestTimeout: no answer.
         """
         try:
             await self.driver.run(operation)

@@ -1,10 +1,10 @@
 """The vehicle's files, as the caches see them. Layer: session; implements cache.remote.VehicleStore.
 
-Did that change happen? A request whose answer was lost is sent again, and may be carried out twice. The
-second time it is refused, or hits the name's next file (docs/servers.md 14.4). So after such a refusal, and
-after a silence, a listing tells whether the change happened. While ACKs are distrusted
-(`ServerSession.distrust`) the network may also have doubled a request that was sent once. A name that was
-changed may be in quarantine before it is changed again (`session.quarantine`); only `wait_out` waits for it.
+**Did that change happen?** A request whose answer was lost is sent again, and the server may execute it
+twice. It refuses the second execution, or that hits the name's next file (docs/servers.md 14.4). So after
+such a refusal, and after a silence, `_perform` lists the directory to see whether the change happened. While
+ACKs are suspect (`ServerSession.distrust`), the network may also have doubled a request that was sent once. A
+changed name may be in quarantine (`session.quarantine`); only `wait_out` waits for its end.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
 
 TIME_SILENCES = 2
-"""How often that must happen, with ListDirectory answering, before opcode 16 counts as unknown: loss may
-look the same once."""
+"""Silences, each followed by an answered ListDirectory, after which opcode 16 counts as unknown: a single one
+may be loss."""
 
 _NO_TIMES = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS))
-"""What servers say that do not know opcode 16; 8 may hide any other code on PX4."""
+"""Refusals by servers that do not know opcode 16; 8 may hide any other code on PX4."""
 
 LONGEST_CRC = 120.0
 """Seconds a vehicle may need for a checksum (promise 2)."""
@@ -67,24 +67,22 @@ CRC_TIME = 5.0
 """Seconds before a checksum is asked for again where the file's size is not known."""
 
 COPY_RATE = 100_000.0
-"""Bytes per second that the slowest card checksums; the question is not repeated before."""
+"""Bytes per second that the slowest card checksums, so no request for a checksum is repeated sooner."""
 
 HURRY = 3.0
-"""Seconds that changes which have begun still get once the process is told to end at once."""
+"""Seconds for running changes to end after the process was told to end at once."""
 
 VERIFY_LIMIT = 4.0
-"""Seconds to spend on finding out what became of a request that was not answered. The caller was promised an
-answer within `op_deadline`, and this comes after it."""
+"""Seconds to look whether an unanswered change happened. The caller waits for them beyond `op_deadline`."""
 
 _OFTEN = 0.25
-"""Seconds after which a transfer looks up at the latest."""
+"""Seconds between two checks of a running transfer at most."""
 
 SWEEPS = 3
-"""How often a directory is listed at most because names of it changed meanwhile."""
+"""Listings of a directory at most, because its names changed during the earlier ones."""
 
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
-"""What servers say of a name that is not there (any more); the errno may be a stale one (docs/servers.md 12).
-"""
+"""Refusals if a name does not exist (any more); the errno may be a stale one (docs/servers.md 12)."""
 
 _THERE = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_EXISTS))
 _SECOND = {
@@ -93,15 +91,16 @@ _SECOND = {
     Opcode.RENAME: _MISSING,
     Opcode.CREATE_DIRECTORY: _THERE,
 }
-"""What servers may say to a request that was done already, by opcode."""
+"""Refusals of a request that was executed before, by opcode."""
 
 
 class Store:
     """Reads, lists, checks and changes remote files; see cache.remote for what each call does.
 
-    A change of the card that fails with FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or
-    Armed had not happened when that was looked at. After OutcomeUnknown that is not known. Only create_empty
-    looks at no listing: after its RequestTimeout the file may be there, and empty.
+    If a change of the card fails with FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or Armed,
+    the change had not happened when the store looked. After OutcomeUnknown it may have. Only create_empty
+    does
+    not look: after its RequestTimeout an empty file may exist.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
@@ -121,7 +120,7 @@ class Store:
 
     @property
     def epoch(self) -> float:
-        """Return when what was read lately last came into doubt (see VehicleStore)."""
+        """Return when reads were last distrusted (see VehicleStore)."""
         return self._server.epoch
 
     def why_lost(self) -> str | None:
@@ -131,8 +130,8 @@ class Store:
     # --- reading
 
     async def list_directory(self, path: bytes, *, known_end: int | None = None) -> Listing:
-        """Sweep a directory (see RemoteStore). Opcode 16 is tried first; that it is refused, or not answered,
-        counts only if opcode 3 then is."""
+        """Sweep a directory (see RemoteStore). Opcode 16 is tried first. If the server refuses it, or does
+        not answer, and then answers opcode 3, the server does not know opcode 16."""
         wire, started, traits = wire_path(path), self._clock(), self.traits
         operation: ListDirectory | None = None
         tried: list[ListDirectory] = []
@@ -193,14 +192,14 @@ class Store:
         return size
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read an `@` file to its end (see RemoteStore); once more if the session was lost or in doubt."""
+        """Read an `@` file to its end (see RemoteStore); once more if the session was lost or suspect."""
         try:
             return await self._read_whole(path, limit)
         except (SessionLost, DataUnproven):
             return await self._read_whole(path, limit)
 
     async def _read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read it once; anew in shorter blocks as long as the server turns out to send no longer ones."""
+        """Read the file; read it anew in shorter blocks if the server sends no longer ones."""
         block: int | None = self._scheduler.read_chunks.size
         while block is not None:
             async with self._opened(path) as session:
@@ -218,10 +217,10 @@ class Store:
 
     @asynccontextmanager
     async def _opened(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> AsyncIterator[OpenSession]:
-        """Have a file open for the length of the body, in a turn of the caller's task; then terminate.
+        """Keep a file open for the length of the body, in a turn of the caller's task; then terminate.
 
         Raises:
-            What Scheduler.turn, opening or closing fail with.
+            MavftpfsError: the turn, the open or the Terminate failed.
         """
         user = SessionUser(path, self._clock(), writing=opcode != Opcode.OPEN_FILE_RO)
         self._vehicle.require(self._clock(), writing=user.writing)
@@ -230,8 +229,8 @@ class Store:
             await self._server.close()
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
-        """Ask for a checksum (see RemoteStore); size: of the file, if known: the question is not repeated
-        before so much can have been read."""
+        """Ask for a checksum (see RemoteStore). size: of the file, if known. The request is not repeated
+        before the slowest card can have read so much."""
         self._scheduler.assert_no_turn()
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
@@ -256,11 +255,11 @@ class Store:
     # --- changing
 
     def another_client_heard(self) -> bool:
-        """Return whether another FTP client was heard lately."""
+        """Return whether another FTP client was heard in the last ten seconds."""
         return self._vehicle.another_client_heard(self._clock())
 
     def address(self) -> tuple[int, int]:
-        """Return system and component id, of an autopilot where nothing was heard yet."""
+        """Return system and component id; (1, 1), an autopilot's, before the first heartbeat."""
         address = self._vehicle.address
         return (1, 1) if address is None else (address.system, address.component)
 
@@ -299,7 +298,7 @@ class Store:
             driver.cancel(transfer)
 
     def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
-        """Queue an upload; nothing is sent before the source has something or finish is called."""
+        """Queue an upload. The upload sends nothing before its source has something or `finish` is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
         upload = Upload(path, source, self._scheduler)
@@ -307,7 +306,7 @@ class Store:
         return upload
 
     async def create_empty(self, path: bytes) -> None:
-        """Make an empty file, or empty it; done twice it is the same."""
+        """Create an empty file, or empty an existing one. A second execution changes nothing."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)
         await self.wait_out(path)
@@ -371,10 +370,11 @@ class Store:
     async def _changing(
         self, *paths: bytes, below: bool = False, in_flight: bool = False, at_once: bool = False
     ) -> AsyncIterator[None]:
-        """Check that writing is allowed now, and keep our own session off the paths. The body sends the
-        request: once begun, it is finished.
+        """Check that writing is allowed now, and keep files with these paths closed. The body sends the
+        request; a cancellation does not interrupt it.
 
-        below: also off all that lies below the first. in_flight: armed or not. at_once: also in quarantine.
+        below: all paths below the first, too. in_flight: also while the vehicle is armed. at_once: do not
+        wait for a quarantine.
 
         Raises:
             RequestTimeout: the body did not begin in time.
@@ -385,7 +385,7 @@ class Store:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
                     await self.wait_out(path)
-                # closing our session may have taken a while
+                # closing a file may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
                 with self.finishing(until=until):
                     yield
@@ -396,13 +396,13 @@ class Store:
     # --- did that change happen?
 
     async def _perform(self, make: Callable[[], Simple], after: Mapping[bytes, After]) -> None:
-        """Run a request; look what became of it if its answer may not be that to its first execution. after:
-        what each name has then."""
+        """Run a request; look at listings if its answer may not be that to its first execution. after: the
+        state of each name once the change happened."""
         error: FtpNak | RequestTimeout
         for last in (False, True):
             self._under_way += 1
             self._sent += 1
-            began, repeated = self._clock(), True  # no answer came yet
+            began, repeated = self._clock(), True  # as long as no answer came
             try:
                 repeated = (await self._server.ask(make, changes=True)).retransmitted
                 return
@@ -437,10 +437,10 @@ class Store:
                 raise error
 
     def _may_be_second(self, nak: FtpNak) -> bool:
-        """Whether a refusal may answer the second execution of a request.
+        """Return whether a refusal may answer the second execution of a request.
 
-        A rename is looked at in any case: its names were looked up just before, and one that is refused for
-        nothing would count as proof that the server renames none.
+        A refused rename is looked at in any case, because the caller would take its refusal for proof that
+        the server renames no files.
         """
         if nak.retransmitted:
             return True
@@ -465,13 +465,13 @@ class Store:
         return Outcome.UNKNOWN
 
     async def _look(self, after: Mapping[bytes, After]) -> Outcome:
-        """List the directories of these names; return whether they have what they have after the change."""
+        """List the directories of these names; return the verdict on the change."""
         listed = {}
         for parent in {split(path)[0]: None for path in after}:
             listed[parent] = await self._names(parent)
         evidence = [listed[split(path)[0]].judge(split(path)[1], then) for path, then in after.items()]
         verdict = together(evidence)
-        for path, then in after.items():  # with entries it is somebody else's
+        for path, then in after.items():  # a directory with entries is somebody else's
             made = then is After.DIRECTORY and verdict is Outcome.HAPPENED
             if made and (await self.list_directory(path)).entries:
                 return Outcome.CONFLICT
@@ -480,8 +480,9 @@ class Store:
     async def _names(self, directory: bytes) -> Names:
         """Return what a fresh listing shows.
 
-        It is listed again if changes of ours went on meanwhile. Servers count names: those behind one that is
-        taken away move up, past the place where a sweep goes on. If they never stood still: what any saw.
+        The directory is listed again if this store changed names meanwhile, because a sweep goes on by a
+        count of names, and misses those that moved up in place of a removed one. After SWEEPS listings,
+        return all names that any of them showed.
         """
         seen: dict[bytes, DirEntry] = {}
         complete = False
@@ -499,7 +500,7 @@ class Store:
 def _asking_times(
     wire: bytes, known_end: int | None, traits: Traits, scope: trio.CancelScope, tried: list[ListDirectory]
 ) -> ListDirectory:
-    """Make a listing that ends the scope's deadline once it is answered, and remember it as tried."""
+    """Make a listing that lifts the scope's deadline when a page arrives, and append it to `tried`."""
 
     def on_page() -> None:
         traits.lists_times = True

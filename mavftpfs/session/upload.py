@@ -1,10 +1,14 @@
 """One upload: its callers, what it does next, and how it uses its turns. Layer: session.
 
-A file is made by CreateFile. Where OpenFileWO was seen to keep a file's content an upload can be interrupted
-at any time: Terminate when its requests are answered, and later OpenFileWO. Where it was seen to empty files
-that would begin the file anew, so the upload keeps the session until its source has nothing more. Where
-neither was seen yet, the upload is interrupted when another user waits, and reopening its file tells. What
-was ACKed before an ACKed Terminate is written.
+CreateFile makes the file. Whether an upload can be interrupted depends on the server's OpenFileWO:
+
+| OpenFileWO | the upload |
+|---|---|
+| keeps the content | may stop at any time: Terminate once its requests are answered, and later OpenFileWO |
+| empties the file | keeps the session until its source has nothing more: resuming means to start anew |
+| is not known yet | stops when another user waits; reopening the file shows which of the two is true |
+
+Bytes that were ACKed before an ACKed Terminate are written.
 """
 
 from __future__ import annotations
@@ -34,14 +38,15 @@ RETRY_AFTER = 5.0
 """Seconds after a failure of the link before it is tried again in the background."""
 
 STARVE = 0.5
-"""Seconds an upload keeps the session with nothing to send. PX4 frees buffers after 2 s, and a log that a
-program writes to each second must not keep the session for ever."""
+"""Seconds for which an upload keeps the session with nothing to send, because PX4 frees buffers after 2 s,
+and a log that a program appends to each second must not keep the session for ever."""
 
 CHECKPOINT_EVERY = 60.0
-"""Seconds after which an upload is terminated and resumed: what a lost session can cost."""
+"""Seconds after which an upload terminates and resumes, because a lost session costs all bytes since the last
+Terminate."""
 
 REFUSALS = (FtpNak, ProtocolError)
-"""Errors that do not pass by themselves."""
+"""Errors after which the upload is tried again only at the next `finish`."""
 
 _OFTEN = 0.25
 
@@ -50,16 +55,16 @@ class Stop(Enum):
     """Why an upload lets go of the session."""
 
     STARVED = "starved"
-    """All that may be sent now is ACKed. While the file grows, a last part of a chunk waits."""
+    """The source has nothing to send, and all sent bytes are ACKed."""
     YIELD = "yield"
-    """It goes on in a later turn."""
+    """The upload resumes in a later turn."""
     ARMED = "armed"
-    """The vehicle was armed: nothing is waited for."""
+    """The vehicle is armed, so the upload does not wait for answers in flight."""
 
 
 class Upload(SessionUser):
-    """Implements cache.remote.Upload. Nothing is sent before the source has something, or
-    `finish` is called.
+    """Implements cache.remote.Upload. The upload sends nothing before its source has something, or `finish`
+    is called.
 
     Attributes:
         may_exist, made_twice: see cache.remote.Upload.
@@ -139,8 +144,8 @@ class Upload(SessionUser):
         return self._awaited_since if self.awaited else None
 
     def on_armed_changed(self) -> None:
-        """If it waits for a turn, its callers get Armed at once; in a turn it sees that itself. After
-        disarming it goes on."""
+        """Raise Armed in the callers at once if the upload waits for a turn. In a turn, `_watch` notices that
+        the vehicle is armed. The upload resumes when the vehicle disarms."""
         if self._vehicle.may_write:
             self._retry_at = 0.0
         else:
@@ -177,27 +182,28 @@ class Upload(SessionUser):
                 await self._use(turn)
 
     def _due_in(self) -> float:
-        """Return in how many seconds it wants a turn, unless it is woken before. While the vehicle is armed
-        it wants none, so that no reader makes way for it."""
+        """Return in how many seconds the upload needs a turn, unless it is woken before. While the vehicle is
+        armed, it needs none, so that no reader yields to it."""
         wanted = self.awaited or (not self._waits_for_finish and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
         return self._retry_at - self._clock()
 
     def _has_work(self) -> bool:
-        """Whether there is something to send or to close. An empty file has to be made, too, once."""
+        """Whether there is something to send or to close. An empty file, too, has to be created once."""
         source = self._source
         return source.has_more() or not source.acked.empty or (self.awaited and not source.has_checkpoint)
 
     def _fail(self, error: MavftpfsError) -> None:
-        """Raise an error in all `finish`, and try again later; after a refusal only at the next `finish`."""
+        """Raise an error in each `finish` that waits, and try again after RETRY_AFTER; after a refusal only
+        at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
         self._waits_for_finish = isinstance(error, REFUSALS)
         self._retry_at = self._clock() + RETRY_AFTER
 
     async def _use(self, turn: Turn) -> None:
-        """Have a turn."""
+        """Use a turn: open, write, close."""
         try:
             session = await self._open(turn)
             stop = await self._write(turn, session)
@@ -210,8 +216,8 @@ class Upload(SessionUser):
             self._on_failure(error)
 
     def _on_failure(self, error: MavftpfsError) -> None:
-        """Send again what is not proven, because a turn failed. A lost session is an error only if it is lost
-        again and again without getting further.
+        """Have all bytes since the last checkpoint sent again, because a turn failed. A lost session is an
+        error only after REOPENS losses without progress.
 
         Raises:
             MavftpfsError: what it failed with.
@@ -235,14 +241,15 @@ class Upload(SessionUser):
 
     @property
     def _may_interrupt(self) -> bool:
-        """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
+        """Whether the file may be closed now and resumed later: the server keeps the content, or closing and
+        reopening this file is the way to learn that."""
         to_tell = self._engine.traits.wo_truncates is None and not self._cannot_resume
         return self._keeps_content or (to_tell and self._source.reached > 0)
 
     def _complete(self, finishers: list[Future]) -> None:
-        """Let these callers go: everything that the source had when they began to wait is ACKed, and the file
-        was closed. Where it cannot be written on, more bytes cost the whole file once more, so they wait for
-        the next `finish`."""
+        """Return from these callers' `finish`: all bytes that the source had then are ACKed, and the file was
+        closed. If the file cannot be resumed, more bytes cost the whole file once more, so they wait for the
+        next `finish`."""
         for finisher in finishers:
             finisher.end()
         self._losses = 0
@@ -251,7 +258,7 @@ class Upload(SessionUser):
     # --- opening
 
     async def _open(self, turn: Turn) -> OpenSession:
-        """Open the upload's file: to go on with it where that is possible, else to begin it."""
+        """Open the upload's file: resume it if possible, otherwise create it."""
         source = self._source
         if source.has_checkpoint and self._may_interrupt:
             session = await self._reopen(turn)
@@ -269,11 +276,12 @@ class Upload(SessionUser):
         return session
 
     async def _reopen(self, turn: Turn) -> OpenSession | None:
-        """Open an interrupted file to go on with it; None if it does not have what was proven.
+        """Open an interrupted file to resume it; return None if it lacks bytes of the last checkpoint.
 
-        The first time since the vehicle's start that finds out what OpenFileWO does (docs/servers.md 8): the
-        size tells, asked afterwards, since the reply to OpenFileWO may say what it was before. A refusal says
-        nothing of the server: only this upload is not interrupted any more.
+        The first call since the vehicle's start finds out whether OpenFileWO empties files (docs/servers.md
+        8), by the size in the ACK of a later OpenFileRO, because the ACK of OpenFileWO may hold the size
+        before. After a refusal, only this upload stops being interrupted, because a refusal proves nothing of
+        the server.
         """
         traits, reached = self._engine.traits, self._source.reached
         try:
@@ -297,22 +305,22 @@ class Upload(SessionUser):
     # --- writing
 
     async def _write(self, turn: Turn, session: OpenSession) -> Stop:
-        """Write until there is a reason to stop. The session is open then, and what was sent is ACKed unless
-        no answers come.
+        """Write until there is a reason to stop. The session is still open then, and all sent bytes are
+        ACKed, unless the server went silent or the vehicle is armed.
 
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         server, stop = self._server, None
-        # A light user that waits gets the session after these requests. On a slow radio a whole queue of them
-        # takes a quarter of a second.
+        # An interactive user that waits gets the session after these requests. On a slow radio a whole queue
+        # of them takes a quarter of a second.
         queue = self._engine.traits.queue_limit
         transfer = WriteTransfer(
             session.id,
             self._source,
             self._scheduler.write_chunks,
             root=storage_root(self.path),
-            in_flight=queue // 2 if queue and turn.light_waits else None,
+            in_flight=queue // 2 if queue and turn.interactive_waits else None,
             on_starved=server.wake,
         )
         self._transfer = server.transfer = transfer
@@ -323,7 +331,7 @@ class Upload(SessionUser):
             self._end_transfer()
         error = transfer.error
         if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
-            # Its requests for paths do not alternate with our writes: the next turns try again.
+            # That client's requests with a path do not alternate with these writes; the next turns try again.
             raise SessionLost(f"beside another FTP client: {error}") from error
         if error is not None:
             raise error
@@ -337,7 +345,7 @@ class Upload(SessionUser):
             self._server.wake()
 
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
-        """Return the reason to let go; None if the transfer ended by itself."""
+        """Return why the upload stops; None if the transfer ended by itself."""
         server, clock = self._server, self._clock
         fed_at = clock()
         while not transfer.done:
@@ -345,8 +353,8 @@ class Upload(SessionUser):
             if not transfer.starved:
                 fed_at = clock()
             stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
-            # After a silence the session may be gone (servers.md 14.9): the answer to Terminate tells. Where
-            # closing costs the whole file, it is closed only if another client was heard.
+            # After a silence the session may be gone (servers.md 14.9), which the answer to Terminate shows.
+            # If closing costs the whole file, the upload closes it only if another client was heard.
             closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
             if stalled and stop is None:
@@ -361,7 +369,7 @@ class Upload(SessionUser):
     def _reason_to_stop(
         self, turn: Turn, session: OpenSession, transfer: WriteTransfer, starved_for: float
     ) -> Stop | None:
-        """starved_for: seconds for which there was nothing to send."""
+        """Return why the upload should stop now, or None. starved_for: seconds with nothing to send."""
         if not self._vehicle.may_write:
             return Stop.ARMED
         if self._scheduler.is_excluded(self.path):
@@ -385,10 +393,10 @@ class Upload(SessionUser):
     # --- letting go
 
     async def _close(self, session: OpenSession, stop: Stop) -> None:
-        """Close the file, and judge by that what of it is written.
+        """Close the file, and take all ACKed bytes for written if that worked.
 
-        A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). But that
-        restart raises doubt, so the file is compared; and `_reopen` compares its size.
+        A vehicle that restarted before may ACK the Terminate, too, because ArduPilot ACKs that of any
+        session. But a restart makes ACKs suspect, so the file is compared; and `_reopen` compares its size.
         """
         self._server.require_open(session)
         try:

@@ -4,9 +4,9 @@ Everything here is learned by listening. Link health (promise 4) is heartbeats p
 session: that a request timed out since the last heartbeat.
 
 Two vehicles have the same MAVLink address unless somebody gave them others: PX4's system id is 1 wherever it
-is fresh. What is held for the first must not be written to the second, nor what was read of one be completed
-from the other. A vehicle that told its unique id once (AUTOPILOT_VERSION) has to tell it again after each
-restart and each silence, before anything else is believed or sent.
+is fresh. Bytes for the first must not be written to the second, nor a file of one be completed from the
+other. So a vehicle that once reported its unique id (AUTOPILOT_VERSION) has to report it again after each
+restart and each silence, before this connection believes or sends anything else.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ class Identity:
 
     def _is_stranger(self) -> None:
         was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
-        if was_trusted:  # nobody asks, and ours may come back without a silence
+        if was_trusted:  # nobody asks, and the known vehicle may come back without a silence
             self._on_doubt()
 
     def _trust(self) -> None:
@@ -186,9 +186,10 @@ class Vehicle:
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
-    own: our address; replies to anyone else are another FTP client's. on_another_client: called with each
-    payload of its, and whether none was heard for a while. on_refusal: called when it refuses to be armed.
-    on_double: somebody else uses our address. on_doubt, patience: see Identity.
+    own: this connection's address; replies to others are another FTP client's. on_another_client: called with
+    each payload of its, and whether none was heard for a while. on_refusal: called when it refuses to be
+    armed.
+    on_double: called when somebody else uses that address. on_doubt, patience: see Identity.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
@@ -301,7 +302,7 @@ class Vehicle:
         self._timed_out = True
 
     def on_message(self, message: Message, now: float) -> None:
-        """Learn from any message except FTP replies to us."""
+        """Learn from any message except FTP replies to this connection."""
         if self.address is not None and message.source == self.address:
             self.identity.heard(now)
         match message:
