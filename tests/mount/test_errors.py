@@ -23,7 +23,7 @@ def test_a_mount_is_not_put_onto_a_vehicle_and_says_what_it_hides(field: Field, 
     (full / "file").write_text("")
     source = f"udpin:{HOST}:{free_udp_port()}"
     said = mavftpfs(source, full, "-o", "connect_timeout=1,window=4", code=2)[1]
-    assert f"{full} is not empty: what is in it is hidden" in said
+    assert f"{full} is not empty: its files are hidden" in said
     assert said.count("option window is gone") == 1
 
 

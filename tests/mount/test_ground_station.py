@@ -278,7 +278,7 @@ def test_endpoints_that_cannot_be_are_said_in_a_line(field: Field) -> None:
             (f"forward=udpin:{HOST}:{taken}", 2, "is in use by another program"),
             ("forward=serial:///dev/nowhere:57600", 2, "there is no /dev/nowhere"),
             ("forward=nonsense", 1, "forward=nonsense"),
-            (f"forward=udpout:{HOST}:{taken}#/dir", 1, "no directory"),
+            (f"forward=udpout:{HOST}:{taken}#/dir", 1, "cannot name a directory"),
         ):
             failing = Mount(flown.source, place, field.local("out"), (option,))
             process = Program("mount", failing.argv(), failing.folder)
