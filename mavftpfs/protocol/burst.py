@@ -153,7 +153,7 @@ class BurstTransfer(ReadTransfer):
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted, on its way or streaming."""
+        """Whether no range is pending, and no burst is running."""
         return self._burst is None and super().idle
 
     def next_requests(self, most: int, now: float) -> list[Request]:
@@ -166,7 +166,7 @@ class BurstTransfer(ReadTransfer):
         gap = self.wants.take(self.chunks.size, self._covered)
         if gap is not None:
             return self._requests_for(gap, self.chunks.size)
-        if self.wants.on_its_way:
+        if self.wants.in_flight:
             return []
         self._covered = 0
         first = self.wants.demand.todo.first() or self.wants.ahead.todo.first()
@@ -207,7 +207,7 @@ class BurstTransfer(ReadTransfer):
             self._end_burst(burst)
 
     def finish(self) -> None:
-        """End; what was on its way is wanted again."""
+        """End; ranges in flight lose their requests and stay pending."""
         self._burst = None
         super().finish()
 

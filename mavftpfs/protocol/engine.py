@@ -1,11 +1,15 @@
 """The client engine: matches replies, keeps the window, notices losses. Layer: protocol; pure.
 
-Theory of operation. Operations say what to ask (`next_requests`) and are told of believed answers. A reply
-belongs to the request whose seq is one less. It is believed if it has the request's req_opcode and, where
-servers echo them, its session and offset. A reply that is not believed changes nothing. A request is lost
-when a later one was answered and a little more than a round trip passed, or when its timer runs out (see
-`timers`). Its operation is told, and asks again. While burst packets arrive timers stand still, because
-ArduPilot answers nothing else then (servers.md 4).
+Theory of operation. An operation supplies requests (`next_requests`) and receives believed answers. A reply
+belongs to the request whose seq is one less. The engine believes it if it has the request's opcode and, where
+servers echo them, its session and offset. Other replies never reach an operation. A request is lost when a
+later one was answered and a little more than a round trip passed, or when its timer runs out (see `timers`).
+The engine then calls its operation's `on_lost`, and the operation supplies the request again. While burst
+packets arrive, timers stand still, because ArduPilot answers nothing else then (servers.md 4).
+
+**How many requests may be in flight?** `flow` decides how many, `pathgate` which kind, and an exclusive
+operation keeps all others back. **When does an operation end without an answer?** When it made no progress
+for its `patience`; lost requests are not counted.
 
 Nothing that comes in can raise: `receive` takes any payload at any time.
 """
@@ -41,10 +45,10 @@ _NAK = int(Opcode.NAK)
 class EngineStats:
     """Plain counters since the engine was made.
 
-    requests: transmissions, also by_opcode. lost: requests that were taken to be lost while their operation
-    wanted an answer. spurious: of these, the ones that were answered after all. replies: believed ones, burst
-    packets included. unknown: replies that nothing waits for (late, duplicate, not ours). unexplained: of
-    these, the ones that no repetition of ours explains.
+    requests: transmissions, also by_opcode. lost: requests that were declared lost while their operation
+    waited for an answer. spurious: how many of these were answered after all. replies: believed ones, burst
+    packets included. unknown: replies that no operation waits for (late, or doubled). unexplained: how many
+    of these exceed the transmissions of their requests.
     """
 
     requests: int = 0
@@ -63,10 +67,10 @@ class Engine:
         rng: for the first seq and the session id to ask for.
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
-        on_unexplained: called with each reply that fits no request of ours whose answer may still come, and
-            with the seconds since its request went out (None where that is not known).
-        on_late: called with each ACK that nothing waits for any more, of a request that was lost or repeated,
-            or whose operation was cancelled, and with the time at which that went out first.
+        on_unexplained: called with each reply beyond one for each transmission of its request, and with the
+            seconds since the request went out (None if that is not known).
+        on_late: called with each ACK to a request whose operation has ended or was cancelled, and with the
+            time at which the request went out first.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -110,7 +114,7 @@ class Engine:
 
     @property
     def in_flight(self) -> int:
-        """Requests on their way, those of cancelled operations included."""
+        """The number of requests in flight, those of cancelled operations included."""
         return len(self._ledger.outstanding)
 
     def serves_others(self, op: Operation) -> bool:
@@ -118,14 +122,14 @@ class Engine:
         return any(request.op is not op for request in self._ledger.outstanding.values())
 
     def timeout(self, manner: Manner) -> float:
-        """Return how many seconds an answer is waited for at present."""
+        """Return how many seconds a first transmission waits for its answer at present."""
         return self._timers.timeout(manner)
 
     # --- traits
 
     def learn_session_echo(self, echoed: bool) -> None:
-        """Note that an Open ACK had the id asked for (servers.md 14.6; then the queue is shared), or
-        another."""
+        """Note whether an open ACK had the session id that was asked for (servers.md 14.6). If so, the server
+        is ArduPilot's, with one short queue for all clients."""
         self.traits.ack_carries_own_session = echoed
         if echoed:
             self.traits.queue_limit = SHARED_QUEUE_WINDOW
@@ -140,10 +144,10 @@ class Engine:
     # --- operations
 
     def start(self, op: Operation, now: float) -> None:
-        """Take an operation on; its first request goes out with the next `outgoing`.
+        """Start an operation; its first request goes out with the next `outgoing`.
 
         Raises:
-            LocalProtocolError: it was taken on before.
+            LocalProtocolError: it was started before.
         """
         if op.started:
             raise LocalProtocolError("an operation runs once")
@@ -173,7 +177,7 @@ class Engine:
     # --- what comes in
 
     def receive(self, reply: Payload, now: float) -> None:
-        """Take a reply of our server to us; anything may be in it."""
+        """Take a reply of the server to this client; anything may be in it."""
         if reply.req_opcode == _BURST and self._on_burst(reply, now):
             return
         request = self._ledger.find(reply.seq)
@@ -255,21 +259,22 @@ class Engine:
                 self._due = min(self._due, request.timer)
 
     def _on_replay(self, request: Request, now: float) -> None:
-        """The server replays an earlier reply under this seq, so it will never answer this one (servers.md
-        2). It may also be a packet of an abandoned burst, and each new seq is one more execution: so wait
-        for the time in which an answer would have come."""
+        """Note a reply of another opcode under a request's seq: the server replays an earlier reply, and will
+        never answer this seq (servers.md 2), so the request goes out again under a new one. The reply may
+        also be a packet of an abandoned burst, and a new seq means one more execution, so the engine first
+        waits as long as for an answer."""
         if request.outstanding and not request.stale:
             request.stale = True
             request.timer = min(request.timer, now + self._timers.timeout(request.manner))
             self._due = min(self._due, request.timer)
 
     def _session_changed(self, request: Request, reply: Payload) -> bool:
-        """Whether a refusal only says that the session changed while the request was on its way."""
+        """Return whether a refusal only means that the session changed while the request was in flight."""
         changed = request.follows and request.session != self.session
         return changed and reply.data[:1] == _INVALID_SESSION
 
     def _lose(self, request: Request, now: float) -> None:
-        """Give up a request. Its operation asks again, unless it is not there any more."""
+        """Declare a request lost. Its operation asks again, unless that has ended."""
         op = request.op
         self.flow.on_loss()
         self._ledger.lose(request)
@@ -312,7 +317,7 @@ class Engine:
         return wires
 
     def hold(self, now: float) -> None:
-        """Send nothing now. The patience of operations that want something runs all the same."""
+        """Send nothing now. The patience of operations runs all the same, unless they are idle."""
         for op in self._ops:
             op.waits(now)
 
@@ -321,7 +326,7 @@ class Engine:
         if op.done or not op.waits(now):
             return True
         if self._gate.keeps(op) or self._waits_for_exclusive(op):
-            op.progress(now)  # it is not the vehicle that is silent
+            op.progress(now)  # the vehicle owes no answer
             return True
         # An urgent one may use one slot more than bulk work: a full window must not make it wait.
         urgent = op.urgent
@@ -341,8 +346,8 @@ class Engine:
         return left > 0
 
     def _waits_for_exclusive(self, op: Operation) -> bool:
-        """Return whether another operation has the server for itself. What went out before that is carried
-        out before it."""
+        """Return whether another operation is exclusive. Requests that went out before may still be in
+        flight, because the server executes them first."""
         lone = next((one for one in self._ops if one.exclusive and not self._gate.keeps(one)), None)
         return lone is not None and op is not lone
 
@@ -363,7 +368,7 @@ class Engine:
         if first.opcode == _BURST:
             self._burst_op = op
             ledger.leave(first)  # its packets tell what became of it, and it is never repeated
-            # The seqs of its packets must not be seqs of ours (servers.md 2, collision).
+            # No later request may have the seq of one of its packets (servers.md 2, collision).
             ledger.jump(op.on_burst_sent(first, now))
         else:
             self._due = min(self._due, timer)
@@ -379,8 +384,8 @@ class Engine:
         return None if deadline == inf else deadline
 
     def on_deadline(self, now: float) -> None:
-        """Lose what is overdue, and end operations that got no further for too long. Harmless when called
-        early or late."""
+        """Declare overdue requests lost, and fail operations without progress for their patience. Harmless
+        when called early or late."""
         if now >= self._due:
             self._lose_overdue(now)
         for op in self._ops.copy():
@@ -406,8 +411,8 @@ class Engine:
             self.flow.on_silence(unheard)
 
     def _overdue_at(self, request: Request, now: float) -> float:
-        """Return when a request is lost by its timer, as far as is known now, because round trips may have
-        grown since it went out. ArduPilot answers nothing else during a burst, so silence proves nothing then
+        """Return when a request's timer runs out, by the round trips known now, because they may have grown
+        since it went out. ArduPilot answers nothing else during a burst, so silence proves nothing then
         (servers.md 4)."""
         manner, op, flow = request.manner, request.op, self.flow
         quiet = max(0.0, request.sent_at - op.progress_at)

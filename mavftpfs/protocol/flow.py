@@ -7,8 +7,8 @@ rounds it asks for a quarter more, to find out when the path improves. Requests 
 than that rate, so that a short queue takes them.
 
 Radios lose frames. So loss alone does not narrow the window: it changes neither rate nor round trip. As many
-more requests make up for it, but not in every round: in the others, losses that we cause by sending too much
-cease. Loss while a queue stands (even the quickest answer of a round took long) is congestion, and narrows
+more requests make up for it, but not in every round: in the others, losses cease that come from sending too
+much. Loss while a queue stands (even the quickest answer of a round took long) is congestion, and narrows
 the window. When nothing at all is heard for a retransmission timeout, two requests probe until an answer
 comes. At first the window grows by one with every answer, which doubles it each round, until the rate stops
 growing, a queue stands, or much is lost.
@@ -68,7 +68,7 @@ show."""
 
 CYCLE, STEP = 5, 0.25
 """One round in CYCLE, and each one after the rate grew, asks for a quarter (STEP) more than the path carries.
-The round after the one in CYCLE makes up for no losses, so that losses of a queue that we overflow cease. The
+The round after the one in CYCLE makes up for no losses, so that losses of a queue that overflows cease. The
 start goes on while the rate grows by a quarter."""
 
 START = 4.0
@@ -108,8 +108,8 @@ LOSS_MEMORY = 100
 
 LOSS_RISE, MOST_LOSS = 0.1, 0.34
 """The share of losses that a wider window and a higher pace make up for rises more slowly than it falls, by
-LOSS_RISE: losses of a link stay, those of a queue of ours go. The share is at most MOST_LOSS: 19 % each way.
-A round of the start that loses more ends the start."""
+LOSS_RISE: losses of a link stay, those of an overflowing queue go. The share is at most MOST_LOSS: 19 % each
+way. A round of the start that loses more ends the start."""
 
 UNUSUAL = 3.0
 """A round lost more than usual if its loss is so many standard deviations above the usual one."""
@@ -230,10 +230,10 @@ class Flow:
         window = self.cap if capped and not self._before_silence else self.window
         room = window - in_flight
         if capped and self.alone and not self._hurried:
-            room += 1  # one more fits a short queue of our own (servers.md 3)
+            room += 1  # one more fits a short queue that no other client fills (servers.md 3)
         if urgent:
             self._hurried = True
-        elif self._hurried:  # an urgent answer should not queue behind our slack
+        elif self._hurried:  # an urgent answer should not queue behind the slack
             room -= min(SLACK + 1, window // 2)
         elif self.pause and not capped:
             room += self._beyond(now, self._reserve() if paced else 0.0)
@@ -336,11 +336,11 @@ class Flow:
         self._round = Round(now, next_order)
 
     def on_loss(self) -> None:
-        """Note that a request is taken to be lost."""
+        """Note that a request was declared lost."""
         self._round.lost += 1
 
     def on_spurious(self) -> None:
-        """Note that a transmission which was taken to be lost was answered after all."""
+        """Note that a request was answered after all that had been declared lost."""
         self._round.lost = max(0, self._round.lost - 1)
 
     def on_silence(self, unheard: int = SILENT) -> None:

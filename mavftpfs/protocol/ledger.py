@@ -1,9 +1,9 @@
-"""Which requests are out, and under which seqs answers may still come. Layer: protocol; pure.
+"""The requests in flight, and the seqs under which answers may still come. Layer: protocol; pure.
 
-Every transmission has an *order* number, and every request a seq, by which its answers are found. A request
-that was lost stays known under its seq: its late answer counts, and explains itself. So does one that was
-answered, but sent more often than that. When its operation is cancelled a request becomes a ghost: it keeps
-its place in the window, because the server still has it in its queue.
+Every transmission has an *order* number, and every request a seq, by which the ledger finds it when an answer
+arrives. A lost request stays known under its seq, so its late answer counts, and is no sign of a duplicate.
+The same holds for a request with fewer answers than transmissions. If its operation ends, a request becomes a
+ghost. A ghost keeps its place in the window, because the server still has it in its queue.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _ACK = int(Opcode.ACK)
 
 
 class Ghost(Operation):
-    """Owns the requests of cancelled operations until they are answered or given up. Nothing is asked of
-    it."""
+    """Owns the requests of operations that ended, until they are answered or lost. The engine never asks a
+    ghost for requests."""
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Nothing to do: the answer is not wanted any more."""
@@ -58,7 +58,7 @@ class Ledger:
     # --- going out
 
     def take_seq(self) -> int:
-        """Return a seq, 0..65534, under which no answer is to come, and count on."""
+        """Return the next seq, 0..65534, under which no answer is expected, and advance."""
         table = self._table
         seq = self._seq
         while seq > LAST_SEQ or seq + 1 in table:  # bounded: the table is far smaller than 65535
@@ -67,8 +67,8 @@ class Ledger:
         return seq
 
     def jump(self, packets: int) -> None:
-        """Skip the seqs that a server may use by itself in a burst of so many packets, and as many more:
-        packets of a burst may come long after it was given up (servers.md 14.3)."""
+        """Skip the seqs that a server uses for the packets of a burst, and as many more, because packets may
+        arrive long after the burst was abandoned (servers.md 14.3)."""
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
 
@@ -103,7 +103,7 @@ class Ledger:
         self._table[request.seq + 1] = self.outstanding[request.order] = request
 
     def leave(self, request: Request) -> None:
-        """Forget a request that went out, because its operation looks for the answers itself."""
+        """Forget a BurstReadFile that went out, because its operation recognises the packets itself."""
         request.outstanding = False
         del self._table[request.seq + 1], self.outstanding[request.order]
 

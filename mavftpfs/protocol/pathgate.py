@@ -1,4 +1,4 @@
-"""Writes, or requests with a path: not both at once where a server mixes them up. Layer: protocol; pure.
+"""Keeps writes and requests with a path apart on servers that mix them up. Layer: protocol; pure.
 
 PX4 on NuttX checks each WriteFile against a scratch buffer in which most requests with a path leave that path
 (docs/servers.md 8). Once a write was refused for that, or with NAK 8, which may hide it, the two kinds
@@ -9,9 +9,9 @@ alternate while a file is written:
 | writes (first) | WriteFile | when a path waits, and the phase lasted `LEAST` or nothing is to be written |
 | paths | requests with a path | when bytes wait, and the phase lasted `LEAST` or no path waits |
 
-Nothing of one kind goes out while the other is on its way, and no phase ends before it could send. Before the
-first write after paths the transfer sets the buffer right (`Operation.on_paths`). Answers come while both
-kinds wait, so no timer ends a phase.
+No request of one kind goes out while one of the other is in flight, and no phase ends before it could send.
+Before the first write after paths the transfer sets the buffer right (`Operation.on_paths`). Each answer lets
+the gate look again, so a phase needs no timer.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class PathGate:
         self._clear = True
 
     def look(
-        self, ops: Sequence[Operation], flying: Collection[Request], now: float, rtt: float | None
+        self, ops: Sequence[Operation], in_flight: Collection[Request], now: float, rtt: float | None
     ) -> None:
-        """Decide which phase it is. ops: all, where paths block writes, else none. flying: the requests on
-        their way."""
+        """Choose the phase. ops: all operations if paths block writes, otherwise none. in_flight: the
+        requests in flight."""
         transfer = next((op for op in ops if op.bulk == Opcode.WRITE_FILE), None)
         if transfer is not self._transfer:
             self._transfer, self._writes, self._began = transfer, True, now
@@ -63,16 +63,16 @@ class PathGate:
             return
         writing, asking = not transfer.idle, any(op.opcode in LEAVES_PATH for op in ops)
         wanted, other = (writing, asking) if self._writes else (asking, writing)
-        paths = any(r.opcode in LEAVES_PATH and r.op is not transfer for r in flying)
+        paths = any(r.opcode in LEAVES_PATH and r.op is not transfer for r in in_flight)
         if paths or not self._writes:
             transfer.on_paths()
         ends = self._began + max(LEAST, LEAST_TRIPS * (rtt or 0.0))
         if other and (not wanted or (self._clear and now >= ends)):
             self._writes, self._began = not self._writes, now
-        self._clear = not (paths if self._writes else any(r.op is transfer for r in flying))
+        self._clear = not (paths if self._writes else any(r.op is transfer for r in in_flight))
 
     def keeps(self, op: Operation) -> bool:
-        """Return whether an operation is to wait."""
+        """Return whether an operation has to wait."""
         if self._transfer is None:
             return False
         if op is self._transfer:

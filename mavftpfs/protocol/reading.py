@@ -33,7 +33,7 @@ _BLOCKS_AHEAD = 3
 
 
 class DataSink(Protocol):
-    """Where the bytes go."""
+    """Receives the bytes."""
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the parts of [start, stop) that are not here yet."""
@@ -46,10 +46,10 @@ class DataSink(Protocol):
 
 
 class Wants:
-    """The ranges of a file that are wanted and have not come. They outlive the transfers that take from them.
+    """The pending ranges of a file: those asked for that did not arrive. They outlive each transfer.
 
     Attributes:
-        demand: what programs wait for; it goes first. ahead: readahead, none of it in demand.
+        demand: ranges that programs wait for, requested first. ahead: readahead; no byte is in both.
     """
 
     def __init__(self) -> None:
@@ -57,16 +57,16 @@ class Wants:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted or on its way."""
+        """Whether no range is pending."""
         return self.demand.empty and self.ahead.empty
 
     @property
-    def on_its_way(self) -> bool:
-        """Whether requests are out."""
+    def in_flight(self) -> bool:
+        """Whether requests are in flight."""
         return not (self.demand.out.empty and self.ahead.out.empty)
 
     def add(self, ranges: Iterable[tuple[int, int]], *, demand: bool) -> None:
-        """Want these ranges, too. demand: a program waits for them, also for what is readahead so far."""
+        """Add pending ranges. demand: a program waits for them, also for parts that are readahead so far."""
         demanded, ahead = self.demand, self.ahead
         for start, stop in ranges:
             if demand:
@@ -84,8 +84,8 @@ class Wants:
                 ahead.todo.add(*part)
 
     def take(self, limit: int, below: int) -> tuple[int, int] | None:
-        """Return the first of what is wanted below an offset, at most `limit` bytes, for which a request goes
-        out now."""
+        """Return the first pending range below an offset without a request, at most `limit` bytes, for which
+        a request goes out now."""
         for wanted in (self.demand, self.ahead):
             first = wanted.todo.first()
             if first is not None and first[0] < below:
@@ -95,23 +95,23 @@ class Wants:
         return None
 
     def on_done(self, start: int, stop: int) -> None:
-        """These bytes came."""
+        """Note that these bytes arrived."""
         self.demand.on_done(start, stop)
         self.ahead.on_done(start, stop)
 
     def on_lost(self, start: int, stop: int) -> None:
-        """A request for these bytes is lost."""
+        """Note that a request for these bytes is lost."""
         self.demand.on_lost(start, stop)
         self.ahead.on_lost(start, stop)
 
     def give_back(self) -> None:
-        """Nobody takes answers any more."""
+        """Lose all requests, because nobody accepts their replies."""
         self.demand.give_back()
         self.ahead.give_back()
 
     def drop(self, *, demand: bool = True) -> None:
-        """Want nothing more; demand: False: no readahead. What is on its way comes all the same, but no
-        program waits for it."""
+        """Drop the ranges without a request; demand: False: only readahead. Bytes in flight still arrive, but
+        no program waits for them."""
         self.ahead.todo = ExtentSet()
         if demand:
             self.demand.todo = ExtentSet()
@@ -132,7 +132,7 @@ class ReadTransfer(Operation):
         received_bytes: delivered to the sink so far.
 
     Fails with SessionLost (reopen, and start another with `wants`; the file may have become shorter, too),
-    FtpNak, or RequestTimeout. After `finish`, too, all that did not come is to be asked for by `wants`.
+    FtpNak, or RequestTimeout. At the end, `finish` included, all bytes that did not arrive are in `wants`.
     """
 
     urgent = False
@@ -156,12 +156,13 @@ class ReadTransfer(Operation):
     # --- what the owner says and sees
 
     def want(self, start: int, stop: int, demand: bool) -> None:
-        """Ask for what the sink lacks of [start, stop), clamped to the size, if it is not on its way."""
+        """Ask for the bytes of [start, stop), clamped to the size, that the sink lacks and that are not in
+        flight."""
         self.wants.add(self._sink.missing(start, min(stop, self.size)), demand=demand)
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted or on its way."""
+        """Whether no range is pending."""
         return self.wants.idle
 
     @property
@@ -200,7 +201,7 @@ class ReadTransfer(Operation):
             return
         nak = nak_of(request, reply)
         if nak.code in _LOST_CODES or nak.server_errno == _EBADF:
-            # Where each client has a session id of its own, an EOF is that of our file.
+            # If each client has a session id of its own, an EOF is that of this file.
             at_end = nak.code == NakCode.EOF and self.port.traits.ack_carries_own_session
             self.fail(SessionLost(str(nak), by_server=not at_end))
         else:
@@ -237,7 +238,7 @@ class ReadTransfer(Operation):
             self._sink.on_data(offset, data)
 
     def finish(self) -> None:
-        """End; what was on its way is wanted again."""
+        """End; ranges in flight lose their requests and stay pending."""
         if not self.done:
             self.wants.give_back()
         super().finish()

@@ -1,9 +1,9 @@
-"""One request on its way, and the manner in which each opcode is repeated. Layer: protocol; pure.
+"""One request in flight, and the manner (retry policy) of each opcode. Layer: protocol; pure.
 
 A manner says how a request is repeated after its answer was lost. Reads, writes and listings may be executed
-twice. So their operations ask again by a new request with a seq of its own, and answers can be told apart. A
-request that changes the server goes out again under the *same* seq first, because PX4 and ArduPilot replay
-their last reply, if this is still their last one (servers.md 2).
+twice. So their operations supply a new request with a seq of its own, and the answers can be told apart. Any
+other request goes out again under the *same* seq, because PX4 and ArduPilot recognise it by the seq and
+replay their reply, if this is still their last one (servers.md 2).
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Manner(NamedTuple):
             apart.
         ordered: servers answer in order, so answers to later requests prove a loss.
         echoes_offset: an ACK carries the request's offset; None: where the server was seen to do so.
-        backoff: the share of the time without progress by which the wait grows.
-        work: seconds that the slowest server works at it, beyond the round trip.
-        usual_work: seconds that a usual server works at it; the first transmission waits for so long.
+        backoff: a transmission waits at least this share of the time without progress.
+        work: seconds that the slowest server works at the request, beyond the round trip.
+        usual_work: seconds that a usual server does; the first transmission waits for so long.
     """
 
     floor: float
@@ -72,7 +72,7 @@ class Request:
         owed: how many answers may still come, one for each transmission.
         repeated: the request went out more than once.
         passed: a later request was answered, so this one is lost soon.
-        stale: no answer will come under this seq, because the server replays another one.
+        stale: no answer will come under this seq, because the server replays another reply.
         seq, order, sent_at, timer: of the last transmission. first_sent: of the first one.
     """
 
@@ -165,29 +165,29 @@ class Port(Protocol):
 
 
 class Operation:
-    """A state machine which the engine asks for requests and tells of replies.
+    """A state machine that supplies the engine with requests and receives the replies.
 
-    The operation reports its `progress`; `progress_at` is inf while nothing is wanted of the server. The
-    engine fails an operation with RequestTimeout when there was no progress for `patience` seconds (inf: the
-    engine's deadline). `timer` is the time at which `on_timer` is to be called. An operation ends by `finish`
-    or `fail`, once.
+    The operation reports its `progress`; `progress_at` is inf while it is idle. The engine fails an operation
+    with RequestTimeout if there was no progress for `patience` seconds (inf: the engine's deadline). `timer`
+    is the time at which the engine calls `on_timer`. `sent`: a request went out. An operation ends by
+    `finish` or `fail`, once.
     """
 
     urgent = True
-    """Whether it goes first when there is room. The transfers of bytes are not urgent."""
+    """Urgent operations go first when there is room. All are urgent except the transfers of bytes."""
 
     opcode = -1
-    """That of the one request it makes, again and again or once; -1: it makes several kinds."""
+    """The opcode of all its requests; -1: they have several."""
 
     bulk = -1
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
 
     paced = True
-    """Whether more may be on the way than a server queues, evenly spread (see `flow`)."""
+    """Whether more requests may be in flight than a server queues, evenly spread (see `flow`)."""
 
     exclusive = False
-    """Whether nothing else goes out until it is answered: the server remembers only its last reply, so it
-    answers a repetition from memory and does not carry it out again (servers.md 2)."""
+    """Exclusive: the engine sends nothing else until this operation ends. The server remembers only its last
+    reply, so it answers a repetition from memory in place of executing it again (servers.md 2)."""
 
     done = False
     error: MavftpfsError | None = None
@@ -202,12 +202,12 @@ class Operation:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted of the server, so that silence is no failure."""
+        """Whether the operation needs nothing from the server, so that silence is no failure."""
         return False
 
     def waits(self, now: float) -> bool:
-        """Return whether something is wanted of the server. If nothing was before, its patience starts
-        now."""
+        """Return whether the operation needs something from the server. If it was idle before, its patience
+        starts now."""
         if self.idle:
             self.progress_at = inf
             return False
@@ -216,19 +216,20 @@ class Operation:
         return True
 
     def progress(self, now: float) -> None:
-        """Note that the operation got further, or that it waited for something else than the server."""
+        """Note that the operation got further, or waited for something else than the server: its patience
+        starts anew."""
         self.progress_at = now
 
     def next_requests(self, most: int, now: float) -> list[Request]:
-        """Return some of the next requests, at most `most` (at least one) and all of one opcode; none if
+        """Return at most `most` (at least one) requests to send now, all of one opcode; an empty list if
         there is none for now. A request that went out before goes out again under its seq."""
         raise NotImplementedError
 
     def on_lost(self, request: Request, now: float) -> None:
-        """A request is lost: what it was for is to be done again."""
+        """Note that a request is lost, and supply it again by `next_requests`."""
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Take the believed ACK or NAK to `request`, perhaps to one that was taken to be lost."""
+        """Take the believed ACK or NAK to `request`, which may have been declared lost before."""
         raise NotImplementedError
 
     def on_run(self, run: Run, now: float) -> None:
@@ -236,15 +237,15 @@ class Operation:
         raise NotImplementedError
 
     def on_paths(self) -> None:
-        """Requests with a path go out, or are on their way, beside this one. It is told only where these
-        disturb it (see `pathgate`)."""
+        """Note that requests with a path go out or are in flight beside this operation. Called only if the
+        server mixes them up with writes (see `pathgate`)."""
 
     def on_burst_sent(self, request: Request, now: float) -> int:
-        """A BurstReadFile of this operation went out under request.seq; return how many packets may come."""
+        """Note that a BurstReadFile of this operation went out; return how many packets may come."""
         return 0
 
     def on_burst(self, reply: Payload, now: float) -> bool:
-        """Take a packet with req_opcode BurstReadFile; return False if it is not of the running burst."""
+        """Take a packet with req_opcode BurstReadFile; return False if it belongs to no running burst."""
         return False
 
     def on_timer(self, now: float) -> None:

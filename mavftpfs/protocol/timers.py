@@ -3,7 +3,7 @@
 There are two estimators of the round trip: of chunks of files, and of single requests, because a listing of a
 big directory takes seconds where a read takes milliseconds. A request is lost when its timer runs out. It is
 lost sooner if a later one was answered: servers answer in order, so a round trip and an eighth are enough
-(`Reordering`). Waits grow with the time that passed without progress. No try is counted.
+(`Reordering`). Waits grow with the time that passed without progress; transmissions are not counted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ INITIAL_RTO = 1.0
 needless repetition its answer tells the round trip all the same, and a second execution changes nothing."""
 
 LONGEST_BACK_OFF = 3.0
-"""Seconds between two tries that growing reaches at most: a link that comes back should not wait longer."""
+"""Seconds to which a wait grows at most, so that a link that comes back is noticed soon."""
 
 _NO_WORK = 0.1
 """Seconds of work that count as none: a request that takes no longer measures the way and the server's

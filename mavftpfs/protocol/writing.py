@@ -46,12 +46,12 @@ _PATH_CODES = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
 
 
 class ChunkSource(Protocol):
-    """Where the bytes come from. ranges: what is to be sent, and what is on its way."""
+    """Supplies the bytes. ranges: bytes to be sent, and bytes in flight."""
 
     ranges: Ranges
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """Return (offset, 1..limit bytes), now in `ranges.out`, or None if there is nothing for now.
+        """Return (offset, 1..limit bytes), moved to `ranges.out`, or None if there is nothing for now.
 
         Raises:
             MavftpfsError: the bytes could not be read. The transfer fails with that.
@@ -106,11 +106,10 @@ class WriteTransfer(Operation):
             it was answered.
 
     Attributes:
-        acked_bytes: written so far.
-        paused: send nothing new; what is on its way is still waited for.
+        paused: send nothing new, but still take the answers to requests in flight.
 
-    Fails with SessionLost (from the FtpNak that showed it), FtpNak, RequestTimeout, or as the source. After
-    `finish`, too, what was not ACKed is to be sent again by the source.
+    Fails with SessionLost (from the FtpNak that showed it), FtpNak, RequestTimeout, or the source's error. At
+    the end, `finish` included, bytes that were not ACKed return to `todo` of the source.
     """
 
     urgent = False
@@ -130,7 +129,6 @@ class WriteTransfer(Operation):
     ) -> None:
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
-        self.acked_bytes = 0
         self._source = source
         self._root = root
         self._needs_listing = False  # the root is to be listed before the next write
@@ -145,17 +143,17 @@ class WriteTransfer(Operation):
     # --- what the owner says and sees
 
     def wake(self) -> None:
-        """The source has more."""
+        """Note that the source has more."""
         self._starved = False
 
     @property
     def starved(self) -> bool:
-        """Whether the source had nothing when it was last asked, and everything it gave was ACKed."""
+        """Whether the source had nothing when it was last asked, and all bytes that it gave were ACKed."""
         return self._starved and self._source.ranges.out.empty
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted of the server; while paused: whether nothing is on its way."""
+        """Whether nothing is in flight, and nothing can be sent: the source is empty, or this is paused."""
         return self._source.ranges.out.empty and (self.paused or self._starved)
 
     # --- requests
@@ -267,7 +265,6 @@ class WriteTransfer(Operation):
         if start < stop:
             self.progress(now)
             self._listings = 0
-            self.acked_bytes += stop - start
             self._source.on_acked(start, stop)
 
     def _written(self, request: Request, data: bytes) -> int:
@@ -288,8 +285,8 @@ class WriteTransfer(Operation):
         return nak
 
     def finish(self) -> None:
-        """End; what was not ACKed is to be sent again. A request that arrives late does no more than a
-        repetition."""
+        """End, and return bytes that were not ACKed to the source. A request that arrives late does no more
+        than a repetition, as long as its file is open."""
         if not self.done:
             self._source.ranges.give_back()
         super().finish()

@@ -45,7 +45,7 @@ def writer() -> tuple[Operation, Answer, Callable[[], object]]:
     return (
         transfer,
         lambda request: ack(request, request.size.to_bytes(4, "little")),
-        lambda: (source.acked, list(source.in_flight), list(source.todo), transfer.acked_bytes),
+        lambda: (source.acked, list(source.in_flight), list(source.todo)),
     )
 
 
