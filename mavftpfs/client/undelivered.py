@@ -162,7 +162,9 @@ def chosen(names: Sequence[str], base: Path) -> list[Recovered]:
             found += recovered_in(path)
             continue
         if not path.is_file():
-            raise UsageError(f"{name} is not a recovered file; list them with: mavftpfs recover")
+            raise UsageError(
+                f"there is no recovered file {name}; give DIRECTORY/FILE as listed by: mavftpfs recover"
+            )
         found += [copy for copy in recovered_in(path.parent) if copy.file.name == path.name]
     return found
 
