@@ -1,1 +1,1 @@
-"""What is remembered of the vehicle: entries, blocks, open files."""
+"""The memory of the vehicle: entries, blocks, open files."""

@@ -1,4 +1,4 @@
-"""What is shown of an entry whose listing says too little or too much. Layer: cache; pure.
+"""The attributes of an entry whose listing says too little or too much. Layer: cache; pure.
 
 That includes mtimes that users set, because no server can be told one. Such an mtime is shown until the file
 changes: until a listing shows another size or mtime than the first listing after it was set.

@@ -45,8 +45,8 @@ SMALL_FILE = 64 * 1024
 
 
 class RateMeter:
-    """How many bytes per second come of one file after the other. Neither pauses count, nor the time between
-    two files: small files tell of round trips, and not of the link.
+    """Bytes per second that arrive of one file after the other. Neither pauses nor the time between two files
+    count, because small files measure round trips, and not the link.
 
     Attributes:
         rate: bytes per second, None while too little was seen. shown: what people are told, which takes
@@ -178,7 +178,7 @@ class Blocks:
 
     @property
     def progress(self) -> int:
-        """How many of the file's bytes arrived, or were here before."""
+        """The number of the file's bytes that are here."""
         return min(self.size, max(self.received, self._present.total))
 
     # --- the sink

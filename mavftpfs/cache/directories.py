@@ -1,4 +1,4 @@
-"""What the vehicle has under each name: remembered listings, and requests for new ones. Layer: cache.
+"""The names of each directory: remembered listings, and requests for new ones. Layer: cache.
 
 There is no stat on the wire (servers.md 14.30): everything known of a path comes from its parent's listing. A
 listing is fresh for a while. A name that a fresh and complete listing lacks does not exist. Expired listings

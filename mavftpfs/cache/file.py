@@ -36,7 +36,7 @@ from mavftpfs.shared.sending import SendBuffer
 
 
 class State(Enum):
-    """How much the vehicle has of a file; see the module."""
+    """The state of a file on the vehicle; see the module."""
 
     CLEAN = "clean"
     DIRTY = "dirty"

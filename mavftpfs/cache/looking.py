@@ -1,4 +1,4 @@
-"""What has the name of a file whose placing was interrupted? A listing and a comparison tell. Layer: cache.
+"""The file under a name after an interrupted replacement, by a listing and a comparison. Layer: cache.
 
 The first that fits:
 1. The name is missing, and the verified temporary file is there: that gets the name; nothing is sent again.

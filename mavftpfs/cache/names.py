@@ -1,4 +1,4 @@
-"""What the vehicle has under a name, changes of names, and how files get their names. Layer: cache.
+"""The names of files: look-ups, changes, and the way of a new file to its name. Layer: cache.
 
 Servers check little before they change a name. RemoveFile removes an empty directory where the server calls
 remove(3). On NuttX a rename moves into a directory. A rename may replace a file that others made (servers.md
@@ -59,7 +59,7 @@ _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
 
 
 class Later(Protocol):
-    """What is looked at after a while; see repair.Repair."""
+    """Paths to look at after a while; see repair.Repair."""
 
     def list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None: ...
     def look_later(self) -> None: ...

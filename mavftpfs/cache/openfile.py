@@ -1,4 +1,4 @@
-"""What every open() of a file offers. Layer: cache."""
+"""The calls of every open file. Layer: cache."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class OpenFile:
 
     @property
     def verified(self) -> str:
-        """How the vehicle's copy was compared with what was written, in words; "" if nothing was sent."""
+        """The comparison of the vehicle's copy with the written bytes, in words; "" if nothing was sent."""
         return ""
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:

@@ -51,17 +51,17 @@ class CacheOptions(Options):
 
     @property
     def proof_time(self) -> float:
-        """How long in seconds what the vehicle told of a file holds."""
+        """Seconds for which the vehicle's facts about a file are valid."""
         return DIR_TIMEOUT if self.dir_timeout is None else self.dir_timeout
 
     @property
     def attributes_hold(self) -> float:
-        """How long in seconds the kernel may keep attributes."""
+        """Seconds for which the kernel may keep attributes."""
         return min(ATTRIBUTES_HOLD, self.proof_time)
 
     @property
     def absence_holds(self) -> float:
-        """How long in seconds the kernel may keep an absent name."""
+        """Seconds for which the kernel may keep an absent name."""
         return min(ABSENCE_HOLDS, self.proof_time)
 
     def __post_init__(self) -> None:

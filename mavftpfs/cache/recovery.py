@@ -1,4 +1,4 @@
-"""How undelivered files outlive a mount, and how the next mount finds them. Layer: cache.
+"""Undelivered files after the end of a mount, and their way to the next one. Layer: cache.
 
 A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a description beside it,
 `NNNNNN.json`:

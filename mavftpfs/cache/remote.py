@@ -1,4 +1,4 @@
-"""What the caches need of the vehicle. Layer: cache; declared here, implemented by session.store.
+"""The calls that the caches make to the vehicle. Layer: cache; declared here, implemented by session.store.
 
 All paths are normalised mount paths (shared.model). All calls raise only MavftpfsError.
 """
@@ -176,7 +176,7 @@ class VehicleStore(RemoteStore, Protocol):
 
     @property
     def traits(self) -> Traits:
-        """What the server was seen to do; forgotten when it restarts."""
+        """The observed traits of the server; forgotten when it restarts."""
         ...
 
     @property

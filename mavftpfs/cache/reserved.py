@@ -40,7 +40,7 @@ _OWNER_LENGTH = 7
 
 
 class Kind(Enum):
-    """What a reserved name stands for."""
+    """The meaning of a temporary file's name."""
 
     NEW = b"n"
     OLD = b"o"

@@ -17,7 +17,7 @@ from mavftpfs.shared.errors import ReadOnly
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """How a file is opened. truncate: it is emptied. append, program: see Tree.open."""
+    """The way to open a file. truncate: empty it. append, program: see Tree.open."""
 
     write: bool = False
     truncate: bool = False

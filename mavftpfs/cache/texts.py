@@ -69,7 +69,7 @@ class Shown(Generic[B]):
 
 @dataclass(slots=True)
 class Reads(Generic[B]):
-    """What a program read, the oldest first: the texts that it got, and what it still knows of them. rereads:
+    """The texts that a program read, the oldest first, and the lines that it still knows of them. rereads:
     the program tried to make another file beside the text, as an editor does that is about to read the text
     again for a backup.
     """

@@ -60,7 +60,7 @@ class Throttle:
 
     @property
     def limit(self) -> int:
-        """How many bytes may be un-ACKed over all uploads."""
+        """The most bytes without an ACK over all uploads."""
         rate = self.meter.rate
         return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
 

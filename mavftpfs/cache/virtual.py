@@ -70,7 +70,7 @@ def tree_of(path: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the last try to read an `@` file showed, and until when that holds.
+    """The result of the last try to read an `@` file, and the time until which it is valid.
 
     data: the whole file; its size is shown even later. None: the file did not open.
     """

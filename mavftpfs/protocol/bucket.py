@@ -1,4 +1,4 @@
-"""How many bytes may go out now. Layer: protocol; pure."""
+"""A token bucket for the bytes that may be sent. Layer: protocol; pure."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from math import inf
 
 
 class Bucket:
-    """A token bucket: bytes come at a rate, a few of them are kept, and what goes out is charged.
+    """A token bucket: bytes accrue at a rate, a few of them are kept, and sent bytes are charged.
 
     Args:
-        depth: bytes that are kept at least; the most that goes out at once after a pause.
-        tick: seconds; what comes in a tick is kept, too, because timers are not more precise.
+        depth: bytes that are kept at least, and the most that may be sent at once after a pause.
+        tick: seconds; the bytes of a tick are kept, too, because timers are not more precise.
 
     Attributes:
         rate: bytes per second, inf for no limit.
@@ -22,7 +22,7 @@ class Bucket:
         self._level, self._at = depth, 0.0
 
     def level(self, now: float) -> float:
-        """Return the bytes that may go out now; inf for no limit, negative after more than that went out."""
+        """Return the bytes that may be sent now; inf for no limit, negative after an overdraft."""
         if self.rate == inf:
             return inf
         self._level = min(
@@ -36,5 +36,5 @@ class Bucket:
         self._level = max(-self._depth, self._level - size)
 
     def holds_at(self, size: float) -> float:
-        """Return when so many bytes may go out, if nothing goes out before."""
+        """Return when so many bytes may be sent, if nothing is sent before."""
         return self._at + (size - self._level) / self.rate + 1e-6

@@ -1,4 +1,4 @@
-"""How many bytes of a file one request carries. Layer: protocol; pure.
+"""The size of chunks: bytes of a file in one request. Layer: protocol; pure.
 
 A chunk is 239 bytes, the most that fits a payload. Some radios and modems pass short frames and drop all long
 ones. So when every full chunk is lost for a while, full and short chunks alternate. If only the short
@@ -15,7 +15,7 @@ SHORT = 64
 too."""
 
 SHORT_SECONDS = 300.0
-"""For how long chunks stay short."""
+"""Seconds for which chunks stay short."""
 
 SUSPICIOUS_LOSSES = 12
 SUSPICIOUS_SECONDS = 1.0

@@ -1,4 +1,4 @@
-"""How many requests may be in flight, and how evenly they go out. Layer: protocol; pure.
+"""The window: the number of requests in flight, and their spacing. Layer: protocol; pure.
 
 Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more requests
 only wait in a queue, and delay all others. So the window aims at what fills the path: its rate (the best

@@ -36,7 +36,7 @@ class DataSink(Protocol):
     """Receives the bytes."""
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the parts of [start, stop) that are not here yet."""
+        """Return the missing parts of [start, stop)."""
         ...
 
     def on_data(self, offset: int, data: bytes) -> None:
@@ -188,14 +188,14 @@ class ReadTransfer(Operation):
         ]
 
     def on_lost(self, request: Request, now: float) -> None:
-        """Ask for its bytes again, unless they came."""
+        """Request its bytes again, unless they arrived."""
         self.chunks.on_lost(request.size, request.sent_at, now)
         self.wants.on_lost(request.offset, request.stop)
 
     # --- replies to ReadFile
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Place a chunk, or find out what a refusal means."""
+        """Place a chunk, or interpret a refusal."""
         if reply.opcode != _NAK:
             self.on_run([(request, reply.data)], now)
             return
@@ -283,11 +283,11 @@ class ReadToEof(Operation):
         return []
 
     def on_lost(self, request: Request, now: float) -> None:
-        """Ask for the block again."""
+        """Request the block again."""
         self._out.discard(request.offset // self._chunk)
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Keep a block, or learn where the end is."""
+        """Keep a block, or note the end of the file."""
         index = request.offset // self._chunk
         self._out.discard(index)
         self.progress(now)

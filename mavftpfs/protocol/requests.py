@@ -22,7 +22,7 @@ _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
 
 class Manner(NamedTuple):
-    """How requests of one opcode are timed and repeated.
+    """The timing and retransmission of requests with one opcode.
 
     Attributes:
         floor: the least seconds to wait for an answer.
@@ -59,7 +59,7 @@ MANNERS: dict[int, Manner] = dict.fromkeys(range(256), _PATH) | {
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
 }
-"""How requests with each opcode are repeated; those not named here are taken to have side effects."""
+"""The retransmission of requests with each opcode; all others count as having side effects."""
 
 
 @dataclass(slots=True, eq=False)
@@ -156,11 +156,11 @@ class Port(Protocol):
     traits: Traits
 
     def timeout(self, manner: Manner) -> float:
-        """Return how many seconds an answer is waited for at present."""
+        """Return the present wait for an answer, in seconds."""
         ...
 
     def learn_session_echo(self, echoed: bool) -> None:
-        """An Open ACK carried the session id asked for, or another."""
+        """Note whether an Open ACK carried the requested session id."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""How long to wait for a reply before it counts as lost. Layer: protocol; pure.
+"""The wait for a reply before its request counts as lost. Layer: protocol; pure.
 
 There are two estimators of the round trip: of chunks of files, and of single requests, because a listing of a
 big directory takes seconds where a read takes milliseconds. A request is lost when its timer runs out. It is

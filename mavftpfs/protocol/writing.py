@@ -59,7 +59,7 @@ class ChunkSource(Protocol):
         ...
 
     def on_acked(self, start: int, stop: int) -> None:
-        """These bytes were written: take them out of `ranges`. Some may have been ACKed before."""
+        """Note that these bytes were written: remove them from `ranges`. Some may have been ACKed before."""
         ...
 
 

@@ -48,42 +48,42 @@ SIGNING_EPOCH = 1_420_070_400
 """2015-01-01 UTC in seconds since 1970 (MAVLink guide, "Message Signing")."""
 
 LOSSY = 0.1
-"""From this share of lost packets on, the link is not called fine."""
+"""The share of lost packets from which the link is no longer reported as fine."""
 
 HEARTBEAT_PERIOD = 1.0
 MOST_HEARD = 32
-"""Components on the link of which a status tells: it has to fit into an extended attribute."""
+"""The most components in a status, which must fit into an extended attribute."""
 HEARD_SOON = 1.2
-"""Seconds within which a vehicle that is there is heard: it sends one heartbeat a second."""
+"""Seconds in which a present vehicle is heard, because it sends one heartbeat a second."""
 TERMINATE_ON_EXIT, WHERE_SILENT = 5.0, 1.0
 """Seconds for closing the server's session at the end of a connection, at most; the second if the vehicle is
 not heard."""
 
 SILENT_ON_EXIT = 2.5
-"""Seconds without a heartbeat after which it is not: two of them, or more, did not come."""
+"""Seconds without a heartbeat after which the vehicle is not heard: at least two heartbeats are missing."""
 
 _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
 _OLD_WAY_FROM = 2
-"""The try from which AUTOPILOT_VERSION is also asked for in the way that older firmware understands."""
+"""The try from which AUTOPILOT_VERSION is also requested in the way of older firmware."""
 
 _IDENTITY_PERIOD = 0.5
 _TIME_TRIES = 5
 _SELDOM = 5.0
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
 _TELLS_NO_ID = (
-    "%d/%d does not tell its unique id any more: nothing is read from it or written to it until it does"
+    "%d/%d does not report its unique id any more: nothing is read from it or written to it until it does"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectOptions(Options):
-    """The options, and the key that is in the file of `signing_key`.
+    """The options, and the key from the file of `signing_key`.
 
-    With `bwlimit` nothing is read by bursts, whose pace is the server's.
+    With `bwlimit` nothing is read by bursts, because the server sets their pace.
 
-    patient: wait for another client as long as it is heard and has a file open, as a command does that a
-        person may interrupt; otherwise SessionBusy after `op_deadline`.
+    patient: wait for another client as long as it is heard and has a file open, because a person may
+        interrupt this command; otherwise SessionBusy after `op_deadline`.
     """
 
     key: bytes | None = None
@@ -91,11 +91,11 @@ class ConnectOptions(Options):
 
 
 class Connection:
-    """One vehicle, reachable. Made by `connected`, which runs its tasks.
+    """One reachable vehicle. Made by `connected`, which runs its tasks.
 
     Attributes:
-        began_at: since when the link is listened to. was_lost: it was lost, and not heard since. news: see
-            `subscribe`.
+        began_at: the time since which the link is listened to. was_lost: the vehicle was lost, and has stayed
+            silent since. news: see `subscribe`.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class Connection:
         self.store = Store(self.scheduler)
 
     async def ready(self, timeout: float, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Wait for the vehicle's first heartbeat; on_wait: called when it does not come at once.
+        """Wait for the vehicle's first heartbeat; on_wait: called if it does not arrive at once.
 
         Raises:
             VehicleLost: none within `timeout` seconds; the text says what was heard instead.
@@ -166,7 +166,7 @@ class Connection:
             raise nobody(self.link, timeout, self.vehicle.heard, self.driver.framer.stats)
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
-        """Have `listener` called with "reboot", "armed", "disarmed", "arming refused" or "back"."""
+        """Call `listener` with "reboot", "armed", "disarmed", "arming refused" or "back" from now on."""
         self.news.append(listener)
 
     def status(self) -> dict[str, dict[str, Any]]:
@@ -240,14 +240,15 @@ class Connection:
         self._tell("armed" if armed else "disarmed")
 
     def _move_away(self) -> None:
-        """Take the next component id: another program uses this one, and replies could not be told apart."""
+        """Take the next component id, because another program uses this one, and replies would be
+        ambiguous."""
         own = self.vehicle.own
         # If even the sixth id is taken, the messages are more likely this connection's echo.
         if own.component - OWN_COMPONENT <= 5:
             self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
 
     def _on_doubt(self) -> None:
-        self._doubted.set()  # `_ask_about_vehicle` goes on
+        self._doubted.set()  # wakes `_ask_about_vehicle`
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
@@ -280,9 +281,9 @@ class Connection:
     async def _ask_about_vehicle(self) -> None:
         """Ask for the vehicle's id, boot time and card.
 
-        At first that is done a few times only, since none of it is needed. Id and boot time are asked for
-        again each time that the vehicle may have restarted, or may be another one. The boot time comes first:
-        no file is asked for before the id is told, and by then a restart is known.
+        At first it asks only a few times, since none of this is necessary. It asks for id and boot time again
+        each time that the vehicle may have restarted, or may be another one. The boot time comes first,
+        because no file is requested before the id is known, and by then a restart is known, too.
         """
         vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
         await self._first_heartbeat.wait()
@@ -290,7 +291,7 @@ class Connection:
         while True:
             asked, asked_at, warned = 0, -inf, False
             while vehicle.address is not None and (wanted := self._wanted(in_doubt, asked)):
-                # It may be gone again: then, and of a stranger, it has time.
+                # The vehicle may be gone again; then, and with a stranger, there is no hurry.
                 soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
                 pause = (0.0 if soon else _SELDOM) if in_doubt else _INFO_PERIOD
                 if self.clock() - asked_at >= pause:
@@ -310,7 +311,7 @@ class Connection:
             in_doubt = True
 
     def _wanted(self, in_doubt: bool, asked: int) -> list[int]:
-        """Return the messages to ask for; asked: how often that was done."""
+        """Return the messages to request; asked: the number of earlier requests."""
         vehicle, wanted = self.vehicle, []
         if in_doubt:
             lacks_time = vehicle.lacks_boot_time(self.clock())
@@ -328,9 +329,9 @@ class Connection:
 
 
 async def heard_within(first: trio.Event, timeout: float, on_wait: Callable[[], None]) -> bool:
-    """Return whether the first heartbeat comes within `timeout` seconds.
+    """Return whether the first heartbeat arrives within `timeout` seconds.
 
-    on_wait: called when it does not come at once.
+    on_wait: called if it does not arrive at once.
     """
     with trio.move_on_after(min(HEARD_SOON, timeout)):
         await first.wait()
@@ -342,8 +343,8 @@ async def heard_within(first: trio.Event, timeout: float, on_wait: Callable[[], 
 
 
 def nobody(link: Link, timeout: float, heard: Mapping[Address, Heartbeat], stats: FramerStats) -> VehicleLost:
-    """Return what is raised when no vehicle was heard on a link within `timeout` seconds. heard: what was
-    heard instead; stats: of the frames that arrived."""
+    """Return the error for no vehicle on a link within `timeout` seconds. heard: what was heard instead;
+    stats: of the frames that arrived."""
     if heard:
         found = names_of(heard[source] for source in sorted(heard))
         reason = f"heard only {found}; check target_system and target_component"
@@ -372,7 +373,7 @@ async def connected(
 ) -> AsyncIterator[Connection]:
     """Run a connection over an open link for the length of the body; the session is terminated at its end.
 
-    on_payload, on_frame: told of each FTP payload, and of each whole frame, received or sent.
+    on_payload, on_frame: called with each FTP payload, and with each whole frame, received or sent.
     """
     rng = rng or random.SystemRandom()
     connection = Connection(link, options, rng=rng, clock=clock, on_payload=on_payload, on_frame=on_frame)
@@ -384,7 +385,7 @@ async def connected(
         try:
             await connection.scheduler.serving.wait()
             yield connection
-        except Exception as error:  # raised again outside, so that it is not wrapped in a group
+        except Exception as error:  # raised again outside the nursery, which would wrap it in a group
             failure = error
         finally:
             with trio.CancelScope(shield=True):
@@ -407,7 +408,7 @@ async def _leave(connection: Connection, serving: _Task) -> None:
 
 
 class _Task:
-    """A task that Ctrl-C does not cancel: the session is terminated first."""
+    """A task that Ctrl-C does not cancel, because the session must be terminated first."""
 
     def __init__(self, nursery: trio.Nursery, function: Callable[[], Awaitable[None]]) -> None:
         self.scope = trio.CancelScope(shield=True)
@@ -427,5 +428,5 @@ class _Task:
 
 
 def signing_now() -> int:
-    """Return the present as MAVLink 2 signing counts it: units of 10 µs since 2015-01-01 UTC."""
+    """Return the present in MAVLink 2's signing time: units of 10 µs since 2015-01-01 UTC."""
     return int((time.time() - SIGNING_EPOCH) * 100_000)

@@ -1,8 +1,8 @@
 """The pump between link and engine. Layer: session; the only task that reads the link.
 
-An operation that a task starts (`start`, `run`) is on the wire before that task next awaits, unless a taken
-session asks for silence (`be_silent`). Tasks that wait are woken once per batch of input, never once per
-packet: a trio event and a time-out per request cost more than the rest of a chunk together.
+When a task starts an operation (`start`, `run`), its first request is sent before that task next awaits,
+unless a taken session requires silence (`be_silent`). Waiting tasks are woken once per batch of input, never
+once per packet, because a trio event and a time-out per request cost more than the rest of a chunk together.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ QUIET = 0.5
 a retransmission; serial ports do not pause inside a frame."""
 
 REFILL_AT = 32
-"""Replies after which room in the window is used at once: the server works meanwhile."""
+"""The number of replies after which the engine fills free room at once, because the server works
+meanwhile."""
 
 LONGEST_DRAIN = 5.0
 """Seconds for which a silence waits for running operations to end. After that there is no silence, because no
@@ -47,14 +48,14 @@ overtake them."""
 
 
 PayloadSink = Callable[[float, str, bytes], None]
-"""Told of each FTP payload (251 bytes): the time, "request" or "reply", and the payload."""
+"""Called with each FTP payload (251 bytes): the time, "request" or "reply", and the payload."""
 
 
 class Driver:
     """Moves payloads between one link and one engine, and everything else to the vehicle.
 
     Attributes:
-        peer: the network address that the vehicle is known by; None where the link has only one.
+        peer: the vehicle's network address; None where the link has only one.
         second: the network address of another sender that claims to be the vehicle.
     """
 
@@ -81,12 +82,12 @@ class Driver:
         self._addresses = AddressBook()
         self._impostor_at: float | None = None
         self._scope: trio.CancelScope | None = None
-        self._deadline = inf  # of `pump`
+        self._deadline = inf  # the next one of `pump`
         self._may_send = False
         self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
-        self._to_begin: set[Operation] = set()  # when the silence is over
+        self._to_begin: set[Operation] = set()  # operations that start after the silence
         self._silences = 0
-        self._changed = trio.lowlevel.ParkingLot()  # what is under way, or silence, ended
+        self._changed = trio.lowlevel.ParkingLot()  # for the end of operations, and of silences
         self._gathered: list[bytes] = []
 
     async def pump(self) -> None:
@@ -133,7 +134,7 @@ class Driver:
         """Carry out an operation; cancelling the caller cancels the operation.
 
         Raises:
-            MavftpfsError: what the operation failed with.
+            MavftpfsError: the error of the operation.
         """
         finished = trio.Event()
         try:
@@ -168,7 +169,7 @@ class Driver:
         self.kick()
 
     def cancel(self, operation: Operation) -> None:
-        """Forget an operation (harmless when it is finished)."""
+        """Forget an operation (harmless if it has finished)."""
         self._to_begin.discard(operation)
         if self._under_way.pop(operation, None) is not None:
             self._changed.unpark_all()
@@ -212,7 +213,7 @@ class Driver:
             # The link does not report that it drained, and before that nothing can go out.
             deadline = now + 0.01
         elif not self._may_send:
-            deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
+            deadline = max(deadline, now + 0.05)  # because nothing can be sent, whatever is due
         if self.framer.waiting:
             deadline = min(deadline, self._heard_at + QUIET)
         self._deadline = deadline
@@ -224,7 +225,7 @@ class Driver:
         self.link.send([frame], self.peer)
 
     def _handle(self, messages: list[Message], now: float, sender: NetAddress | None) -> None:
-        """Gather replies, and tell the vehicle everything else, in its turn."""
+        """Collect replies, and pass all other messages to the vehicle, in order."""
         vehicle = self.vehicle
         for message in messages:
             if sender is not None and not self._is_from(message.source, sender, now):
@@ -238,7 +239,7 @@ class Driver:
             if sender is None or vehicle.address is None:
                 continue
             if message is vehicle.heartbeat:
-                # A target without heartbeats of its own is where its system's autopilot is.
+                # A target without heartbeats of its own has the address of its system's autopilot.
                 if vehicle.address in self._addresses:
                     self._is_from(vehicle.address, sender, now)
                 else:
@@ -247,7 +248,7 @@ class Driver:
             self._addresses.distrusted = self.peer if strange else None
 
     def _pass_on(self, now: float) -> None:
-        """Give the engine the gathered replies."""
+        """Pass the collected replies to the engine."""
         wires = self._gathered
         if not wires:
             return
@@ -281,7 +282,7 @@ class Driver:
         return True
 
     def _on_impostor(self, source: Address, sender: NetAddress, now: float) -> None:
-        """Warn once that another sender claims to be the vehicle. The vehicle itself may have moved there. So
+        """Warn once that another sender claims to be the vehicle. The vehicle itself may have moved there, so
         warn only when it is heard at its old address again."""
         if self._impostor_at is None:
             self._impostor_at = now
@@ -291,7 +292,7 @@ class Driver:
             log.warning(_IGNORED, readable_address(sender), *source)
 
     def _refill(self, now: float) -> None:
-        """Send what the engine has to send, if anything may go out now."""
+        """Send the engine's requests, if the link has room."""
         target, link = self.vehicle.address, self.link
         self._may_send = link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
         if target is None or not self._may_send:

@@ -15,7 +15,7 @@ from mavftpfs.shared.model import DirEntry, EntryKind
 
 
 class Outcome(Enum):
-    """The verdict of listings on a change that was asked for."""
+    """The verdict of listings on a requested change."""
 
     HAPPENED = "happened"
     """The server carried it out."""
@@ -44,7 +44,7 @@ class Names:
     complete: bool
 
     def judge(self, name: bytes, after: After) -> Outcome:
-        """Return what this listing tells about one name of a change."""
+        """Return this listing's evidence about one name of a change."""
         entry = self.entries.get(name)
         if entry is None and not self.complete:
             return Outcome.UNKNOWN

@@ -4,10 +4,11 @@ Servers with one session refuse the second client, or give the session to the cl
 September 2026 and MAVSDK's server end the first session without a word (docs/servers.md 1 and 16), and
 ArduPilot ends that of a client that paused for 3 s. So this connection opens nothing while another client may
 have a file open: from that client's first request that uses a session, until its Terminate or Reset, or 10 s
-after the last request that was heard. A refused open changes nothing: clients ask so whether a name is free.
+after its last request. A refused open changes nothing, although clients use it to learn whether a name is
+free.
 
-After another client closed its file, this connection waits a moment longer, by chance. If several programs
-wait, the first one that opens a file is heard by the others.
+After another client closed its file, this connection waits a random moment longer. If several programs wait,
+the others hear the first one that opens a file.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from math import inf
 from mavftpfs.protocol.payload import Opcode
 
 LEFT_OPEN = 10.0
-"""Seconds after another client's last request for which its file counts as open. PX4 closes it then; PX4 of
-September 2026 after 30."""
+"""Seconds after another client's last request for which its file counts as open. PX4 closes the file then;
+PX4 of September 2026 after 30."""
 
 MOST_PAUSE = 0.3
-"""Seconds after another client closed its file for which nothing is opened, at most."""
+"""The most seconds for which this connection opens nothing after another client closed its file."""
 
 STAYS_ITS_OWN = 2.5
-"""Seconds after an answer for which no ArduPilot with one session gives that away; it does after 3."""
+"""Seconds after an answer for which no ArduPilot with one session reassigns that session; it does after 3."""
 
 OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _USING = OPENING | {Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE}
 _CLOSING = frozenset((Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS))
-_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
+_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # their positions in a payload
 
 
 class OtherClients:
@@ -48,15 +49,15 @@ class OtherClients:
         self.session: int | None = None
         self.closed_at = -inf
         self._has_file = False
-        self._asks = False  # an open of theirs is not answered yet
+        self._asks = False  # their open is not answered yet
         self._heard_at = self._answered_at = -inf
         self._answered_since = inf  # since then its answers show no pause that loses a session
 
     def hear(self, payload: bytes, now: float) -> int | None:
-        """Take a request of another client, or an answer to one; return the id of the session that it uses.
+        """Take a request of another client, or an answer to one; return the id of its session.
 
-        None for listings, checksums and changes of names, which use no session: a ground station that shows
-        directories makes nobody's bytes doubtful.
+        None for listings, checksums and changes of names, which use no session, so that a ground station that
+        shows directories makes nobody's bytes suspect.
         """
         opcode, answered = _opcode_of(payload)
         if now >= self.file_open_until:
@@ -103,18 +104,18 @@ class OtherClients:
 
 
 def took_session(payload: bytes) -> bool:
-    """Return whether this payload shows that another client has the session that all share."""
+    """Return whether this payload shows that another client has the shared session."""
     opcode, answered = _opcode_of(payload)
     return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
 
 
 def asks_to_open(payload: bytes) -> bool:
-    """Return whether this is a request to open a file: only the answer tells what became of it."""
+    """Return whether this is a request to open a file, whose result only the answer shows."""
     return payload[_OPCODE] in OPENING
 
 
 def _opcode_of(payload: bytes) -> tuple[int, bool]:
-    """Return the opcode of a request, or of what is answered, and whether this is its ACK."""
+    """Return the opcode of a request, or of the answered request, and whether this is its ACK."""
     opcode = payload[_OPCODE]
     if opcode in (Opcode.ACK, Opcode.NAK):
         return payload[_REQ_OPCODE], opcode == Opcode.ACK

@@ -14,7 +14,7 @@ LASTS = 600.0
 another client stays for a while."""
 
 MOST = 10.0
-"""Seconds for which a name is in quarantine at most."""
+"""The most seconds for which a name is in quarantine."""
 
 LEAST_IF_REPEATED = 1.0
 """Seconds for which a name is in quarantine at least after a request that was repeated, because a buffer may
@@ -35,13 +35,14 @@ class Quarantine:
     The lateness is the largest time, in the last ten minutes, from the first transmission of a request to the
     answer to a duplicate of it.
 
-    Names that differ by case alone count as one, as on many cards.
+    Names that differ by case alone count as one, because many cards treat them so.
     """
 
     def __init__(self) -> None:
         self._lateness = 0.0
         self._seen_at = -inf
-        # By name, the oldest in front: when it was changed, and how long the answer took if it was repeated.
+        # By name, the oldest first: the time of the change, and the time to the answer if it was
+        # retransmitted.
         self._changed: dict[bytes, tuple[float, float]] = {}
 
     def saw(self, lateness: float | None, now: float) -> None:
@@ -52,14 +53,15 @@ class Quarantine:
         self._seen_at = now
 
     def on_changed(self, path: bytes, now: float, took: float = 0.0) -> None:
-        """Note a request that made, emptied or took away the file of this name, or may have done so.
+        """Note a request that made, emptied or removed the file of this name, or may have done so.
 
         took: seconds from its first transmission to its answer or time-out, if the session repeated it or
             got no answer; otherwise 0.
         """
         name, took = path.lower(), min(max(took, LEAST_IF_REPEATED / 2), MOST / 2) if took else 0.0
         since, before = self._changed.pop(name, (now, 0.0))
-        self._changed[name] = now, max(took, before - (now - since) / 2)  # an earlier one is not cut short
+        # An earlier, longer quarantine stays.
+        self._changed[name] = now, max(took, before - (now - since) / 2)
         while now - next(iter(self._changed.values()))[0] > MOST:
             del self._changed[next(iter(self._changed))]
 

@@ -1,4 +1,4 @@
-"""Reads one file, turn by turn: which bytes are wanted, and how a turn fetches them. Layer: session."""
+"""Reads one file, turn by turn: its pending ranges, and the requests of a turn. Layer: session."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolErr
 from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 
 FIRST_WANT = 0.05
-"""Seconds an opened file is kept open for its first read although another file waits."""
+"""Seconds for which an opened file stays open for its first read although another file waits."""
 
 _OFTEN = 0.25
 
@@ -24,10 +24,10 @@ class FileStream(SessionUser):
     """Implements cache.remote.Reader. A stream outlives the server's session on its file: ranges that did not
     arrive remain pending for the transfer of its next turn.
 
-    expected_size: in bytes, if the file need not be opened to know it.
+    expected_size: in bytes, if it is known without opening the file.
 
     Attributes:
-        size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK came, or with the
+        size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK arrives, or with the
             error of the open.
         closed: the sink is called no more, except that its bytes are suspect.
     """
@@ -43,9 +43,9 @@ class FileStream(SessionUser):
         self._wants = Wants()
         self._removed = False
         self._transfer: ReadTransfer | None = None
-        self._received = 0  # by that transfer
+        self._received = 0  # bytes of that transfer
         self._last_data_at = -inf
-        self._lost = 0  # how often the session was, without progress
+        self._lost = 0  # number of lost sessions without progress
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
             self.opened.end()
@@ -115,7 +115,7 @@ class FileStream(SessionUser):
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in the reads that wait, and drop their ranges."""
         self.drop()
-        self._lost = 0  # the next read has as many turns
+        self._lost = 0  # so that the next read has as many turns
         self.waiting_since = None
         if not self.opened.ended:
             self.opened.end(error)
@@ -135,8 +135,8 @@ class FileStream(SessionUser):
                 async with self._scheduler.turn(self) as turn:
                     await self._open(turn)
                     await self._read(turn)
-            except SessionLost as error:  # the next turn goes on at the same offset (promise 5)
-                # The turn is over, but nothing was awaited since: nobody else has opened a file yet.
+            except SessionLost as error:  # the next turn continues at the same offset (promise 5)
+                # The turn is over, but nothing was awaited since, so nobody else has opened a file yet.
                 server.lose(error)
                 self._lost += 1
                 if self._lost > REOPENS:
@@ -159,7 +159,7 @@ class FileStream(SessionUser):
             session = await turn.open()
         if session.size is None:
             await server.close_quietly()
-            raise RemoteProtocolError("the vehicle's open reply holds no size")
+            raise RemoteProtocolError("the vehicle's open reply contains no size")
         if not first and compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
             await server.close_quietly()
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
@@ -190,8 +190,8 @@ class FileStream(SessionUser):
                 if turn.is_over() or (turn.contended and not transfer.demanded):
                     break
                 if isinstance(transfer, BurstTransfer):
-                    # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
-                    # burst what the link holds, and the answer finds no room there.
+                    # Bursts do not follow one another while others wait for an answer, because PX4 fills the
+                    # link with a burst, and the answer finds no room there.
                     transfer.by_requests = engine.serves_others(transfer)
                 # A new range may have woken this task, and with nothing in flight no answer sends a request
                 # for it.

@@ -44,18 +44,18 @@ MOST_USE = 0.3
 """Seconds of recent usage that count at most."""
 
 USE_MEMORY = 10.0
-"""Seconds after which use no longer counts."""
+"""Seconds after which usage no longer counts."""
 
 WAITED = 0.1
 """Seconds of usage that a second of waiting makes up for."""
 
 LEAST_TURN, LONGEST_TURN = 0.5, 2.5
 TURN_TRIPS = 10.0
-"""Seconds, and round trips, that a turn lasts among equals: changing files costs up to five round trips."""
+"""Seconds, and round trips, of a turn among equals; changing files costs up to five round trips."""
 
 RECENT = 10.0
-"""Seconds for which what was read stays provisional, also of files that were closed since: another client is
-noticed late, because servers answer it on its own link, and a router may pass on only some of that."""
+"""Seconds for which read bytes stay provisional, even of files closed since, because another client is
+noticed late: servers answer it on its own link, and a router may pass on only some of that."""
 
 IDLE_CLOSE = 1.5
 """Seconds for which a file stays open on the server without being read. PX4 frees its buffers after 2 s, and
@@ -77,7 +77,7 @@ class Future:
 
     @property
     def ended(self) -> bool:
-        """Whether it ended, well or not."""
+        """Whether the work ended, well or not."""
         return self._event.is_set()
 
     def end(self, error: MavftpfsError | None = None) -> None:
@@ -94,7 +94,7 @@ class Future:
 
 
 class SessionUser:
-    """A reader, an upload or a single request, with what orders it among those that wait.
+    """A reader, an upload or a single request, with its order among the waiting users.
 
     Attributes:
         path: of the file it uses.
@@ -118,11 +118,11 @@ class SessionUser:
 
     @property
     def idle(self) -> bool:
-        """Whether it wants nothing, though it may be in the queue."""
+        """Whether the user needs no turn, though it may be in the queue."""
         return False
 
     def goes_on(self, session: OpenSession) -> bool:
-        """Return whether it uses what is open and opens nothing."""
+        """Return whether the user continues with the open file and opens nothing."""
         return False
 
     def on_queued(self) -> None:
@@ -133,7 +133,7 @@ class SessionUser:
         """Note that the file of its path was removed or replaced."""
 
     def on_suspect(self, reason: str) -> None:
-        """Note that what was read lately may be another file's."""
+        """Note that recently read bytes may be another file's."""
 
     def on_armed_changed(self) -> None:
         """Note that the vehicle was armed or disarmed."""
@@ -186,7 +186,7 @@ class Turn:
 
     @property
     def contended(self) -> bool:
-        """Whether another user waits that could use the session now."""
+        """Whether another waiting user could use the session now."""
         return bool(self._scheduler.waiting(self._scheduler.clock()))
 
     @property
@@ -239,7 +239,7 @@ class Scheduler:
     Attributes:
         users: the readers and uploads that are registered.
         holder: the turn that was granted and is not over. serving: set once `serve` runs.
-        read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
+        read_mode: the requests that read files. read_chunks, write_chunks: the size of requests.
     """
 
     def __init__(
@@ -264,8 +264,8 @@ class Scheduler:
         self.holder: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
-        self._longest_wait = 1.02 * op_deadline  # the time-out of a request comes first, and says more
-        self._queue: dict[SessionUser, MavftpfsError | None] = {}  # with what refuses it a turn
+        self._longest_wait = 1.02 * op_deadline  # so that a request's own time-out, which says more, is first
+        self._queue: dict[SessionUser, MavftpfsError | None] = {}  # with the reason to refuse it a turn
         self._excluded: list[_Excluded] = []
         self._nursery: trio.Nursery | None = None
         self._tidying = False
@@ -288,10 +288,10 @@ class Scheduler:
             self._gone.append((now, user))
             while self._gone[0][0] < now - RECENT:
                 self._gone.popleft()
-        self.refuse(user, LocalProtocolError("it was closed"))
+        self.refuse(user, LocalProtocolError("the file was closed"))
 
     def refuse(self, user: SessionUser, error: MavftpfsError) -> None:
-        """If a user waits for a turn, raise an error there."""
+        """Raise an error in a user that waits for a turn; harmless for others."""
         if user in self._queue:
             self._queue[user] = error
         self.server.wake()
@@ -325,7 +325,7 @@ class Scheduler:
             user.waiting_since = None
 
     async def wait_again(self, turn: Turn) -> None:
-        """Give a turn back, and wait until it is next again; raises what `turn` does."""
+        """Give a turn up, and wait until the user is next again; raises the errors of `turn`."""
         self._set_holder(None)
         await self._wait(turn.user)
         turn.granted_at = self.clock()
@@ -454,10 +454,10 @@ class Scheduler:
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """Note that a file or directory was renamed.
 
-        Users of it, and of what lies in it, go on under the new path. A file that had the new name cannot be
-        read any more.
+        Users of it, and of files in it, continue under the new path. A file that had the new name can no
+        longer be read.
         """
-        for user in list(self.users):  # a user may be closed by that
+        for user in list(self.users):  # a copy, because this may close a user
             if user.path == new:
                 user.on_removed()
             else:
@@ -494,7 +494,7 @@ class Scheduler:
                 if self._queue and self.clock() < self.others_until:
                     await self.server.learn_several_sessions()
                 now, wait = self.clock(), self._closes_in(self.clock())
-                if now < self.others_until:  # then another user may be next
+                if now < self.others_until:  # after which another user may be next
                     wait = min(wait, self.others_until - now)
                 if wait > 0.0:
                     await self.server.sleep(wait)
@@ -533,7 +533,7 @@ class Scheduler:
             return max(0.0, self._used_at + IDLE_CLOSE - now)
         if any(self.is_excluded(path) for _, path in server.maybe_open):
             return 0.0
-        if not server.maybe_open or self.next_user() is not None:  # which closes that before its open
+        if not server.maybe_open or self.next_user() is not None:  # whose open closes those first
             return inf
         if server.vehicle.lost(now):
             return MAYBE_OPEN_CLOSE

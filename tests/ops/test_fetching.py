@@ -177,7 +177,7 @@ async def test_what_was_resumed_waits_for_its_proof(
 @pytest.mark.parametrize(
     ("error", "lacking", "later"),
     [
-        (Armed("checksums are not asked for in flight"), "armed", True),
+        (Armed("the vehicle is armed, and computes checksums only on the ground"), "armed", True),
         (FtpNak(14, 7), "the vehicle computes no checksums", False),
         (RequestTimeout("nobody answered within 30 s"), "no answer", True),
     ],
