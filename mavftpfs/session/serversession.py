@@ -432,7 +432,7 @@ class ServerSession:
 
     async def close_maybe_open(self) -> None:
         """Close the files in `maybe_open`; a failure leaves them there."""
-        with suppress(MavftpfsError):
+        with trio.move_on_after(TERMINATE_LIMIT), suppress(MavftpfsError):
             await self._close_maybe_open()
 
     async def _close_maybe_open(self) -> bool:

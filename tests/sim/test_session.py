@@ -16,8 +16,14 @@ from mavftpfs.protocol.operations import OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.others import LEFT_OPEN
-from mavftpfs.session.scheduler import SessionUser
-from mavftpfs.session.serversession import REOPENS, SILENCE_ARDUPILOT, SILENCE_PX4, STALL
+from mavftpfs.session.scheduler import MAYBE_OPEN_CLOSE, SessionUser
+from mavftpfs.session.serversession import (
+    REOPENS,
+    SILENCE_ARDUPILOT,
+    SILENCE_PX4,
+    STALL,
+    TERMINATE_LIMIT,
+)
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
     FileChanged,
@@ -312,6 +318,21 @@ async def test_an_open_whose_answer_was_lost_is_closed_also_where_the_refusal_hi
         began = trio.current_time()
         assert await read_file(connection, path("px4", "f")) == b"hello"
         assert trio.current_time() - began < SILENCE_ARDUPILOT
+
+
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_request_waits_no_longer_because_an_earlier_open_was_not_answered(profile: str) -> None:
+    """Between turns the Terminate of that open is not answered either."""
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        here.faults.cut_after(0)
+        for _ in range(2):
+            began = trio.current_time()
+            with pytest.raises(RequestTimeout):
+                await connection.store.stat_size(path(profile, "f"))
+            assert trio.current_time() - began < DEFAULTS.op_deadline + TERMINATE_LIMIT + 0.1
+            await trio.sleep(MAYBE_OPEN_CLOSE + 0.5)
 
 
 ONE_SESSION = ["px4", "px4-2026", "ardupilot", "mavsdk"]
