@@ -15,7 +15,7 @@ BARE = "bare loop"
 
 
 class Outcome(StrEnum):
-    """How a run ended; bytes are compared in each that ended by itself."""
+    """The end of a run; the bytes of each run that ended by itself are compared."""
 
     OK = "ok"
     TIMEOUT = "timeout"
@@ -114,7 +114,7 @@ class Run:
 
     @property
     def outcome(self) -> Outcome:
-        """How it ended."""
+        """The end of the run."""
         return self.measured.outcome
 
 

@@ -1,4 +1,4 @@
-"""Who takes part in `tests.bench.mount`, and how each is made to move a file.
+"""The peers of `tests.bench.mount`, each with its way to move a file.
 
 Two kinds. A *worker* is a process that connects, moves the file and says what it took (`peer.timed`), or
 ends with a reason. A *mount* is a daemon; the transfer is a `cp`. Peers live in an environment of their own,

@@ -313,7 +313,7 @@ async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[
 
 @pytest.mark.parametrize("there", [True, False])
 async def test_the_same_command_goes_on_in_the_same_place(tmp_path: Path, there: bool) -> None:
-    """Whether LOCAL was there before or not, it is after the first run."""
+    """The first run makes LOCAL, so later runs find a directory there."""
     tree, to = SpoiltTree({b"/log/d/a": BIG, b"/log/b": b"2"}), tmp_path / "gg"
     if there:
         to.mkdir()

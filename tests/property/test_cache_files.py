@@ -1,4 +1,4 @@
-"""What is held of a file is what came of it, and readahead stays within its bounds."""
+"""The cache holds the bytes that arrived of a file, and readahead stays within its bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KIB = 1024
 
 @dataclass
 class Step:
-    """What happens to the blocks next."""
+    """The next event for the blocks."""
 
     what: str
     start: int = 0

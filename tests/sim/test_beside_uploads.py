@@ -1,6 +1,7 @@
-"""Who comes beside an upload: he sees his own file soon, and the upload ends with the right bytes.
+"""Programs beside an upload: each gets its own file soon, and the upload ends with the right bytes.
 
-Whether OpenFileWO empties files is found out on the way; where it does, others wait, and are told in time.
+The upload learns on the way whether OpenFileWO empties files. If it does, others wait, or get an error in
+time.
 """
 
 from __future__ import annotations
@@ -189,7 +190,7 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(profile: s
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_arming_while_it_is_closed_is_told(profile: str) -> None:
-    """Who waits for an upload was told nothing before the vehicle was disarmed (promise 9)."""
+    """A caller that waited for the upload got no answer before the vehicle was disarmed (promise 9)."""
     here = Rig(profile, FILES, LINK)
     vehicle, handle = here.vehicle, here.server.handle
 
@@ -388,7 +389,7 @@ async def test_a_client_that_lists_beside_an_upload_on_nuttx_does_not_pass_for_a
 
 @pytest.mark.parametrize("replaces", [False, True])
 async def test_a_close_does_not_wait_for_another_upload_that_gives_no_way(replaces: bool) -> None:
-    """Whether its name is still free, or the size under it, is asked of a listing there."""
+    """The close asks a listing whether its name is still free, or which size is under it."""
     old = {b"/d/one": b"old", b"/d/two": b"old"} if replaces else {b"/d": None}
     async with rig("mavsdk", old, link=LinkSettings(rate=5_760.0, delay=0.05)) as here:
         tree = here.mount(verify_max=0)

@@ -182,7 +182,7 @@ async def test_a_server_that_says_that_it_renames_and_does_not(
 
 @pytest.mark.holds("fault duplicate")
 async def test_a_removal_that_arrives_twice_does_not_pass_for_a_card_that_cannot_rename() -> None:
-    """It removes the empty file that was renamed to find out. Only the second answer comes, a refusal."""
+    """The removal is that of the empty file of the rename test. Only its second answer arrives, a refusal."""
     asked: list[int] = []
     for _ in range(2):
         async with rig("mavsdk") as here:
@@ -269,8 +269,8 @@ async def test_small_files_before_it_are_no_reason_to_refuse_a_part_of_a_large_o
 
 @pytest.mark.parametrize("stale", [False, True], ids=["", "stale errno"])
 async def test_overwriting_in_place_needs_no_room_for_both_files(stale: bool) -> None:
-    """Whether the card can rename is found out on an empty file then. ArduPilot's refusal may tell what an
-    earlier request failed of."""
+    """The delivery then tries a rename on an empty file. ArduPilot's refusal may have the errno of an earlier
+    request."""
     async with rig("littlefs", {FILE: OLD}) as here:
         here.card.capacity = len(NEW)
         if stale:
@@ -283,7 +283,7 @@ async def test_overwriting_in_place_needs_no_room_for_both_files(stale: bool) ->
 
 @pytest.mark.holds("fault full card")
 async def test_overwriting_in_place_that_failed_goes_on_later() -> None:
-    """What lies there is the old file, or a part of the new one: nobody else's."""
+    """The file there is the old one, or a part of the new one, and nobody else's."""
     async with rig("littlefs", {FILE: OLD}) as here:
         tree = here.mount(inplace=True)
         await write_file(tree, FILE, NEW)
@@ -470,7 +470,7 @@ async def test_no_checksum_is_asked_for_in_flight() -> None:
 @pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("path", [FRESH, FILE])
 async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> None:
-    """What is there is compared after it was disarmed."""
+    """The file on the card is compared after the vehicle was disarmed."""
     tree = here.mount()
     here.faults.at(Opcode.TERMINATE_SESSION, here.vehicle.arm)
     with pytest.raises(Armed):

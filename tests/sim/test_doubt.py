@@ -1,7 +1,7 @@
-"""What puts everything in doubt, and what is done while it lasts. Virtual time.
+"""Suspect replies: their causes, and the comparisons while they last. Virtual time.
 
-What is in doubt is compared whatever its size: the size tells nothing of bytes that were ACKed and are
-not what the card has, because an older copy came late, another client was there, or the power went.
+A suspect file is compared whatever its size, because the size proves nothing about bytes that were ACKed and
+differ on the card: a late duplicate was executed, another client wrote, or the power failed.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ async def test_nor_does_it_empty_a_file_that_has_its_final_name_at_once(lateness
 async def test_a_create_that_the_network_repeats_after_the_file_was_compared(
     profile: str, after: Opcode, verify_max: int
 ) -> None:
-    """It is the first sign of doubt, and the file is empty when it gets its name."""
+    """The duplicate is the first suspicious sign, and the file is empty when it gets its name."""
     async with rig(profile, {b"/d/k": b"x"}, link=CLEAN) as here:
         tree = here.mount(verify_max=verify_max)
         await write_file(tree, b"/d/first", content(300, 1))  # the server renames, as is known from now on
@@ -367,7 +367,8 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
 @pytest.mark.parametrize("known", [False, True], ids=["first", "known"])
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
 async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: str, known: bool) -> None:
-    """What moved the old file aside takes the new one away 5 s later. No program lists the directory."""
+    """The rename that moved the old file aside takes the new one away 5 s later. No program lists the
+    directory."""
     async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": b""}, link=CLEAN) as here:
         tree = here.mount()
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
@@ -524,7 +525,7 @@ async def test_a_removal_without_an_answer_comes_late() -> None:
 async def test_an_open_that_we_repeated_comes_late(
     profile: str, delay: float, latenesses: tuple[float, ...]
 ) -> None:
-    """It puts its file in the place of the one that is read."""
+    """The late open puts its file in place of the one that is read."""
     files = {b"/d/one": content(60_000, 1), b"/d/two": content(60_000, 2)}
     for lateness in latenesses:
         async with rig(profile, files, link=LinkSettings(delay=delay)) as here:

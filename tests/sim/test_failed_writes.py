@@ -150,7 +150,8 @@ async def test_nothing_of_the_part_reaches_the_card(
 
 @pytest.mark.parametrize("path", [FILE, FRESH])
 async def test_the_name_is_free_for_the_next_program_at_once(each: Rig, path: bytes) -> None:
-    """Who read the old file reads on what was written over it; who opens the name gets what the card has."""
+    """A program with the old file open still reads the changes; a program that opens the name gets the card's
+    file."""
     tree = await mount(each)
     file = await break_it(tree, path)
     assert bytes(await file.read(0, len(PART))) == PART
@@ -170,7 +171,7 @@ async def test_the_name_is_free_for_the_next_program_at_once(each: Rig, path: by
 
 
 async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
-    """What others were told was taken is delivered."""
+    """Bytes that other programs wrote with success are delivered."""
     tree = await mount(here)
     file = await part_of(tree, FRESH)
     appender = await tree.open(FRESH, write=True)
@@ -483,7 +484,7 @@ async def test_the_oldest_parts_go_when_there_are_too_many(here: Rig) -> None:
 
 
 async def test_an_error_is_not_shown_once_its_cause_is_over() -> None:
-    """What was refused in flight is sent after disarming."""
+    """The change that was refused in flight is sent after disarming."""
     async with rig("px4", {FILE: OLD}) as here:
         tree = here.mount()
         file = await tree.create(FRESH, exclusive=True)

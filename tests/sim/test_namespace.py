@@ -239,7 +239,7 @@ async def rename(tree: Tree, path: bytes) -> None:
 async def test_a_name_that_no_listing_can_show_is_refused_and_nothing_is_sent(
     fat: Rig, act: Callable[[Tree, bytes], Awaitable[None]], path: bytes
 ) -> None:
-    """It could never be removed. Of names that never reach the vehicle any will do."""
+    """Such a file could never be removed. Names that never reach the vehicle may be any."""
     tree = fat.mount()
     with pytest.raises(MavftpfsError) as told:
         await act(tree, path)

@@ -492,7 +492,7 @@ async def test_emptying_calls_off_a_delivery_that_waits_for_its_path(profile: st
 async def test_what_was_taken_back_may_have_got_its_place(
     profile: str, old: bytes, new: bytes, nth: int
 ) -> None:
-    """Whether the card has the old file is unknown, so the mount must not count the new one as delivered."""
+    """The mount must not count the new file as delivered, because the card may still have the old one."""
     async with rig(profile, {FILE: old}, options=QUICK) as here:
         tree = here.mount()
         file = await tree.open(FILE, write=True)

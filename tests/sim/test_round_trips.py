@@ -1,4 +1,4 @@
-"""How many round trips short work takes, and what the loss of a packet adds. Virtual time."""
+"""The round trips of short work, and the cost of a lost packet. Virtual time."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ async def test_several_files_at_once_share_the_session(profile: str) -> None:
 @pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(profile: str) -> None:
-    """It may be asked for before the task with the session has seen that nothing is left to do."""
+    """The request may arrive before the task with the session has noticed that nothing is left to do."""
     rtt, step, steps = 0.1, 239, 60
     here = Rig(profile, {b"/d/f": content(steps * step)}, LinkSettings(rate=1e6, delay=rtt / 2))
     async with here.connected() as connection:
@@ -204,7 +204,7 @@ async def test_a_user_that_is_cancelled_at_any_time_gives_its_turn_back(profile:
 
 
 async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> None:
-    """It would wait for itself: a change waits until the session is off its path."""
+    """The request would wait for itself, because a change waits until the session is off its path."""
     here = Rig("px4", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         async with connection.scheduler.turn(SessionUser(b"/d/f", trio.current_time())) as turn:
@@ -407,7 +407,7 @@ async def test_a_client_that_only_lists_does_not_keep_our_lost_open_open(profile
 @pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
 async def test_the_file_that_another_client_opened_after_a_lost_open_of_ours_stays_open(profile: str) -> None:
-    """It got the session in place of what may be open by our doing."""
+    """The other client got the session in place of a file that this connection may have open."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection:
         here.faults.at(Opcode.OPEN_FILE_RO, here.link.cut)
@@ -651,7 +651,7 @@ async def test_the_answer_to_an_open_that_was_cancelled_is_no_reason_for_doubt(p
 
 
 async def test_then_the_caller_that_opens_a_file_still_waits() -> None:
-    """It does not fall behind those that came later, and gets its error in time."""
+    """The caller keeps its place before later ones, and gets its error in time."""
     here = Rig("mavsdk", {b"/d/f": DATA}, LinkSettings(delay=0.02))
     took = taken_behind(here, Opcode.OPEN_FILE_RO)
     async with here.connected() as connection, trio.open_nursery() as nursery:
@@ -735,7 +735,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(profile: st
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 @pytest.mark.parametrize("shrinks", [False, True])
 async def test_a_session_is_closed_within_two_seconds_of_its_last_use(shrinks: bool, profile: str) -> None:
-    """It is opened again for more. What is smaller then is another file."""
+    """The file is opened again for more reads. A smaller one then is another file."""
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         sink = MemorySink(len(DATA))

@@ -179,7 +179,8 @@ def test_a_link_that_holds_each_packet_up_is_filled_too(
 def test_so_is_one_that_mixes_packets(
     reorder: float, share: float, requests: float, direction: Direction
 ) -> None:
-    """Those that are held back by 20 ms make the usual round trip longer than the least: half was reached."""
+    """Packets that are delayed by 20 ms make the usual round trip longer than the least: half the rate was
+    reached."""
     result = measure(Case("px4", 625_000.0, 0.03, 0.0, direction), SHORT, reorder=reorder)
     assert result.share >= share
     assert result.requests <= requests

@@ -1,5 +1,4 @@
-"""What the vehicle does not have: what programs are told, when it is tried again, what the local disk
-keeps."""
+"""Undelivered files: the errors of programs, the times of new tries, and the files on the local disk."""
 
 from __future__ import annotations
 
@@ -288,7 +287,8 @@ async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(
 
 @pytest.mark.parametrize("data", [b"new", b""])
 async def test_after_that_refusal_the_name_can_be_written_anew(data: bytes) -> None:
-    """It is a copy that begins anew: by O_TRUNC, and through the library by what makes files, too."""
+    """Such a write begins a new copy: by O_TRUNC, and through the library also by the calls that make
+    files."""
     async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, data)

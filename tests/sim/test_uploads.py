@@ -142,7 +142,7 @@ async def test_a_full_card_is_told(profile: str) -> None:
 
 @pytest.mark.parametrize("bad", [0, 5_000])
 async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(bad: int) -> None:
-    """It does not give back the bytes from `bad` on."""
+    """The local disk cannot read the bytes from `bad` on."""
 
     class Failing(MemorySource):
         fails = True
@@ -222,7 +222,7 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str) -> None:
 
 
 async def test_in_flight_no_reader_makes_way_for_an_upload() -> None:
-    """It has bytes to send, and may not: a turn of it would cost the reader its open file."""
+    """The upload has bytes that it may not send, and a turn for it would cost the reader its open file."""
     here = Rig("px4", {b"/d/f": content(200_000)}, PLAIN)
     async with here.connected() as connection:
         upload = await start(connection, "px4", MemorySource(content(60_000)))
@@ -239,7 +239,7 @@ async def test_in_flight_no_reader_makes_way_for_an_upload() -> None:
 
 @pytest.mark.holds("promise 9")
 async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
-    """What is in flight is not answered, so the reader that is to go first still waits."""
+    """Requests in flight are not answered, so the reader that should be first still waits."""
     here = Rig("px4", {b"/d/f": content(1000)}, PLAIN)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         upload = await start(connection, "px4", MemorySource(content(60_000)))
@@ -430,8 +430,8 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again() -> None:
 @pytest.mark.parametrize("code", [NakCode.FILE_NOT_FOUND, NakCode.UNKNOWN_COMMAND])
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_file_that_cannot_be_opened_again_is_sent_again(probed: bool, code: NakCode) -> None:
-    """It is gone, or the server opens no file for writing without emptying it. Whether it does stays as known
-    as it was."""
+    """The file is gone, or the server empties a file when it opens it for writing. The refusal adds no
+    knowledge about the server."""
     async with uploading(content(3000), known=probed) as (here, source, upload):
         await upload.finish()
         here.faults.refuse(Opcode.OPEN_FILE_WO, code)
@@ -460,7 +460,7 @@ async def test_what_was_abandoned_during_a_silence_is_not_sent_after_it() -> Non
 
 
 async def test_a_finish_with_nothing_to_send_leaves_no_early_place() -> None:
-    """What comes in the background later has waited since then, not since that call."""
+    """Later bytes in the background have waited since they were written, not since that call."""
     async with uploading(content(3000)) as (_, _, upload):
         await upload.finish()
         await upload.finish()

@@ -327,7 +327,7 @@ def test_commands_that_mount_nothing_need_no_libfuse() -> None:
 
 @pytest.mark.parametrize("words", [["--help"], ["sim", "--help"], ["status"], ["umount", "/proc/none"]])
 def test_commands_that_only_ask_load_no_event_loop(tmp_path: Path, words: list[str]) -> None:
-    """These libraries take most of the time until such a command says something."""
+    """The libraries take most of the time until such a command prints a line."""
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('trio', 'pymavlink', 'rich')))\n"
         f"from mavftpfs.cli.main import main; sys.exit(main({words}))"

@@ -1,4 +1,4 @@
-"""How long an answer is waited for, and when a request is lost although its timer has not run out."""
+"""The wait for an answer, and the loss of a request before its timer runs out."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ async def test_beside_another_client_a_server_is_probed_only_if_somebody_asks(px
 
 
 async def test_the_probe_waits_for_no_session_that_a_killed_program_left(nuttx: Rig) -> None:
-    """That takes ten seconds of silence, which only a program that wants to open a file should wait for."""
+    """The end of such a session takes ten seconds of silence, for which only an open should wait."""
     nuttx.faults.lose_reply_to(OPEN)
     left = request(1, OPEN, data=b"/fs/microsd/fs/a").encode()
     nuttx.server.handle(left, Address(254, 25), trio.current_time())
