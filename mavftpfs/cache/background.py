@@ -47,11 +47,12 @@ class Background:
         """See Tree.break_unfinished. A file that did not change since a close or an fsync of it failed is
         whole."""
         reason = LinkClosed("the mount was taken away while a program wrote it")
-        for file in list(self._card.live):
+        for file in sorted(self._card.live, key=lambda file: file.lock.locked()):  # the wait may be cut short
             if file.writers and file.undelivered and file.failed_at != file.changes:
                 async with file.lock:
                     if file.undelivered and file.state is State.DIRTY:
                         await writing.break_off(self._card, file, reason)
+        await self._remove_parts()
 
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""
@@ -63,10 +64,15 @@ class Background:
 
     async def tidy_up(self) -> None:
         """See Tree.tidy_up."""
+        await self._remove_parts()
+        if self._card.store.why_lost() is None:
+            await self._card.repair.finish()
+
+    async def _remove_parts(self) -> None:
+        """Remove from the card what broken files left there, while their bytes are here to compare it."""
         if self._card.store.why_lost() is None:
             with suppress(MavftpfsError):
                 await uploads.remove_parts(self._card)
-            await self._card.repair.finish()
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
@@ -86,7 +92,7 @@ class Background:
                 if file in card.broken:
                     card.broken.remove(file)
                 file.content.forget()
-                file.state = State.CLEAN
+                file.state, file.unsure = State.CLEAN, None
         if failed is not None and not kept:
             raise failed
         return kept

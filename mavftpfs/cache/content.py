@@ -95,15 +95,15 @@ class Content:
                 parts.append(bytes(b - a))
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    def crc32(self) -> int:
-        """Return the CRC32 of whole content, as the vehicle computes it (servers.md 10).
+    def crc32(self, stop: int | None = None) -> int:
+        """Return the CRC32 of whole content, or of [0, stop), as the vehicle computes it (servers.md 10).
 
         Raises:
             SpoolFailed.
         """
-        value = 0
-        for at in range(0, self.size, STEP):
-            value = crc32(self.get(at, min(at + STEP, self.size)), value)
+        value, stop = 0, self.size if stop is None else stop
+        for at in range(0, stop, STEP):
+            value = crc32(self.get(at, min(at + STEP, stop)), value)
         return value
 
     # --- what the vehicle has

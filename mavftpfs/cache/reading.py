@@ -128,7 +128,8 @@ async def _open(card: Card, file: File, entry: DirEntry) -> bool | None:
         reader.close()
         on_replaced(card, file)
         return None
-    blocks.close_reader()  # another read may have opened one meanwhile
+    blocks.close_reader()  # another read may have opened one meanwhile, perhaps of another file
+    blocks.drop()
     blocks.reader = reader
     file.content.on_opened(reader.size)
     file.base = Known(reader.size, entry.mtime if entry.size == reader.size else None)

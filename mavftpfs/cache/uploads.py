@@ -15,7 +15,7 @@ import trio
 from mavftpfs.cache import verify
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Attempt, File, State
-from mavftpfs.cache.reserved import Kind
+from mavftpfs.cache.reserved import Kind, is_reserved
 from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -30,7 +30,7 @@ from mavftpfs.shared.errors import (
     SessionBusy,
     SessionLost,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import SendBuffer
 
@@ -190,16 +190,33 @@ async def is_empty_in_place(card: Card, path: bytes) -> bool:
 async def remove_parts(card: Card, path: bytes | None = None) -> None:
     """Remove from the card what broken files left there. path: only of this one.
 
-    If the vehicle refuses, the part stays on the card, and the log names it.
+    If the vehicle refuses, or if a part under its own name may be another client's file, it stays on the
+    card, and the log names it.
 
     Raises:
         As VehicleStore, but no FtpNak: what is left is tried again later.
     """
     for part in [part for part in card.parts if path in (None, part)]:
         try:
-            await card.names.remove_if_there(part)
+            if not (is_reserved(split(part)[1]) or await _is_part(card, part)):
+                log.warning("%r stays on the card: it may be a part of a failed copy, or another file", part)
+            else:
+                await card.names.remove_if_there(part)
         except FtpNak as nak:
             log.info("%r stays on the card: %s", part, nak)
         if part in card.parts:  # else another call was faster
             card.parts.remove(part)
         card.own.release(part)
+
+
+async def _is_part(card: Card, path: bytes) -> bool:
+    """Return whether the vehicle's file of this name is, or may be, the beginning of the last broken file.
+
+    Others may have put a file of theirs there while the link was cut.
+    """
+    size, broken = await card.names.size(path), card.find_broken(path)
+    if not size:
+        return True
+    if broken is None or size > broken.size:
+        return False
+    return await card.store.crc32(path, size=size) == broken.content.crc32(size)

@@ -17,7 +17,15 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, FileTooLarge, MavftpfsError, NoSpace, NotFound, WriteFailed
+from mavftpfs.shared.errors import (
+    Armed,
+    CrossDevice,
+    FileTooLarge,
+    MavftpfsError,
+    NoSpace,
+    NotFound,
+    WriteFailed,
+)
 from tests.support.rigs import KINDS, Rig, card, read_file, rig, write_file
 from tests.support.transfers import content
 
@@ -536,3 +544,21 @@ async def test_a_file_that_breaks_while_its_replacement_is_unfinished(
         await tree.list(b"/d")
         assert here.files() in ({FILE: OLD}, {FILE: PART})
         assert tree.broken() == [FILE]
+
+
+@pytest.mark.parametrize("theirs", [content(1_500, 9), content(200_000, 9)], ids=["small", "large"])
+async def test_the_file_of_others_under_the_name_of_a_part_stays(theirs: bytes) -> None:
+    """A card that cannot rename has the part under the file's own name, where others may put their file."""
+    async with rig("littlefs", {FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = await mount(here)
+        with pytest.raises(CrossDevice):
+            await tree.rename(FILE, b"/d/moved")
+        file = await part_of(tree, FRESH)
+        here.link.cut()
+        with pytest.raises(MavftpfsError):
+            await write_on(file)
+        here.replace(FRESH, theirs)
+        here.link.restore()
+        await trio.sleep(LONG)
+        assert here.data(FRESH) == theirs
+        file.close()
