@@ -86,7 +86,7 @@ class ReadHandle(OpenFile):
             return
         try:
             if self.writable:
-                await self._deliver()
+                await self._deliver(closing=True)
         finally:
             self.close()
 
@@ -102,7 +102,7 @@ class ReadHandle(OpenFile):
         if not file.handles:
             on_closed(self._card, file)
 
-    async def _deliver(self, *, ends_write: bool = False) -> None:
+    async def _deliver(self, *, closing: bool = False, ends_write: bool = False) -> None:
         await delivery.deliver(self._card, self.file)
 
 
@@ -168,7 +168,7 @@ class WriteHandle(ReadHandle):
             Why it is not delivered.
         """
         if self.file.size > 0 or self.file.error is not None:
-            await self._deliver()
+            await self._deliver(closing=True)
 
     async def take_back(self) -> bool | None:
         """See OpenFile.take_back. May take as long as a request that is not answered."""
@@ -223,12 +223,20 @@ class WriteHandle(ReadHandle):
         if self in file.changers and file.undelivered and file.state is not State.STALE:
             await writing.break_off(self._card, file, error)
 
-    async def _deliver(self, *, ends_write: bool = False) -> None:
+    async def _deliver(self, *, closing: bool = False, ends_write: bool = False) -> None:
         """Deliver for a program. If the rest of the old file cannot be fetched, there is no whole file that
-        could be delivered later, so the file breaks."""
+        could be delivered later, so the file breaks.
+
+        closing: this is a flush or a release. If another program empties the file meanwhile, that program's
+        close delivers it, because bytes are about to come.
+        """
         file = self.file
+
+        def wanted() -> bool:
+            return not closing or file.size > 0 or self in file.changers
+
         try:
-            await delivery.deliver(self._card, file)
+            await delivery.deliver(self._card, file, wanted=wanted)
         except MavftpfsError as error:
             lacks_base = file.is_local and not file.content.whole and not isinstance(error, Armed)
             if ends_write or lacks_base:

@@ -152,8 +152,11 @@ def truncate(card: Card, file: File, size: int) -> None:
     file.content.spool(card.spool, file.path)
     file.content.truncate(size)
     _on_changed(card, file, min(before, size), Event.CHANGED if size else Event.EMPTIED)
-    if file.has_name and not size:
-        card.forget_broken(file.path)
+    if not size:  # what was written before is gone, and so is the error that kept it from the vehicle
+        file.changers.clear()
+        file.error = None
+        if file.has_name:
+            card.forget_broken(file.path)
 
 
 def _on_changed(card: Card, file: File, start: int, event: Event) -> None:

@@ -562,3 +562,34 @@ async def test_the_file_of_others_under_the_name_of_a_part_stays(theirs: bytes) 
         await trio.sleep(LONG)
         assert here.data(FRESH) == theirs
         file.close()
+
+
+async def test_the_close_of_another_program_does_not_send_an_emptied_file(here: Rig) -> None:
+    """Until the program that emptied the file has written, the card keeps a whole file."""
+    tree = await mount(here)
+    first = await opened(tree, FILE)
+    await first.write(0, PART)
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(first.release)
+        await trio.sleep(0.02)
+        second = await tree.open(FILE, write=True, truncate=True)
+        await trio.sleep(LONG)
+        assert here.files()[FILE] in (OLD, PART)
+        await second.write(0, OLD[::-1])
+        await second.release()
+    assert here.files() == {FILE: OLD[::-1]}
+
+
+async def test_the_error_of_an_earlier_copy_does_not_send_an_emptied_file(here: Rig) -> None:
+    """A shell empties the file and closes a copy of the descriptor before it writes."""
+    tree = await mount(here)
+    first = await opened(tree, FILE)
+    await first.write(0, PART)
+    here.faults.refuse(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC, times=1)
+    with pytest.raises(MavftpfsError):
+        await first.flush()
+    first.close()
+    second = await tree.open(FILE, write=True, truncate=True)
+    await second.flush()
+    assert here.files() == {FILE: OLD}
+    second.close()
