@@ -77,7 +77,7 @@ WRONG = {
     ("RTL_ALT=", "3"): "without blanks: RTL_ALT=3",
     ("=3",): "write NAME=VALUE",
     ("RTL_ALT=1.5",): "not a whole number",
-    ("RTL_ALT=1", "rtl_alt=2"): "given two values",
+    ("RTL_ALT=1", "rtl_alt=2"): "has two values",
     ("NOPE=1",): "has no NOPE",
     ("RTL_ALT=1", "WPNAV_SPEED"): "not both",
     ("--load", "/nowhere/x"): "No such file",

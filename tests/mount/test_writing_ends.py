@@ -230,7 +230,7 @@ def test_fsync_confirms_an_empty_file_and_close_does_not(field: Field) -> None:
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
     mount, vehicle, card = holding(field, data)
     unmount(mount.path)
-    wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
+    wait_until("it delivers before it ends", lambda: "uploading" in mount.alive_or_ended().text())
     with mount.started(*MAVFTPFS, "umount", mount.path) as second:
         assert second.stderr is not None
         assert "uploading pending changes" in second.stderr.readline()
@@ -349,7 +349,7 @@ def left_behind(field: Field, data: Path) -> tuple[SimVehicle, Path]:
     vehicle.left_alone = True
     process, mount.process = mount.alive(), None
     process.send_signal(signal.SIGTERM)
-    wait_until("it delivers before it ends", lambda: "delivering" in process.text())
+    wait_until("it delivers before it ends", lambda: "uploading" in process.text())
     process.send_signal(signal.SIGTERM)
     assert process.wait() == 4
     vehicle.kill()
@@ -470,7 +470,11 @@ def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
         unknown={},
     )
     listed = command("recover")[0]
-    for reason in ("a program was still writing it", "only the changed parts of it", "was not written down"):
+    for reason in (
+        "a program was still writing it",
+        "only the changed parts of it",
+        "its path on the vehicle is unknown",
+    ):
         assert reason in listed
     command("recover", field.sim(card).source, directory / "changed", code=ExitCode.USAGE)
     assert list(card.iterdir()) == []
