@@ -29,7 +29,7 @@ from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.progress import Progress, noting_losses
-from mavftpfs.client.recover import put_back
+from mavftpfs.client.recover import Left, put_back
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.source import files_in_mount, target_of
@@ -476,18 +476,22 @@ def recover(args: Args) -> int:
         how = "was there already" if there_already else "is on the vehicle now, verified"
         print(f"{_name(copy.path or b'')} {how}; the copy here is removed", flush=True)
 
-    async def work(session: Session) -> list[Recovered]:
+    async def work(session: Session) -> Left:
         async with noting_losses(session, bar):
             return await put_back(session, wanted, bar, tell)
 
     with shown(bar):
-        others = with_session(args, work, writing=True)
-    for vehicle, count in Counter(copy.vehicle for copy in others).items():
+        left = with_session(args, work, writing=True)
+    for copy, reason in left.failed:
+        say(f"{copy.file}: {reason}")
+    for vehicle, count in Counter(copy.vehicle for copy in left.others).items():
         say(
             f"{count_files(count)} of {vehicle} not sent: this is another vehicle; give that one as SOURCE, "
             "or use: mavftpfs put SOURCE FILE PATH"
         )
-    return ExitCode.INCOMPLETE if others else ExitCode.OK
+    if left.failed:
+        return ExitCode.UNDELIVERED
+    return ExitCode.INCOMPLETE if left.others else ExitCode.OK
 
 
 def _list_recovered(found: Sequence[Recovered]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import trio
 
@@ -17,11 +18,7 @@ from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.undelivered import Recovered, recovered_in
 from mavftpfs.client.upload import put_file
-from mavftpfs.shared.errors import (
-    NotDelivered,
-    NotFound,
-    UsageError,
-)
+from mavftpfs.shared.errors import MavftpfsError, NotDelivered, NotFound, UsageError
 from mavftpfs.shared.model import EntryKind
 from mavftpfs.shared.readable import name_text
 
@@ -29,38 +26,64 @@ _TICK = 0.05
 """Seconds between two checks whether the vehicle has reported its unique id."""
 
 
+@dataclass(frozen=True, slots=True)
+class Left:
+    """The files that stay here.
+
+    others: those of other vehicles. failed: the others, each with the reason.
+    """
+
+    others: Sequence[Recovered]
+    failed: Sequence[tuple[Recovered, str]]
+
+
 async def put_back(
     session: Session,
     wanted: Sequence[Recovered],
     progress: Progress,
     tell: Callable[[Recovered, bool], None],
-) -> list[Recovered]:
-    """Upload files. Remove the local copy of each file that is verified to be on the vehicle.
+) -> Left:
+    """Upload all files that can be uploaded. Remove the local copy of each file that is verified to be on the
+    vehicle.
 
-    tell: called for each file, with whether it was there already.
+    tell: called for each uploaded file, with whether it was there already.
 
-    Return the files of other vehicles, which stay here.
-
-    Raises:
-        UsageError: one of them cannot be uploaded, and the text gives the reason; the others were uploaded.
-        NotDelivered: a file did not reach the vehicle.
+    Return the files that stay here.
     """
     others = await _of_others(session, wanted)
-    hindered = [copy for copy in wanted if copy not in others and copy.hindrance]
-    wanted = [copy for copy in wanted if copy not in others and not copy.hindrance]
-    progress.plan(len(wanted), sum(copy.size for copy in wanted))
-    for copy in wanted:
-        path = _in_session(session, copy)
-        there_already = await _is_there(session, path, copy)
-        if not there_already:
-            await put_file(session, copy.file, path, progress)
-            if (await compare(session, path, copy.file)).match is Match.DIFFERS:
-                raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {copy.file}")
-        _forget(copy)
-        tell(copy, there_already)
-    for copy in hindered:
-        raise UsageError(f"{copy.file}: {copy.hindrance}; look at it, use `mavftpfs put`, and delete it here")
-    return others
+    mine = [copy for copy in wanted if copy not in others]
+    failed = [
+        (copy, f"{copy.hindrance}; look at it, use `mavftpfs put`, and delete it here")
+        for copy in mine
+        if copy.hindrance
+    ]
+    mine = [copy for copy in mine if not copy.hindrance]
+    progress.plan(len(mine), sum(copy.size for copy in mine))
+    for copy in mine:
+        try:
+            there_already = await _put_back(session, copy, progress)
+        except MavftpfsError as error:
+            failed.append((copy, str(error)))
+        else:
+            tell(copy, there_already)
+    return Left(others, failed)
+
+
+async def _put_back(session: Session, copy: Recovered, progress: Progress) -> bool:
+    """Upload a file, and remove its local copy. Return whether the vehicle had it already.
+
+    Raises:
+        UsageError: it cannot be uploaded, and the text gives the reason.
+        NotDelivered: it did not reach the vehicle.
+    """
+    path = _in_session(session, copy)
+    there_already = await _is_there(session, path, copy)
+    if not there_already:
+        await put_file(session, copy.file, path, progress)
+        if (await compare(session, path, copy.file)).match is Match.DIFFERS:
+            raise NotDelivered(f"{name_text(path)} differs on the vehicle")
+    _forget(copy)
+    return there_already
 
 
 async def _of_others(session: Session, wanted: Sequence[Recovered]) -> list[Recovered]:

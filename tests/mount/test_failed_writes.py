@@ -138,7 +138,7 @@ def test_a_copy_that_failed_is_not_put_on_the_card_by_the_mount_after_a_kill(
     again.run("ls", again.path)
     assert shown_files(card) == GOOD, "the part lies under a temporary name for ten minutes"
     assert "a write failed, so this is only the part that was written before" in command("recover")[0]
-    command("recover", vehicle.source, "--all", code=1)
+    command("recover", vehicle.source, "--all", code=4)
     assert shown_files(card) == GOOD
 
 

@@ -395,7 +395,7 @@ def test_what_changed_since_is_not_replaced_and_what_is_there_is_not_sent(field:
     (card / "changed").write_bytes(b"somebody else's")
     (card / "same").write_bytes(b"kept here")
     os.utime(card / "same", (1, 1))
-    _, said = command("recover", source, "--all", code=ExitCode.USAGE)
+    _, said = command("recover", source, "--all", code=ExitCode.UNDELIVERED)
     assert "/changed has 15 bytes on the vehicle, and had nothing when this was kept" in said
     assert (card / "changed").read_bytes() == b"somebody else's"
     assert f"mavftpfs put SOURCE {directory}/changed /changed" in said
@@ -403,6 +403,22 @@ def test_what_changed_since_is_not_replaced_and_what_is_there_is_not_sent(field:
     assert "/same was there already" in command("recover", source, "--all")[0]
     assert ((card / "changed").read_bytes(), (card / "same").stat().st_mtime) == (b"kept here", 1)
     assert list(state.iterdir()) == []
+
+
+@pytest.mark.holds("promise 3")
+def test_one_file_that_fails_does_not_keep_the_others_here(field: Field, state: Path) -> None:
+    """The card refuses the first name; the second file was changed since."""
+    card = field.local("card")
+    source = field.sim(card, "ardupilot5").source
+    (card / "changed").write_bytes(b"somebody else's")
+    names = ("a:b", "changed", "last")
+    directory = keep(state, **{name: {"path": f"/{name}", "whole": True} for name in names})
+    told, said = command("recover", source, "--all", code=ExitCode.UNDELIVERED)
+    assert told == "/last is on the vehicle now, verified; the copy here is removed\n"
+    lines = [line for line in said.splitlines() if f": {directory}/" in line]
+    assert [line.split(": ")[1] for line in lines] == [f"{directory}/a:b", f"{directory}/changed"]
+    assert (card / "last").read_bytes() == b"kept here"
+    assert not (directory / "last").exists()
 
 
 def test_a_description_goes_with_the_file_that_a_person_removed(state: Path) -> None:
@@ -476,6 +492,6 @@ def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
         "its path on the vehicle is unknown",
     ):
         assert reason in listed
-    command("recover", field.sim(card).source, directory / "changed", code=ExitCode.USAGE)
+    command("recover", field.sim(card).source, directory / "changed", code=ExitCode.UNDELIVERED)
     assert list(card.iterdir()) == []
     assert len(list(directory.iterdir())) == 6
