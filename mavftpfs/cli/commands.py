@@ -234,20 +234,19 @@ class _Delivery:
         # A mount that is still in use has pending changes, too, but does not end.
         line = report.delivery_line(status) if status["state"] == "unmounting" else ""
         if line and not self._explained:
-            self._explain(status["pid"])
+            self._explain(status)
         if line:
             self._show(line)
 
-    def _explain(self, pid: int) -> None:
+    def _explain(self, status: Status) -> None:
         self._explained = True
-        from mavftpfs.client.undelivered import recovered_directory
         from mavftpfs.mount.drain import DRAIN_LIMIT
 
         say(
             f"uploading pending changes for up to {readable_time(DRAIN_LIMIT)}; files not uploaded by then "
-            f"are saved in {recovered_directory()}"
+            f"are saved in {report.recovered_in_mount(status)}"
         )
-        say(f"Ctrl-C only stops this command; to save the remaining files here now: kill {pid}")
+        say(f"Ctrl-C only stops this command; to save the remaining files here now: kill {status['pid']}")
 
 
 def _after_a_killed_mount() -> int:

@@ -123,7 +123,7 @@ def _transfer_line(transfer: Status) -> str:
 def _held_lines(status: Status) -> Iterator[str]:
     held, files = status["held"], status["held"]["files"]
     for path, error in held.get("broken", {}).items():
-        yield f"  write failed {path}: {error}; copy the file again ({_part_goes()})"
+        yield f"  write failed {path}: {error}; copy the file again ({_part_goes(status)})"
     if not files:
         if not (status.get("read_only") or held.get("broken")):
             yield "  nothing is pending: the vehicle has all that was written"
@@ -135,11 +135,17 @@ def _held_lines(status: Status) -> Iterator[str]:
             yield f"  failed {path}: {error}"
 
 
-def _part_goes() -> str:
+def _part_goes(status: Status) -> str:
     """Return the words about the part of a file whose write failed."""
+    return f"umount moves the part that was written to {recovered_in_mount(status)}"
+
+
+def recovered_in_mount(status: Status) -> str:
+    """Return a mount's recovery directory. A mount of an earlier version does not send its own: then this
+    user's."""
     from mavftpfs.client.undelivered import recovered_directory
 
-    return f"umount moves the part that was written to {recovered_directory()}"
+    return str(status.get("recovered") or recovered_directory())
 
 
 def _waits_for(status: Status) -> str:

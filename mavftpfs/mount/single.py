@@ -19,6 +19,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
 from mavftpfs.client.mounts import also_mounted
+from mavftpfs.client.undelivered import recovered_directory
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.drain import drain_or_keep
 from mavftpfs.mount.fileserver import FileServer
@@ -169,6 +170,7 @@ class SingleMount(Life):
         return {
             "root": os.fsdecode(client.root),
             "read_only": client.read_only,
+            "recovered": str(recovered_directory()),
             **self._status(),
         }
 

@@ -285,10 +285,11 @@ def test_a_mount_that_wrote_and_a_put_that_was_refused_leave_nothing_behind(
 
 
 def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
-    field: Field, data: Path, state: Path
+    field: Field, data: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mount, vehicle, card = holding(field, data)
     process = mount.alive()
+    monkeypatch.setenv("XDG_STATE_HOME", "/of-another-user")
     with mount.started(*MAVFTPFS, "umount", mount.path) as child:
         assert child.stderr is not None
         first, second, third = (child.stderr.readline() for _ in range(3))

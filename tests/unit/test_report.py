@@ -119,6 +119,15 @@ def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
     assert lines(read_only=True)[1:] == []
 
 
+def test_a_failed_write_names_the_recovery_directory_of_the_mount(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mount of an earlier version does not send it."""
+    monkeypatch.setenv("XDG_STATE_HOME", "/mine")
+    cache = {"broken": {"/a": "the link is cut"}}
+    (told,) = lines(None, cache, recovered="/theirs/mavftpfs/recovered")[1:]
+    assert told.endswith("moves the part that was written to /theirs/mavftpfs/recovered)")
+    assert lines(None, cache)[1].endswith(" to /mine/mavftpfs/recovered)")
+
+
 async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     def facts() -> dict[str, Any]:
         return connection({"armed": 0.05 < trio.current_time() - began < 0.95})
