@@ -127,6 +127,9 @@ class Timers:
         return wait + min(manner.work, max(manner.usual_work, quiet))
 
     def passed_wait(self, now: float) -> float:
-        """Return how many seconds after its transmission a request is lost, if a later one was answered."""
-        rtt = max(self._rtt, self.bulk.smoothed)
+        """Return how many seconds after its transmission a request is lost, if a later one was answered.
+
+        The last round trip counts, because the smoothed one is too long when a pause of the card has ended.
+        """
+        rtt = self._rtt
         return max((1.0 + self.reordering.share(now)) * rtt, rtt + AT_ONCE)
