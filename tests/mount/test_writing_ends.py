@@ -396,12 +396,13 @@ def test_what_changed_since_is_not_replaced_and_what_is_there_is_not_sent(field:
     (card / "changed").write_bytes(b"somebody else's")
     (card / "same").write_bytes(b"kept here")
     os.utime(card / "same", (1, 1))
-    _, said = command("recover", source, "--all", code=ExitCode.UNDELIVERED)
+    told, said = command("recover", source, "--all", code=ExitCode.UNDELIVERED)
+    assert "/same was there already" in told
     assert "/changed has 15 bytes on the vehicle, and had nothing when this was kept" in said
     assert (card / "changed").read_bytes() == b"somebody else's"
     assert f"mavftpfs put SOURCE {directory}/changed /changed" in said
     command("put", source, directory / "changed", "/changed")
-    assert "/same was there already" in command("recover", source, "--all")[0]
+    assert "/changed was there already" in command("recover", source, "--all")[0]
     assert ((card / "changed").read_bytes(), (card / "same").stat().st_mtime) == (b"kept here", 1)
     assert list(state.iterdir()) == []
 
