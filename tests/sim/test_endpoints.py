@@ -83,7 +83,7 @@ def test_a_card_that_nothing_can_be_written_to_is_told(
     (tmp_path / storage).mkdir(parents=True, exist_ok=True)
     with pytest.raises(LinkClosed):
         endpoints.run(arguments(str(tmp_path), "--profile", profile, "--link", "udpin:198.51.100.1:1"))
-    assert ("/fs/microsd only" in capsys.readouterr().err) == told
+    assert ("only below /fs/microsd" in capsys.readouterr().err) == told
 
 
 RUNNER = """
