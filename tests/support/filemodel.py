@@ -127,6 +127,16 @@ class Model:
             await getattr(self, "on_" + call)(*args)
         except self.excused:
             self.failures += 1
+            self.lose_broken()
+
+    def lose_broken(self) -> None:
+        """Give the names of files of which a write failed back to what the card has there (promise 3)."""
+        broken = [handle.file for handle in self.handles if handle.writes and not handle.real.has_name]
+        for path in [path for path, file in self.names.items() if file in broken]:
+            data = self.card().get(path)
+            del self.names[path]
+            if data is not None:
+                self.names[path] = File(bytearray(data))
 
     # --- calls
 
