@@ -233,7 +233,7 @@ class WriteHandle(ReadHandle):
         file = self.file
 
         def wanted() -> bool:
-            return not closing or file.size > 0 or self in file.changers
+            return not closing or file.size > 0 or self in file.changers or file.writers == 1
 
         try:
             await delivery.deliver(self._card, file, wanted=wanted)

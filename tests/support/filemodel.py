@@ -200,7 +200,8 @@ class Model:
         handle = self.handle(index)
         if handle is not None:
             try:
-                await self.confirm(index, lambda handle: handle.real.release())
+                others = [one for one in self.handles if one.file is handle.file and one.writes]
+                await self.confirm(index, lambda handle: handle.real.release(), empty_too=others == [handle])
             finally:
                 self.handles.remove(handle)
 
