@@ -36,12 +36,14 @@ MAX_LINE = 1 << 20
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 SYSTEM = Path("/run/mavftpfs")
+SHORT = Path("/tmp")
+"""Holds the directory of sockets where the home's path is too long for one (the kernel takes 107 bytes)."""
 FOREIGN = "belongs to another user; only that user and root may use it by commands"
 """The reason why a mount refuses, although its files may be for everybody."""
 BOUND = Path("/proc/net/unix")
 """The kernel's table of sockets that are bound."""
 _SUFFIX = ".sock"
-_OURS = re.compile(r"^/.*/mavftpfs/[0-9a-f]{20}\.sock$")
+_OURS = re.compile(r"^/.*/mavftpfs(?:-[0-9]+)?/[0-9a-f]{20}\.sock$")
 
 
 class ControlError(MountFailed):
@@ -74,6 +76,7 @@ def usable_directory(preferred: Path | None = None) -> Path:
     if os.getuid() == 0 and _is_roots(SYSTEM):
         return SYSTEM
     places = [*([] if preferred is None else [preferred]), *own_directories()]
+    places.append(SHORT / f"mavftpfs-{os.getuid()}")
     found = private_directory(places, longest_name=len(socket_name("")))
     if found is not None:
         return found

@@ -427,6 +427,7 @@ def test_a_mount_is_reached_through_bind_mounts(mount: Mount, field: Field, card
         assert str(whole) not in shown
 
 
+@pytest.mark.needs("root")
 def test_a_mount_that_may_not_be_looked_at_is_found_by_its_name(
     mount: Mount, field: Field, monkeypatch: pytest.MonkeyPatch
 ) -> None:

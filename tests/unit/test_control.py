@@ -232,12 +232,26 @@ def test_a_directory_that_others_may_enter_or_own_is_not_used(
     link.symlink_to(tmp_path)
     too_long = tmp_path / ("x" * 100)
     monkeypatch.setattr(control, "SYSTEM", open_to_all)
+    monkeypatch.setattr(control, "SHORT", too_long)
     monkeypatch.setattr(control, "own_directories", lambda: [open_to_all, link, too_long])
     with pytest.raises(ControlError, match="open"):
         control.usable_directory()
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root may make that directory")
+def test_a_home_that_is_too_deep_for_a_socket_costs_no_mount_its_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "SYSTEM", tmp_path / "no" / "such" / "place")
+    monkeypatch.setattr(control, "own_directories", lambda: [tmp_path / ("x" * 100)])
+    with TemporaryDirectory() as short:
+        monkeypatch.setattr(control, "SHORT", Path(short))
+        chosen = control.usable_directory()
+        assert chosen == Path(short) / f"mavftpfs-{os.getuid()}"
+        assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
+        assert control._OURS.match(f"{chosen}/{control.socket_name('/mnt/drone')}")
+
+
+@pytest.mark.needs("root")
 def test_root_s_sockets_are_where_all_users_find_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
