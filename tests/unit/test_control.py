@@ -177,7 +177,7 @@ async def test_a_mount_of_a_version_that_tells_less_is_named_in_a_line(
     async def status(_: Reply) -> Reply:
         return {"status": told}
 
-    with TemporaryDirectory() as name:
+    with TemporaryDirectory(dir="/tmp") as name:
         place = Path(name) / "mavftpfs" / control.socket_name("/mnt/old")
         place.parent.mkdir()
         async with serving(place, {"status": status}):
@@ -191,7 +191,7 @@ async def test_a_socket_whose_directory_was_removed_is_bound_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As systemd removes a user's runtime directory at logout."""
-    with TemporaryDirectory() as name:
+    with TemporaryDirectory(dir="/tmp") as name:
         runtime, home = Path(name) / "run", Path(name) / "home"
         monkeypatch.setattr(controlserver, "LOOK_PERIOD", 0.02)
         monkeypatch.setattr(control, "SYSTEM", Path("/proc/none"))
@@ -212,7 +212,7 @@ async def test_a_socket_whose_directory_was_removed_is_bound_again(
 
 
 def test_a_private_directory_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    with TemporaryDirectory() as name:  # a socket's path may not be as long as pytest's directories
+    with TemporaryDirectory(dir="/tmp") as name:  # a socket's path may not be as long as pytest's directories
         short = Path(name)
         monkeypatch.setattr(control, "SYSTEM", short / "no" / "such" / "place")
         places = [short / "missing" / "deep" / "x", short / "run" / "mavftpfs"]
@@ -243,7 +243,7 @@ def test_a_home_that_is_too_deep_for_a_socket_costs_no_mount_its_socket(
 ) -> None:
     monkeypatch.setattr(control, "SYSTEM", tmp_path / "no" / "such" / "place")
     monkeypatch.setattr(control, "own_directories", lambda: [tmp_path / ("x" * 100)])
-    with TemporaryDirectory() as short:
+    with TemporaryDirectory(dir="/tmp") as short:
         monkeypatch.setattr(control, "SHORT", Path(short))
         chosen = control.usable_directory()
         assert chosen == Path(short) / f"mavftpfs-{os.getuid()}"
@@ -268,7 +268,7 @@ async def test_a_socket_is_found_wherever_it_is_but_not_another_user_s(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """sudo and su leave HOME and XDG_RUNTIME_DIR as they were, or change them."""
-    with TemporaryDirectory() as name:
+    with TemporaryDirectory(dir="/tmp") as name:
         directory = Path(name) / "mavftpfs"
         directory.mkdir(mode=0o700)
         path = directory / control.socket_name("/mnt/drone")
