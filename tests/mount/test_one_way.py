@@ -136,7 +136,12 @@ def said(words: Sequence[str], places: dict[str, str]) -> tuple[int, str, str]:
     return code, texts[0], texts[1]
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+SLOW = pytest.mark.soak  # 75 to 95 s each: these tests wait, and a file's tests run one after the other
+
+
+@pytest.mark.parametrize(
+    "profile", ["px4", pytest.param("ardupilot5", marks=SLOW), pytest.param("mavsdk", marks=SLOW)]
+)
 def test_every_command_says_the_same_with_and_without_a_mount(field: Field, profile: str) -> None:
     given = field.local("given")
     (given / "big").write_bytes(NEW)
@@ -176,7 +181,9 @@ ON_A_BAD_LINK: list[list[str]] = [
 ]
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+@pytest.mark.parametrize(
+    "profile", [pytest.param("px4", marks=SLOW), pytest.param("ardupilot5", marks=SLOW), "mavsdk"]
+)
 def test_nor_does_a_bad_link_make_a_difference(field: Field, profile: str) -> None:
     given = field.local("given")
     (given / "big").write_bytes(NEW)
