@@ -135,7 +135,6 @@ class Inode:
     """A number that the kernel may use.
 
     path: None once the name was removed. told_size: the size in bytes that the kernel last received, if any.
-    believed_until: the time when the kernel asks for its attributes again (trio's clock).
     """
 
     ino: int
@@ -143,11 +142,6 @@ class Inode:
     path: bytes | None
     lookups: int = 0
     told_size: int | None = None
-    believed_until: float = 0.0
-
-
-MAX_ABSENT = 10_000
-"""Absent names that the kernel may believe at once."""
 
 
 class InodeTable:
@@ -158,7 +152,6 @@ class InodeTable:
         root = Inode(ROOT_INO, 0, ROOT)
         self._by_ino: dict[int, Inode] = {ROOT_INO: root}
         self._by_path: dict[bytes, Inode] = {ROOT: root}
-        self._absent: dict[tuple[int, bytes], float] = {}
         self.excess_forgets = 0
         """Forgets beyond the count. They are a bug here or in the kernel, but harmless."""
 
@@ -212,22 +205,6 @@ class InodeTable:
         inode.lookups = max(0, inode.lookups - lookups)
         if inode.lookups == 0:
             self._free(inode)
-
-    def absent(self, parent: int, name: bytes, valid_for: float, now: float) -> float:
-        """Note that a name is absent, and return for how long the kernel may believe it; 0 if there are too
-        many to note."""
-        if len(self._absent) >= MAX_ABSENT:
-            self._absent = {known: until for known, until in self._absent.items() if until > now}
-        if len(self._absent) >= MAX_ABSENT:
-            return 0.0
-        self._absent[parent, name] = now + valid_for
-        return valid_for
-
-    def believed(self, now: float) -> tuple[list[int], list[tuple[int, bytes]]]:
-        """Return what the kernel now answers by itself: inodes with attributes, and absent names with their
-        directory's inode."""
-        inodes = [ino for ino, inode in self._by_ino.items() if inode.believed_until > now]
-        return inodes, [known for known, until in self._absent.items() if until > now]
 
     def unlink(self, path: bytes) -> None:
         """Note that the name is gone; the kernel may still have the inode (an open file)."""

@@ -100,13 +100,6 @@ class Invalidator:
         await self.forget_pages(path)
         await self.forget_name(path)
 
-    async def forget_beliefs(self) -> None:
-        """Make the kernel ask again for everything that it would answer by itself; return when it has dropped
-        that."""
-        inodes, absent = self._inodes.believed(trio.current_time())
-        calls = [partial(self._notify, ino, True) for ino in inodes]
-        await self._in_thread(calls + [partial(self._notify_name, *name) for name in absent])
-
     async def _tell(self, ino: int, *, attr_only: bool) -> None:
         await self._in_thread([partial(self._notify, ino, attr_only)])
 

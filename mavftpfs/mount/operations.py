@@ -119,7 +119,7 @@ class Operations(pyfuse3.Operations):
         try:
             found = await self._tree.stat(path)
         except NotFound:
-            return self._negative(parent_inode, name, path)
+            return self._negative(path)
         # The parent may have another path by now.
         return self._attributes(self.inodes.lookup(self._child(parent_inode, name)), found)
 
@@ -496,15 +496,15 @@ class Operations(pyfuse3.Operations):
             return parent
         return split(parent)[0] if name == b".." else join(parent, name)
 
-    def _negative(self, parent: int, name: bytes, path: bytes) -> EntryAttributes:
+    def _negative(self, path: bytes) -> EntryAttributes:
         entry = EntryAttributes()
-        entry.st_ino, now = 0, trio.current_time()
-        entry.entry_timeout = self.inodes.absent(parent, name, self._tree.negative_valid_for(path), now)
+        entry.st_ino = 0
+        entry.entry_timeout = self._tree.negative_valid_for(path)
         return entry
 
     def _attributes(self, inode: Inode, found: Stat) -> EntryAttributes:
         look = self._presentation
-        inode.told_size, inode.believed_until = found.size, trio.current_time() + found.valid_for
+        inode.told_size = found.size
         entry = EntryAttributes()
         entry.st_ino = inode.ino
         entry.generation = inode.generation

@@ -103,9 +103,9 @@ class ToldFiles:
         await _told(self._invalidator.forget_name, old, new)
 
     async def refresh(self) -> None:
-        """See Files."""
+        """See Files. The kernel asks again within two seconds."""
         self._tree.forget_caches()
-        await _told(self._invalidator.forget_beliefs)
+        await trio.lowlevel.checkpoint()
 
 
 class ToldFile:

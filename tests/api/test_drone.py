@@ -552,7 +552,7 @@ def refusal(call: Call, drone: mavftpfs.Drone) -> tuple[type, str]:
 
 
 @pytest.mark.mount
-def test_refresh_reaches_the_kernel_of_a_mount(field: Field) -> None:
+def test_refresh_reaches_a_mount(field: Field) -> None:
     card = field.local("card")
     (card / "f").write_bytes(DATA)
     vehicle = field.sim(card)

@@ -30,17 +30,6 @@ def test_a_taken_number_is_stepped_over(monkeypatch: pytest.MonkeyPatch) -> None
     assert numbers == {2, 3}
 
 
-def test_what_the_kernel_believes_is_known_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(handles, "MAX_ABSENT", 2)
-    table = InodeTable()
-    table.lookup(b"/a").believed_until = 5.0
-    assert [table.absent(ROOT_INO, name, 2.0, now=0.0) for name in (b"b", b"c", b"d")] == [2.0, 2.0, 0.0]
-    inodes, absent = table.believed(now=1.0)
-    assert (inodes, absent) == ([table.known(b"/a")], [(ROOT_INO, b"b"), (ROOT_INO, b"c")])
-    assert table.absent(ROOT_INO, b"d", 9.0, now=3.0) == 9.0
-    assert table.believed(now=6.0) == ([], [(ROOT_INO, b"d")])
-
-
 def test_rename_moves_a_subtree_and_keeps_numbers() -> None:
     table = InodeTable()
     paths = [b"/d", b"/d/x", b"/d/e/y", b"/dx"]
