@@ -35,7 +35,7 @@ NAMESPACE_BUDGET = 240.0
 """Seconds for a change of names, which may have to finish a delivery, and to check whether it happened."""
 
 _DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
-_NAMING = frozenset({"create", "mknod", "mkdir", "rmdir", "unlink", "rename"})
+_NAMING = frozenset({"create", "mkdir", "rmdir", "unlink", "rename"})
 
 SLOWEST_RATE = 256
 """Bytes/s of the slowest link worth waiting for. The tree itself ends a read without progress; this ends a

