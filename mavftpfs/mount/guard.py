@@ -9,13 +9,12 @@ from __future__ import annotations
 import errno
 import functools
 import logging
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import trio
 from pyfuse3 import FUSEError
 
-from mavftpfs.client.mountpoint import XATTR_CRC32
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import MavftpfsError
 
@@ -24,22 +23,15 @@ log = logging.getLogger("mavftpfs.fuse")
 MARGIN = 3.0
 """Seconds beyond op_deadline for the tree to report its own, better error."""
 
-CRC_BUDGET = 120.0
-"""Seconds for a checksum, for which the vehicle reads the whole file (promise 2)."""
+LONG, LONGEST = 600.0, 4 * 3600.0
+"""Seconds for calls that wait for a file to be read or a name to be changed, and for those that wait until
+a file is sent. The tree itself ends a call without progress, so these end only a trickle."""
 
-DELIVERY_BUDGET = 4 * 3600.0
-"""Seconds for calls that move bytes. The tree itself ends calls without progress, so this ends only a
-trickle."""
-
-NAMESPACE_BUDGET = 240.0
-"""Seconds for a change of names, which may have to finish a delivery, and to check whether it happened."""
-
-_DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
-_NAMING = frozenset({"create", "mkdir", "rmdir", "unlink", "rename"})
-
-SLOWEST_RATE = 256
-"""Bytes/s of the slowest link worth waiting for. The tree itself ends a read without progress; this ends a
-read that trickles."""
+_BUDGETS = {
+    **dict.fromkeys(("read", "getxattr", "create", "mkdir", "rmdir", "unlink", "rename"), LONG),
+    **dict.fromkeys(("write", "flush", "fsync", "release", "setattr", "open"), LONGEST),
+}
+"""Handler -> its seconds. All others have op_deadline and MARGIN."""
 
 
 class Guarded(Protocol):
@@ -58,7 +50,7 @@ def handler(method: Handler[S, P, T]) -> Handler[S, P, T]:
     """Guard a handler."""
 
     async def guarded(self: S, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        with trio.move_on_after(budget(method.__name__, args, self.op_deadline)):
+        with trio.move_on_after(max(_BUDGETS.get(method.__name__, 0.0), self.op_deadline + MARGIN)):
             try:
                 return await method(self, *args, **kwargs)
             except FUSEError:
@@ -73,16 +65,3 @@ def handler(method: Handler[S, P, T]) -> Handler[S, P, T]:
         raise FUSEError(errno.ETIMEDOUT)
 
     return functools.update_wrapper(guarded, method)
-
-
-def budget(name: str, args: Sequence[Any], op_deadline: float) -> float:
-    """Return the seconds that the handler of this name may take, with these arguments."""
-    if name in _DELIVERING:
-        return DELIVERY_BUDGET
-    if name in _NAMING:
-        return NAMESPACE_BUDGET
-    if name == "read":
-        return op_deadline + MARGIN + int(args[2]) / SLOWEST_RATE
-    if name == "getxattr" and args[1] == XATTR_CRC32:
-        return CRC_BUDGET + op_deadline + MARGIN
-    return op_deadline + MARGIN
