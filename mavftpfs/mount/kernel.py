@@ -11,7 +11,7 @@ import os
 import select
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from typing import Any
+from types import SimpleNamespace
 
 import pyfuse3
 import trio
@@ -116,30 +116,8 @@ def never_blocking(on_gone: Callable[[], None] = lambda: None) -> Iterator[None]
 
     The seam is the one that pyfuse3's own asyncio support uses: its variable for the module `trio`.
     """
-    setattr(pyfuse3, "trio", _Trio(on_gone))  # noqa: B010 (which its types do not tell)
-    try:
-        yield
-    finally:
-        setattr(pyfuse3, "trio", trio)  # noqa: B010
 
-
-class _Delegate:
-    """Has the attributes of a module, except those that a subclass defines."""
-
-    def __init__(self, module: object) -> None:
-        self._module = module
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._module, name)
-
-
-class _LowLevel(_Delegate):
-    def __init__(self, on_gone: Callable[[], None]) -> None:
-        super().__init__(trio.lowlevel)
-        self._on_gone = on_gone
-
-    async def wait_readable(self, fd: int) -> None:
-        """Wait until a read finds a request, as far as that can be known."""
+    async def wait_readable(fd: int) -> None:
         os.set_blocking(fd, False)
         poll = select.poll()
         poll.register(fd, select.POLLIN)
@@ -147,30 +125,26 @@ class _LowLevel(_Delegate):
         while not (found := poll.poll(0)):
             await trio.lowlevel.wait_readable(fd)
         if any(events & select.POLLERR for _, events in found):  # on Linux: the kernel's mount is gone
-            self._on_gone()
+            on_gone()
+
+    lowlevel = SimpleNamespace(**{**vars(trio.lowlevel), "wait_readable": wait_readable})
+    seam = SimpleNamespace(**{**vars(trio), "lowlevel": lowlevel, "open_nursery": _workers})
+    setattr(pyfuse3, "trio", seam)  # noqa: B010 (which its types do not tell)
+    try:
+        yield
+    finally:
+        setattr(pyfuse3, "trio", trio)  # noqa: B010
 
 
-class _Trio(_Delegate):
-    def __init__(self, on_gone: Callable[[], None]) -> None:
-        super().__init__(trio)
-        self.lowlevel = _LowLevel(on_gone)
+@asynccontextmanager
+async def _workers() -> AsyncIterator[SimpleNamespace]:
+    """Open the nursery of pyfuse3's workers, which survive a read without a request."""
+    async with trio.open_nursery() as nursery:
 
-    @asynccontextmanager
-    async def open_nursery(self) -> AsyncIterator[_Workers]:
-        """Open the nursery of pyfuse3's workers."""
-        async with trio.open_nursery() as nursery:
-            yield _Workers(nursery)
+        def start_soon(worker: Callable[..., Awaitable[None]], *args: object, name: object = None) -> None:
+            nursery.start_soon(_work, worker, args, name=name)
 
-
-class _Workers:
-    """Starts workers that survive a read without a request."""
-
-    def __init__(self, nursery: trio.Nursery) -> None:
-        self._nursery = nursery
-
-    def start_soon(self, worker: Callable[..., Awaitable[None]], *args: object, name: object = None) -> None:
-        """As trio.Nursery's."""
-        self._nursery.start_soon(_work, worker, args, name=name)
+        yield SimpleNamespace(start_soon=start_soon)
 
 
 async def _work(worker: Callable[..., Awaitable[None]], args: tuple[object, ...]) -> None:
