@@ -8,7 +8,6 @@ own parsers.
 from __future__ import annotations
 
 import argparse
-import errno
 import os
 import re
 import shlex
@@ -65,8 +64,6 @@ SYSTEMD_RUNS = Path("/run/systemd/system")
 
 FOR_ALL = "sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
 """Makes a copy of the program that belongs to root, and that all users can run."""
-NOBODY = 65534
-"""A user id without any rights of its own."""
 
 MARK = "# Made by mavftpfs install."
 """A line in installed programs, which distinguishes them from other programs of the same name."""
@@ -119,7 +116,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
     Raises:
         UsageError: a file cannot be written or removed, or users other than root could change the program
-            that all run, or could not run it.
+            that all run.
     """
     program = own_program()
     everybody = os.geteuid() == 0
@@ -129,7 +126,6 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
         return ExitCode.OK
     if everybody and not args.remove:
         check_program(program)
-        check_others(program)
     for piece in pieces:
         if piece.is_others() or (args.remove and not piece.is_there()):
             continue
@@ -170,59 +166,6 @@ def check_program(program: Path) -> None:
                     f"{path} can be changed by others than root, but root would run it; install a copy "
                     f"of its own: {FOR_ALL}"
                 )
-
-
-def check_others(program: Path) -> None:
-    """Check that other users can run the program, by running it as `nobody`.
-
-    Raises:
-        UsageError: they cannot; the text gives the reason, if a mode explains it.
-    """
-    words = [str(program), "--version"]
-    try:
-        done = subprocess.run(
-            words,
-            user=NOBODY,
-            group=NOBODY,
-            extra_groups=(),
-            cwd="/",
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-    except OSError as exc:
-        if exc.errno != errno.EACCES:  # this container has no user `nobody`
-            return
-        said = exc.strerror or ""
-    else:
-        if done.returncode == 0:
-            return
-        said = (done.stderr.splitlines() or [""])[-1]
-    closed = _closed_to_others(program)
-    why = said if closed is None else f"{closed} is closed to them ({_mode(closed)})"
-    raise UsageError(f"other users could not run {program}: {why}; install a copy for all users: {FOR_ALL}")
-
-
-def _closed_to_others(program: Path) -> Path | None:
-    """Return the first file or directory that a program needs and other users may not use."""
-    python = _interpreter(program)
-    for place in (program, python, Path(os.path.realpath(python)), Path(mavftpfs.__file__)):
-        for path in (*reversed(place.parents), place):
-            needed = stat.S_IXOTH if path.is_dir() else stat.S_IROTH
-            if not path.stat().st_mode & needed:
-                return path
-    return None
-
-
-def _interpreter(program: Path) -> Path:
-    """Return the interpreter in a script's first line; without such a line this program's own Python."""
-    with program.open("rb") as file:
-        mark, words = file.read(2), file.readline().split()
-    return Path(os.fsdecode(words[0])) if mark == b"#!" and words else Path(sys.executable)
-
-
-def _mode(path: Path) -> str:
-    return f"mode {stat.S_IMODE(path.stat().st_mode):04o}"
 
 
 def for_user(

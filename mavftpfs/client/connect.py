@@ -7,8 +7,8 @@ import hashlib
 import os
 import stat
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, nullcontext
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from functools import partial
@@ -20,7 +20,6 @@ import trio
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.mounts import holder_of
 from mavftpfs.client.status import snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.undelivered import rescue, spool_for
@@ -37,7 +36,6 @@ from mavftpfs.session.driver import PayloadSink
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
-    LinkClosed,
     ListingIncomplete,
     NoFtp,
     NotADirectory,
@@ -119,17 +117,6 @@ def _print_payload(now: float, direction: str, wire: bytes) -> None:
     print(f"{datetime.now():%H:%M:%S.%f} {text_line(direction, wire)}", file=sys.stderr)
 
 
-HOLDER_PATIENCE = 3.0
-"""Seconds for mounts to answer which link they have."""
-
-
-async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
-    """Return the status of the mount that has a link, None if no mount is known."""
-    with trio.move_on_after(HOLDER_PATIENCE):
-        return await trio.to_thread.run_sync(holder_of, spec, abandon_on_cancel=True)
-    return None
-
-
 @asynccontextmanager
 async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other mavftpfs programs.
@@ -137,7 +124,7 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
     beats: receive only heartbeats; then the link is shared from the beginning.
 
     Raises:
-        LinkClosed: as open_link; the text names a mount that has the port or the device and cannot share it.
+        LinkClosed: as open_shared. UsageError: an endpoint of forward= is SOURCE itself.
     """
     own = Address(options.source_system, OWN_COMPONENT)
     wanted = PortRequest(own, options.forward, process_name(), beats)
@@ -146,28 +133,8 @@ async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> As
             raise UsageError(
                 f"forward={place} is SOURCE itself; name another place, such as udpout:127.0.0.1:14551"
             )
-    async with AsyncExitStack() as stack:
-        try:
-            link = await stack.enter_async_context(open_shared(spec, wanted))
-        except LinkClosed as exc:
-            cause = exc.__cause__
-            status = None
-            if isinstance(cause, OSError) and cause.errno in (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN):
-                status = await mount_with(spec)
-            if status is None:
-                raise
-            raise LinkClosed(_had_by(spec, status)) from exc
+    async with open_shared(spec, wanted) as link:
         yield link
-
-
-def _had_by(spec: LinkSpec, status: Mapping[str, Any]) -> str:
-    vehicle, mountpoint = status["vehicle"], status["mountpoint"]
-    what = "device" if spec.kind is LinkKind.SERIAL else "port"
-    return (
-        f"{spec.description}: this {what} belongs to the mount on {mountpoint}, of vehicle "
-        f"{vehicle['system']}/{vehicle['component']}; unmount that (mavftpfs umount {mountpoint}), "
-        f"or use another {what}"
-    )
 
 
 def waiting(spec: LinkSpec, options: Options) -> str:

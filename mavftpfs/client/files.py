@@ -28,7 +28,6 @@ from mavftpfs.client.mounts import (
     mounts_on,
     require_usable,
     status_of,
-    vehicle_below,
 )
 from mavftpfs.client.several import Unnamed
 from mavftpfs.client.status import Facts
@@ -327,10 +326,11 @@ async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Async
     """
     status = await usable_status(mountpoint)
     if "members" in status:
-        mountpoint = vehicle_below(status, subtree, options)
-        status = await usable_status(mountpoint)
-    if "members" in status:
-        raise errors.LinkClosed(f"the mount on {mountpoint} is one of several vehicles now")
+        names = [member["name"] for member in status["members"]]
+        example = f"{mountpoint}/{names[0] if names else 1}"
+        raise errors.UsageError(
+            f"{mountpoint} is for several vehicles ({', '.join(names) or 'none yet'}); name one, as {example}"
+        )
     system, component = status["vehicle"]["system"], status["vehicle"]["component"]
     if options.target_system not in (0, system) or options.target_component not in (0, component):
         raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")

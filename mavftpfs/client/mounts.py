@@ -11,7 +11,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import pwd
 import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
@@ -23,7 +22,6 @@ from mavftpfs import __version__
 from mavftpfs.client import control, wire
 from mavftpfs.client.control import ControlError, NobodyThere, Refused
 from mavftpfs.client.mountpoint import (
-    MOUNT_TABLE,
     OUR_TYPE,
     XATTR_STATUS,
     Mounted,
@@ -36,7 +34,7 @@ from mavftpfs.client.status import Facts
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.shared.errors import LinkClosed, MavftpfsError, NotFound, UsageError
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError
 from mavftpfs.shared.model import normalise
 from mavftpfs.shared.options import Options
 
@@ -231,39 +229,6 @@ def several_at(place: str) -> Status | None:
     return status if "members" in status else None
 
 
-def several_above(path: str) -> str | None:
-    """Return the directory at or above a path below which all vehicles are mounted; None if there is none."""
-    while path != "/":
-        if several_at(path) is not None:
-            return path
-        path = os.path.dirname(path)
-    return None
-
-
-def vehicle_below(status: Status, subtree: bytes, options: Options) -> str:
-    """Return the mountpoint of the vehicle that the options ask for, below a mount of several vehicles.
-
-    UsageError: the options do not name one. NotFound: `subtree` names a vehicle that is not there.
-    LinkClosed: the vehicle is not mounted now.
-    """
-    place, names = status["mountpoint"], {member["name"]: member for member in status["members"]}
-    first = os.fsdecode(subtree.strip(b"/").partition(b"/")[0])
-    wanted = str(options.target_system)
-    if first.isdigit():
-        raise NotFound(f"no vehicle is mounted on {place}/{first}")
-    if not options.target_system and len(names) == 1:
-        (wanted,) = names
-    elif not options.target_system:
-        shown = ", ".join(names) or "none yet"
-        raise UsageError(f"{place} is for several vehicles ({shown}); name one, as {place}/1")
-    if wanted not in names:
-        raise LinkClosed(f"no vehicle {wanted} is mounted below {place}")
-    if names[wanted]["state"] != "mounted":
-        why = names[wanted]["problem"] or names[wanted]["state"]
-        raise LinkClosed(f"vehicle {wanted} is not mounted below {place}: {why}")
-    return os.path.join(place, wanted)
-
-
 def statuses_at(place: str) -> list[Status]:
     """Return the statuses that belong to a mountpoint, or to the directory of a mount of all vehicles.
 
@@ -322,52 +287,6 @@ def mounts_on(spec: LinkSpec) -> list[Status]:
     return [status for status in _of_mounts(STATUS_PATIENCE) if has_link(status, spec)]
 
 
-def holder_of(spec: LinkSpec) -> Status | None:
-    """Return the status of the mount that has a link, even another user's; None if there is none."""
-    return next((status for status in all_statuses() if has_link(status, spec)), None)
-
-
-def also_mounted(spec: LinkSpec, vehicle: Facts) -> str:
-    """Return a line about the mounts of a vehicle on a link, or "". vehicle: the facts of its status."""
-
-    def is_same(status: Status) -> bool:
-        same = all(status["vehicle"][key] == vehicle[key] for key in ("system", "component"))
-        return same and has_link(status, spec)
-
-    known = [status for status in all_statuses() if not status.get("problem") and "vehicle" in status]
-    places = [status["mountpoint"] for status in known if is_same(status)]
-    if not places:
-        return by_others(spec)
-    return (
-        f"this vehicle is mounted on {' and '.join(places)}, too; a change through one mount may show in the "
-        f"other one 20 s later; to have only one, run: mavftpfs umount {places[0]}"
-    )
-
-
-def by_others(spec: LinkSpec, *, table: str = MOUNT_TABLE) -> str:
-    """Return a line about mounts of other users on a link, or "". This user may not query them, so they may
-    have another vehicle on the link."""
-    found = []
-    for place, mount in mounts(table).items():
-        if mount.type == OUR_TYPE and mount.uid not in (None, os.getuid()):
-            with suppress(UsageError):
-                if same_link(parse_source(mount.source), spec):
-                    found.append(f"{place} (user {_user(mount.uid)})")
-    if not found:
-        return ""
-    return (
-        f"this link is mounted on {' and '.join(sorted(found))}, too; if that is the same vehicle, a change "
-        "through one mount may show in the other one 20 s later"
-    )
-
-
-def _user(uid: int | None) -> str:
-    """Return the name of a user, or the number if there is none."""
-    with suppress(KeyError):
-        return pwd.getpwuid(uid or 0).pw_name
-    return str(uid)
-
-
 def is_wanted(status: Status, options: Options) -> bool:
     """Return whether a mount has the vehicle that the options ask for, and that vehicle still answers
     there."""
@@ -388,15 +307,11 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
     place, _, subtree = source.partition("#")
     if not place or (":" in place and not place.startswith("/")):
         return None
-    found = enclosing_mount(place) or _below_several(place)
+    found = enclosing_mount(place)
     if found is None:
-        return None
+        several = canonical(place)
+        if several_at(several) is None:
+            return None
+        found = several, ""
     mountpoint, below = found
     return mountpoint, normalise(os.fsencode(f"{below}/{subtree}"))
-
-
-def _below_several(place: str) -> tuple[str, str] | None:
-    """Return (directory, path below it) if a path leads into the directory of a mount of all vehicles."""
-    path = canonical(place)
-    above = several_above(path)
-    return None if above is None else (above, path[len(above) :])

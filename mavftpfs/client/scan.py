@@ -10,7 +10,7 @@ from typing import Any
 
 import trio
 
-from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
+from mavftpfs.client.connect import connect_options, opened, waiting
 from mavftpfs.client.files import Target, heartbeats_in, usable_status
 from mavftpfs.client.listening import listening
 from mavftpfs.client.mounts import mounts_on, with_vehicles
@@ -19,7 +19,7 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.peers import describe_peer, names_of
 from mavftpfs.session.connection import connected, heard_within
-from mavftpfs.shared.errors import FtpNak, LinkClosed, MavftpfsError, VehicleLost
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_time
 
@@ -45,15 +45,9 @@ async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     assert target.spec is not None
     mounted = await trio.to_thread.run_sync(mounts_on, target.spec, abandon_on_cancel=True)
     found = _shown(_of_mounts([status for status in mounted if not status.get("problem")]), show)
-    try:
-        async with opened(target.spec, target.options) as link:
-            async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
-                found += _shown([entry], show)
-    except LinkClosed:  # the mount is another user's, and does not share the port
-        holder = await mount_with(target.spec)
-        if holder is None or holder.get("problem"):
-            raise
-        return _shown(_of_mount(holder), show)
+    async with opened(target.spec, target.options) as link:
+        async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
+            found += _shown([entry], show)
     return sorted(found, key=itemgetter("system", "component"))
 
 

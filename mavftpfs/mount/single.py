@@ -18,7 +18,6 @@ import trio
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
-from mavftpfs.client.mounts import also_mounted
 from mavftpfs.client.undelivered import recovered_directory
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.drain import drain_or_keep
@@ -31,9 +30,6 @@ from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import fuse_words
 from mavftpfs.mount.toldfiles import ToldFiles
 from mavftpfs.shared.errors import ExitCode, MountFailed
-
-ASKING_TIME = 2.0
-"""Seconds for other mounts to report their vehicle."""
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
 """Connects to the vehicle. Its argument is called for paths whose bytes changed."""
@@ -84,24 +80,15 @@ class SingleMount(Life):
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
             self._files = FileServer(ToldFiles(vehicle.tree, operations, invalidator), self.facts)
             words = fuse_words(self.request.options, self.request.source)
-            notes = await self._notes(vehicle)
             if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
                 unmount(self.request.mountpoint, lazy=True)
             with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
                 try:
                     self.enter(State.MOUNTED)
                     await self.start_control(nursery, self._files)
-                    await self._answer(invalidator, lambda: _together(vehicle.notice(), *notes))
+                    await self._answer(invalidator, lambda: _together(vehicle.notice(), timeout_note()))
                 finally:
                     invalidator.end()
-
-    async def _notes(self, vehicle: Attached) -> list[str]:
-        """Return the notes for the user about this computer's kernel and mounts."""
-        notes = [timeout_note()]
-        ask = partial(also_mounted, self.request.spec, vehicle.status()["vehicle"])
-        with trio.move_on_after(ASKING_TIME):  # a mount may have been stopped
-            notes.append(await trio.to_thread.run_sync(ask, abandon_on_cancel=True))
-        return notes
 
     @asynccontextmanager
     async def _drained(self, tree: Tree) -> AsyncIterator[None]:

@@ -186,32 +186,3 @@ def test_root_does_not_run_what_another_user_owns(installation: Installation, pl
     (line,) = said["error"]
     assert "can be changed by others than root" in line
     assert "PIPX_HOME" in line
-
-
-@pytest.mark.needs("namespaces", "root's Python")
-@pytest.mark.parametrize(
-    ("close", "reason"),
-    [
-        (['chmod 700 "$2"'], "/bin is closed to them (mode 0700)"),
-        (
-            [
-                'mkdir -m 700 "$1/closed"',
-                f'printf \'#!/bin/sh\\nexec "{sys.executable}" "$@"\\n\' > "$1/closed/python"',
-                'chmod 755 "$1/closed/python"',
-                'sed -i "1s,.*,#!$1/closed/python," "$2/mavftpfs"',
-            ],
-            "/closed is closed to them (mode 0700)",
-        ),
-    ],
-    ids=["program", "interpreter"],
-)
-def test_root_installs_nothing_that_others_could_not_run(
-    installation: Installation, close: list[str], reason: str
-) -> None:
-    steps = (*close, "trap 'written \"$1\" left' EXIT", '"$2/mavftpfs" install')
-    said = installation.run(*steps, code=1)
-    assert "left" not in said
-    (line,) = said["error"]
-    assert line.startswith("mavftpfs: other users could not run ")
-    assert reason in line
-    assert "install a copy for all users: sudo PIPX_HOME=/opt/pipx" in line

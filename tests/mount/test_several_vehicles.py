@@ -260,19 +260,19 @@ def test_all_starts_again_where_a_killed_run_left_its_directories(fleet: Fleet) 
 
 
 def test_commands_know_the_vehicles_below(fleet: Fleet) -> None:
-    mounts = mount_all(fleet, 1)
-    assert "0.bin" in command("ls", mounts.path, "/log")[0], "there is only one"
-    fleet.launch(2)
+    for system in (1, 2):
+        fleet.launch(system)
+    mounts = mount_all(fleet)
     mounts.await_up("1", "2")
-    said = command("ls", mounts.path, "/log", code=1)[1]
-    assert "(1, 2)" in said
+    for options in ((), ("-o", "target_system=1")):
+        said = command("ls", mounts.path, "/log", *options, code=1)[1]
+        assert said.endswith(f"is for several vehicles (1, 2); name one, as {mounts.path}/1\n")
     for system in (1, 2):
         local = fleet.field.local(f"sync{system}")
-        command("sync", mounts.path, local, "-o", f"target_system={system}", "--from", "/log")
+        command("sync", mounts.path / str(system), local, "--from", "/log")
         assert same(fleet.cards[system], local)
         assert "0.bin" in command("ls", fleet.source, "/log", "-o", f"target_system={system}")[0]
-    assert "no vehicle 9" in command("ls", mounts.path, "/", "-o", "target_system=9", code=2)[1]
-    assert "9" in command("ls", mounts.path / "9", code=1)[1]
+    assert "no vehicle is mounted on" in command("ls", mounts.path / "9", code=1)[1]
     for source in (mounts.path, fleet.source):
         found = json.loads(command("scan", "--json", source)[0])
         assert [entry["system"] for entry in found if entry["answers"]] == [1, 2]

@@ -19,8 +19,6 @@ from mavftpfs.client.mountpoint import (
     unmount,
     why_not_mounted,
 )
-from mavftpfs.client.mounts import by_others
-from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import MountFailed
 
 
@@ -152,19 +150,3 @@ def test_the_kernels_limit_for_a_request(
         if text is not None:
             (tmp_path / name).write_text(text)
     assert request_timeout(tmp_path) == limit
-
-
-def test_a_mount_of_another_user_on_the_same_link_is_named(tmp_path: Path) -> None:
-    def mount(place: str, source: str, uid: int) -> str:
-        return f"1 2 0:50 / {place} rw - fuse.mavftpfs {source} rw,user_id={uid},group_id=0"
-
-    others = os.getuid() + 4321
-    path = table(
-        tmp_path,
-        mount("/mnt/theirs", "udpin:0.0.0.0:14550#/fs", others),
-        mount("/mnt/elsewhere", "udpin:0.0.0.0:14551", others),
-        mount("/mnt/own", "udpin:0.0.0.0:14550", os.getuid()),
-    )
-    told = by_others(parse_source("udpin:127.0.0.1:14550"), table=path)
-    assert told.startswith(f"this link is mounted on /mnt/theirs (user {others}), too; ")
-    assert by_others(parse_source("/dev/ttyACM0"), table=path) == ""
