@@ -1,4 +1,4 @@
-"""Drawing on a terminal: progress, the status, a line that changes, names. Layer: cli; all of it by rich.
+"""Drawing on a terminal: progress, the status, a line that changes. Layer: cli; all of it by rich.
 
 rich takes a tenth of a second to import, so each function imports what it draws with.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NoReturn
 
@@ -97,16 +97,6 @@ def shown(progress: Progress, idle: str = "looking for files") -> Iterator[Progr
         redirect_stdout=sys.stdout.isatty(),
     ):
         yield progress
-
-
-def print_styled(lines: Iterable[tuple[str, str, str, str]]) -> None:
-    """Print lines on a terminal, each of four texts: before a name, the name, its style, after the name."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console()
-    for before, name, style, after in lines:
-        console.print(Text.assemble(before, (name, style), after), soft_wrap=True)
 
 
 def watch(lines: Callable[[], Sequence[str]], period: float) -> NoReturn:

@@ -5,44 +5,26 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from typing import NamedTuple
 
 from mavftpfs.client.fetch import known_time
-from mavftpfs.client.names import Entry, Listing
+from mavftpfs.client.names import Listing
+from mavftpfs.client.status import Facts
 from mavftpfs.shared.readable import printable, readable_size
-
-_LOGS = (".ulg", ".bin", ".tlog", ".log")
-
-
-class NameLine(NamedTuple):
-    """A line with a name in it, and the name's style on a terminal."""
-
-    before: str = ""
-    name: str = ""
-    after: str = ""
-    style: str = ""
 
 
 def show(listings: Sequence[Listing], *, detailed: bool, units: bool) -> None:
-    """Print entries. On a terminal directories and logs are highlighted, and control characters in names
-    become `?`. Elsewhere names are printed byte for byte.
+    """Print the entries of several paths as ls does: paths of files, then directories with headings. On a
+    terminal control characters in names become `?`. Elsewhere names are printed byte for byte.
 
     detailed: with size and time; units: sizes as 1.2 MB.
     """
-    found = lines(listings, detailed=detailed, units=units)
-    if not sys.stdout.isatty():
-        for line in found:
-            text = f"{line.before}{line.name}{line.after}\n"
-            sys.stdout.buffer.write(text.encode("utf-8", "surrogateescape"))
-        sys.stdout.flush()
-        return
-    from mavftpfs.cli.drawing import print_styled
-
-    print_styled((line.before, printable(line.name), line.style, line.after) for line in found)
+    for line in _lines(listings, detailed, units):
+        text = printable(line) if sys.stdout.isatty() else line
+        sys.stdout.buffer.write(f"{text}\n".encode("utf-8", "surrogateescape"))
+    sys.stdout.flush()
 
 
-def lines(listings: Sequence[Listing], *, detailed: bool, units: bool) -> Iterator[NameLine]:
-    """Yield the lines of several paths as ls prints them: paths of files, then directories with headings."""
+def _lines(listings: Sequence[Listing], detailed: bool, units: bool) -> Iterator[str]:
     files = [entry for directory, entries in listings if directory is None for entry in entries]
     yield from (_line(entry, entry["path"], detailed, units) for entry in files)
     apart = bool(files)
@@ -51,18 +33,16 @@ def lines(listings: Sequence[Listing], *, detailed: bool, units: bool) -> Iterat
             continue
         if len(listings) > 1:
             if apart:
-                yield NameLine()
-            yield NameLine(name=directory, after=":")
+                yield ""
+            yield f"{directory}:"
         yield from (_line(entry, entry["name"], detailed, units) for entry in entries)
         apart = True
 
 
-def _line(entry: Entry, called: str, detailed: bool, units: bool) -> NameLine:
+def _line(entry: Facts, called: str, detailed: bool, units: bool) -> str:
     size = readable_size(entry["size"]) if units else str(entry["size"])
     before = f"{size:>12} {_when(entry['mtime'])} " if detailed else ""
-    if entry["kind"] == "directory":
-        return NameLine(before, called, "/", "bold blue")
-    return NameLine(before, called, "", "green" if called.lower().endswith(_LOGS) else "")
+    return f"{before}{called}{'/' if entry['kind'] == 'directory' else ''}"
 
 
 def _when(mtime: int) -> str:

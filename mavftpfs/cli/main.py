@@ -10,7 +10,6 @@ import argparse
 import difflib
 import importlib
 import os
-import shlex
 import signal
 import sys
 import textwrap
@@ -20,7 +19,6 @@ from typing import NoReturn
 
 import mavftpfs
 from mavftpfs.cli import commands
-from mavftpfs.client.mountpoint import enclosing_mount
 from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
@@ -132,7 +130,7 @@ def _run(words: list[str]) -> int:
     if name in _COMMANDS:
         make_parser, run = _COMMANDS[name]
         # allows `ls SOURCE -l PATH`: parse_args takes no PATH... after an option behind SOURCE
-        return run(_parsed(make_parser(name), name, _without_gone_flags(name, words[1:])))
+        return run(make_parser(name).parse_intermixed_args(_without_gone_flags(name, words[1:])))
     parser = _top_parser()
     if not words:
         print(_FIRST_STEPS, end="", file=sys.stderr)
@@ -146,26 +144,6 @@ def _run(words: list[str]) -> int:
     if not any(mark in args.source for mark in ":/") and not os.path.isdir(args.source):
         raise _no_command(args.source)
     return commands.mount(args)
-
-
-_PLAIN_ALIKE = ("rm", "mkdir", "rmdir")
-"""Commands that a mount does not need, because the system has one of the same name."""
-
-
-def _parsed(parser: Parser, name: str, words: list[str]) -> argparse.Namespace:
-    """Return a command's parsed words.
-
-    Raises:
-        UsageError: the words are wrong. For a path inside a mount, the text names the system's command.
-    """
-    try:
-        return parser.parse_intermixed_args(words)
-    except UsageError as exc:
-        named = [word for word in words if not word.startswith("-")]
-        inside = enclosing_mount(named[0]) if name in _PLAIN_ALIKE and len(named) == 1 else None
-        if inside is None or not inside[1].strip("/"):
-            raise
-        raise UsageError(f"{named[0]} lies in a mount, so run: {name} {shlex.join(words)}") from exc
 
 
 _GONE_FLAGS = {

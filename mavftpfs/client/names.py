@@ -6,10 +6,10 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
-from typing import Any
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, reading, walk, written
+from mavftpfs.client.status import Facts
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
@@ -124,9 +124,7 @@ async def _names_like(files: Files, directory: bytes, pattern: bytes) -> list[by
     return [name for name in names if fnmatchcase(name, pattern) and (hidden or not name.startswith(b"."))]
 
 
-Entry = dict[str, Any]
-
-Listing = tuple[str | None, list[Entry]]
+Listing = tuple[str | None, list[Facts]]
 """A directory's name and its entries; None: the path is a file, the only entry."""
 
 
@@ -138,20 +136,20 @@ async def list_paths(session: Session, paths: Sequence[bytes], *, recursive: boo
 async def _list_path(files: Files, path: bytes, recursive: bool) -> list[Listing]:
     found = await files.stat(path)
     if found.kind is EntryKind.FILE:
-        return [(None, [_entry(path, split(path)[1], found)])]
+        return [(None, [_facts(path, split(path)[1], found)])]
     listings: list[Listing] = []
     pending = [path]
     while pending:
         here = pending.pop()
         below = sorted(await files.list(here), key=lambda entry: entry[0])
-        listings.append((name_text(here), [_entry(join(here, name), name, stat) for name, stat in below]))
+        listings.append((name_text(here), [_facts(join(here, name), name, stat) for name, stat in below]))
         if recursive:
             inner = [join(here, name) for name, stat in below if stat.kind is EntryKind.DIRECTORY]
             pending += reversed(inner)
     return listings
 
 
-def _entry(path: bytes, name: bytes, found: Stat) -> Entry:
+def _facts(path: bytes, name: bytes, found: Stat) -> Facts:
     return {
         "path": path.decode("utf-8", "surrogateescape"),
         "name": name.decode("utf-8", "surrogateescape"),
