@@ -16,7 +16,7 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import trio
@@ -345,15 +345,12 @@ def _print_comparison(outcome: download.Outcome) -> None:
 
 def put(args: Args) -> int:
     """Upload files to the vehicle."""
-    (path,), component = names.parse_paths([args.path])
-    into = args.path.endswith("/")
-    if Path(STDIN) in args.locals:
-        if len(args.locals) > 1 or args.recursive:
-            raise UsageError("stdin (-) is uploaded alone; leave out -r and the other files")
-        with _spooled_stdin() as local:
-            return _put(args, component, partial(upload.put_alone, local=local, path=path, into=into))
-    batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
-    return _put(args, component, partial(upload.put_paths, batches=batches, path=path, into=into))
+    if Path(STDIN) not in args.locals:
+        return _put(args, args.locals)
+    if len(args.locals) > 1 or args.recursive:
+        raise UsageError("stdin (-) is uploaded alone; leave out -r and the other files")
+    with _spooled_stdin() as local:
+        return _put(args, [local])
 
 
 @contextmanager
@@ -362,20 +359,23 @@ def _spooled_stdin() -> Iterator[Path]:
 
     If the body fails, no other copy of the bytes exists. So the file stays, and the error's text names it.
     """
-    with NamedTemporaryFile(prefix="mavftpfs-") as file:
-        shutil.copyfileobj(sys.stdin.buffer, file)
-        file.flush()
+    with TemporaryDirectory(prefix="mavftpfs-") as folder:
+        local = Path(folder, "stdin")
+        with local.open("wb") as file:
+            shutil.copyfileobj(sys.stdin.buffer, file)
         try:
-            yield Path(file.name)
+            yield local
         except MavftpfsError as exc:
             directory = recovery_directory("stdin")
             make_private_directory(directory)
-            kept = Path(shutil.copy(file.name, directory / "stdin"))
-            exc.args = (f"{exc}; the bytes from stdin are kept in {kept}",)
+            exc.args = (f"{exc}; the bytes from stdin are kept in {shutil.copy(local, directory)}",)
             raise
 
 
-def _put(args: Args, component: int | None, function: Callable[..., Coroutine[Any, Any, None]]) -> int:
+def _put(args: Args, locals_: Sequence[Path]) -> int:
+    (path,), component = names.parse_paths([args.path])
+    into = args.path.endswith("/")
+    batches = [(local, upload.collect(local, recursive=args.recursive)) for local in locals_]
     bar = Progress()
 
     async def work(session: Session) -> None:
@@ -384,7 +384,7 @@ def _put(args: Args, component: int | None, function: Callable[..., Coroutine[An
             print(f"{_name(session.on_vehicle(remote))}: {readable_size(size)}, {verified}", flush=True)
 
         async with noting_losses(session, bar):
-            await function(session, progress=bar, tell=tell)
+            await upload.put_paths(session, batches, path, bar, tell, into=into)
 
     def stopped() -> str:
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"

@@ -19,7 +19,6 @@ from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, writte
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
 from mavftpfs.shared.errors import (
-    IsADirectory,
     LinkError,
     MavftpfsError,
     NotADirectory,
@@ -99,7 +98,7 @@ async def put_paths(
             with _naming(session, remote, progress):
                 await make_directory(session.files, remote, may_exist=True)
         else:
-            await _put_and_tell(session, one, remote, progress, tell)
+            tell(remote, *await put_file(session, one, remote, progress))
 
 
 def _placed(
@@ -119,34 +118,6 @@ def _placed(
             if other != one and not (other.is_dir() and one.is_dir()):
                 raise UsageError(f"{other} and {one} would both become {name_text(remote)}; nothing was sent")
     return plan
-
-
-async def put_alone(
-    session: Session,
-    local: Path,
-    path: bytes,
-    progress: Progress,
-    tell: Tell,
-    *,
-    into: bool = False,
-) -> None:
-    """Upload one file under another name than its own, such as stdin; otherwise as `put_paths`.
-
-    Raises:
-        IsADirectory: the path is a directory, or is written as one.
-    """
-    with _naming(session, path, progress):
-        inside = into or await is_directory(session.files, path)
-    if inside:
-        raise IsADirectory(
-            f"{name_text(path)}{'/' * into} is a directory; name the file that stdin is to become"
-        )
-    progress.plan(1, os.stat(local).st_size)
-    await _put_and_tell(session, local, path, progress, tell)
-
-
-async def _put_and_tell(session: Session, local: Path, remote: bytes, progress: Progress, tell: Tell) -> None:
-    tell(remote, *await put_file(session, local, remote, progress))
 
 
 async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> tuple[int, str]:

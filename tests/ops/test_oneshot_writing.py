@@ -13,7 +13,7 @@ import trio.testing
 from mavftpfs.client import names
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.upload import collect, put_alone, put_paths
+from mavftpfs.client.upload import collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -121,8 +121,6 @@ async def test_a_path_that_ends_in_a_slash_is_a_directory(
         await put(tree, local / "a", to=to, into=True)
     with pytest.raises(error, match=f"{to.decode()}/"):
         await names.move_paths(session_of(tree), [b"/x"], to, into=True)
-    with pytest.raises(IsADirectory, match="stdin"):
-        await put_alone(session_of(tree), local / "a", to, Progress(), print, into=True)
     assert tree.files == {b"/f": b"old", b"/x": b"x"}
     assert await put(tree, local / "a", to=b"/there", into=True) == [b"/there/a"]
     assert len(await put(tree, local, to=b"/new", recursive=True, into=True)) == 3
@@ -174,11 +172,6 @@ async def test_a_missing_directory_is_that_and_no_undelivered_file(local: Path) 
     with pytest.raises(NotFound, match="/none/a was not delivered") as caught:
         await put(tree, local / "a", to=b"/none/a")
     assert exit_code_for(caught.value) is ExitCode.USAGE
-
-
-async def test_what_came_from_stdin_needs_a_name(local: Path) -> None:
-    with pytest.raises(IsADirectory, match="stdin"):
-        await put_alone(session_of(Card({b"/d/x": b""})), local / "a", b"/d", Progress(), print)
 
 
 # -- names ----------------------------------------------------------------------------------------
