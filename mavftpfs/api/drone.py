@@ -5,8 +5,6 @@ The calls are synchronous. The event loop's thread (`api.portal`) does their wor
 
 from __future__ import annotations
 
-import errno
-import io
 import logging
 import os
 import stat
@@ -361,12 +359,10 @@ class Drone:
             raise IsADirectory(f"{remote(new)!r} is a directory")
         await names.copy(self._files, source, remote(new))
 
-    @changing
-    async def truncate(self, path: PathLike, size: int) -> None:
+    def truncate(self, path: PathLike, size: int) -> None:
         """Cut a file, or extend it with zeros."""
-        if size < 0:
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-        await self._files.truncate(await self._existing(path), size)
+        with self.open(path, "r+b", 0) as file:
+            file.truncate(size)
 
     # --- files
 
@@ -425,32 +421,26 @@ class Drone:
         self._connected.opened.add(opened)
         return opened
 
-    @in_loop
-    async def read_bytes(self, path: PathLike) -> bytes:
+    def read_bytes(self, path: PathLike) -> bytes:
         """Return a file's content."""
-        opened = await self._open(path, "r")
-        try:
-            return await opened.read_to_end(0)
-        finally:
-            await opened.close()
+        with self.open(path, "rb", 0) as file:
+            content: bytes = file.read()
+            return content
 
-    @in_loop
-    async def write_bytes(self, path: PathLike, data: bytes) -> None:
+    def write_bytes(self, path: PathLike, data: bytes) -> None:
         """Make a file or replace its content; return when the content is on the card, verified.
 
         Raises:
             NotDelivered: the card does not have it; `on_vehicle` says more.
         """
-        view = memoryview(data).cast("B")
-        opened = await self._open(path, "w")
-        try:
-            await opened.write(0, view)
-        finally:
-            await opened.close()
+        with self.open(path, "wb", 0) as file:
+            file.write(data)
 
     def read_text(self, path: PathLike, encoding: str = "utf-8") -> str:
         """Return a file's content as text, with every line ending as `\\n`."""
-        return io.TextIOWrapper(io.BytesIO(self.read_bytes(path)), encoding).read()
+        with self.open(path, encoding=encoding) as file:
+            text: str = file.read()
+            return text
 
     def write_text(self, path: PathLike, text: str, encoding: str = "utf-8") -> None:
         """Make a file or replace its content by a text."""

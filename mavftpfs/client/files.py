@@ -104,9 +104,6 @@ class Files(Protocol):
     async def create(self, path: bytes, *, exclusive: bool) -> File:
         """Make a file, or open an existing one, for reading and writing."""
 
-    async def truncate(self, path: bytes, size: int) -> None:
-        """Cut or extend a file on the card."""
-
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file."""
 

@@ -177,11 +177,6 @@ class MountFiles:
         self._require_writable(path)
         return await self._open("create", path, {"exclusive": exclusive})
 
-    async def truncate(self, path: bytes, size: int) -> None:
-        """See Files."""
-        self._require_writable(path)
-        await self._ask("truncate", path, {"size": size})
-
     async def mkdir(self, path: bytes) -> None:
         """See Files."""
         self._require_writable(path)

@@ -102,7 +102,7 @@ class _Connection:
         self._calls: dict[str, Call] = {
             **{"stat": self._stat, "list": self._list, "crc32": self._crc32, "status": self._tell_status},
             **{name: _of_path(getattr(files, name)) for name in ("mkdir", "rmdir", "unlink")},
-            **{"rename": self._rename, "truncate": self._truncate, "refresh": self._refresh},
+            **{"rename": self._rename, "refresh": self._refresh},
             **{"open": self._open, "create": self._create, "read": self._read, "write": self._write},
             **{"resize": self._resize, "fsync": self._fsync, "release": self._release},
             **{"take back": self._take_back},
@@ -196,10 +196,6 @@ class _Connection:
 
     async def _tell_status(self, _: Message) -> Message:
         return Message({"status": dict(self._status())})
-
-    async def _truncate(self, request: Message) -> Message:
-        await self._files.truncate(_path(request), _number(request, "size"))
-        return Message({})
 
     async def _rename(self, request: Message) -> Message:
         await self._files.rename(_path(request), _path(request, "new"))

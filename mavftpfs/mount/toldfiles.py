@@ -67,13 +67,6 @@ class ToldFiles:
         await _told(self._invalidator.forget_name, path)
         return ToldFile(file, path, self._operations, self._invalidator)
 
-    async def truncate(self, path: bytes, size: int) -> None:
-        """See Files."""
-        try:
-            await self._tree.truncate(path, size)
-        finally:
-            await _told(self._invalidator.forget_pages, path)
-
     async def mkdir(self, path: bytes) -> None:
         """See Files."""
         await self._tree.mkdir(path)

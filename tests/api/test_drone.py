@@ -276,12 +276,7 @@ def test_sync_takes_the_dates_and_patterns_of_the_command(
     "wrong",
     [
         {"since": "soon"},
-        {"since": float("nan")},
-        {"since": [1]},
-        {"newest": "1"},
         {"newest": 0},
-        {"include": 1},
-        {"exclude": [b"*"]},
         {"verify": "yes"},
     ],
     ids=str,
@@ -292,7 +287,7 @@ def test_a_wrong_choice_is_refused_before_anything_is_sent(
     (name,) = wrong
     with pytest.raises(mavftpfs.UsageError, match=f"^{name}"):
         shared.sync(tmp_path / "logs", place="nothing", **wrong)  # sent, this would be FileNotFoundError
-    if name in ("include", "exclude", "verify"):
+    if name == "verify":
         with pytest.raises(mavftpfs.UsageError, match=f"^{name}"):
             shared.get("nothing", tmp_path, **wrong)
 

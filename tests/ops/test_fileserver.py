@@ -114,7 +114,6 @@ CALLS: dict[str, Callable[[Files], Awaitable[object]]] = {
     "rmdir": lambda files: files.rmdir(b"/d"),
     "rename": lambda files: files.rename(b"/f", b"/g"),
     "unlink": lambda files: files.unlink(b"/f"),
-    "truncate": lambda files: files.truncate(b"/f", 3),
     "open a directory": lambda files: files.open(b"/"),
     "create": lambda files: files.create(b"/f", exclusive=True),
 }
@@ -263,7 +262,7 @@ GARBAGE = {
     "a number for a path": message("stat", path=7),
     "out of the tree": message("stat", path="/../../etc/passwd"),
     "nothing open": message("read", at=0, size=5),
-    "a size that is none": message("truncate", path="/f", size="large"),
+    "a size that is none": OPEN + message("resize", size="large"),
     "a negative offset": OPEN + message("read", at=-5, size=-7),
     "two files": OPEN + OPEN,
     "half a message": OPEN[:10],

@@ -81,8 +81,6 @@ async def test_names_are_told_after_the_change_and_before_the_answer() -> None:
         assert kernel.told() == ["rename", "name", "name"]
         await files.unlink(b"/m")
         assert kernel.told() == ["unlink", "name"]
-        await files.truncate(b"/f", 1)
-        assert kernel.told() == ["truncate", "pages"]
 
 
 async def test_a_write_drops_pages_and_the_end_waits_for_that() -> None:
