@@ -323,7 +323,7 @@ def _print_plan(outcome: download.Outcome) -> None:
         print(f"{printable(log.name)}: {readable_size(log.size)}{on}")
     left = sum(log.size - log.begun for log in outcome.wanted)
     print(
-        f"would fetch {len(outcome.wanted)} ({readable_size(left)}), {len(outcome.here)} here already, "
+        f"would download {len(outcome.wanted)} ({readable_size(left)}), {len(outcome.here)} here already, "
         f"from {_name(outcome.place)}"
     )
 

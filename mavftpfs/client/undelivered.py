@@ -96,7 +96,7 @@ class Recovered:
         if self.path is None:
             return "its path on the vehicle is unknown"
         if "whole" not in self.facts:
-            return "a program was still writing it, so it may be a part only"
+            return "its program had not closed it, so it may be incomplete"
         if self.facts.get("broken"):
             return "a write failed, so this is only the part that was written before"
         return "" if self.facts.get("whole") else "only the changed parts of it are here"

@@ -228,6 +228,7 @@ _REASONS = {
 _ERRNOS = {
     5: "its card reports an error",
     13: "permission denied",
+    22: "invalid argument, such as a name that the card cannot store",
     28: "the card is full",
     30: "it is read-only",
 }

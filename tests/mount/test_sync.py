@@ -79,7 +79,7 @@ def test_new_logs_come_newest_first_and_a_second_run_moves_nothing(field: Field,
     logs = logs_of(card)
     local = tmp_path / "logs"
     planned, _ = run("sync", "--dry-run", vehicle.source, local)
-    assert planned.splitlines()[-1].startswith("would fetch 3 (180.0 kB)")
+    assert planned.splitlines()[-1].startswith("would download 3 (180.0 kB)")
     out, _ = run("sync", vehicle.source, local)
     *lines, summary = out.splitlines()
     youngest_first = [str(path.relative_to(card)) for path in reversed(logs)]
@@ -107,7 +107,7 @@ def test_since_says_first_that_a_vehicle_tells_no_times(field: Field, tmp_path: 
     )
     words = ("sync", vehicle.source, tmp_path / "logs", "--since", "2h")
     out, err = run(*words, "--dry-run")
-    assert (out.splitlines()[-1][:13], err) == ("would fetch 2", warning)
+    assert (out.splitlines()[-1][:16], err) == ("would download 2", warning)
     with started(*words, "-o", "bwlimit=50000") as child:
         assert child.stderr is not None
         assert child.stderr.readline() == warning

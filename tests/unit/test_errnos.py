@@ -117,6 +117,7 @@ def test_a_request_on_an_open_file_cannot_say_that_a_name_exists_or_is_missing(o
 def test_a_refusal_is_told_in_words_and_numbers() -> None:
     told = str(errors.FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 13))
     assert told == "the vehicle refused to rename it: permission denied (opcode 13, NAK 2, errno 13)"
+    assert "a name that the card cannot store" in str(errors.FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 22))
     assert "the card is full" in str(errors.FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 28))
     for opcode in set(Opcode) - {Opcode.NONE, Opcode.RESET_SESSIONS, Opcode.ACK, Opcode.NAK}:
         assert "do that" not in str(errors.FtpNak(opcode, NakCode.FAIL)), "each has its words"
