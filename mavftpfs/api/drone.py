@@ -30,7 +30,7 @@ from mavftpfs.client import download, logs, names, upload
 from mavftpfs.client.compare import Verify
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetcher
-from mavftpfs.client.files import File, Files, Session, Target, walk
+from mavftpfs.client.files import File, Files, Session, Target, is_directory, walk
 from mavftpfs.client.options import options_of
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.several import IN_PYTHON
@@ -471,12 +471,9 @@ class Drone:
 
         async def work(downloads: download.Downloads) -> None:
             wanted = await self._existing(path)
-            try:
-                await downloads.get(
-                    [wanted], Path(local), into=False, recursive=recursive, selection=selection
-                )
-            except IsADirectory as exc:
-                raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True") from exc
+            if not recursive and await is_directory(self._files, wanted):
+                raise IsADirectory(f"{wanted!r} is a directory; get it with recursive=True")
+            await downloads.get([wanted], Path(local), into=False, recursive=recursive, selection=selection)
 
         outcome = await self._download(verify, work)
         return [*(fetched.wanted.local for fetched in outcome.fetched), *(one.local for one in outcome.here)]
@@ -517,7 +514,7 @@ class Drone:
         for path, error in outcome.failed.items():
             count, of = len(outcome.fetched) + len(outcome.here), len(outcome.wanted) + len(outcome.here)
             text = download.named(name_text(path), error)
-            raise os_error(error, f"{text}; {count} of {of} files are here") from error
+            raise os_error(error, f"{text}; {count} of {of} files are here" if of > 1 else text) from error
         return outcome
 
     @changing

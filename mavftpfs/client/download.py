@@ -116,28 +116,27 @@ class Downloads:
 
         Raises:
             UsageError: two files would get one local name. NotFound: `selection` takes no file. In both cases
-            nothing was downloaded. For a single file as Fetcher.fetch, otherwise as `fetch_all`.
+            nothing was downloaded. Otherwise as `fetch_all`.
         """
-        alone, refreshed = len(paths) == 1, self.fetcher.session.mountpoint is None
+        refreshed = self.fetcher.session.mountpoint is None
         found: list[Wanted] = []
         for path in paths:
             try:
                 refreshed = refreshed or await self._refreshed_for(path)
                 names = await self._matching(path, recursive=recursive)
-                alone = alone and names == [path]
                 plain = names == [path]
                 top = split(path)[0] if plain else fixed_part(path)
+                several = len(paths) > 1 or not plain
                 for name in names:
-                    place = Place(top, path if plain else top, local, into or not alone)
+                    place = Place(top, path if plain else top, local, into or several)
                     found += await self._found(name, place, selection, recursive=recursive)
             except MavftpfsError as exc:
-                self.fail(path, exc, alone=alone)
+                self.fail(path, exc)
         found = list(dict.fromkeys(found))
         if selection.by_name and not found and not self.outcome.failed:
             raise NotFound("--include and --exclude leave no file to fetch")
         _require_apart(found)
-        alone = alone and [one.remote for one in found] == [*paths]
-        await self.fetch_all(apart(found), alone=alone)
+        await self.fetch_all(apart(found))
 
     async def _refreshed_for(self, path: bytes) -> bool:
         """Have a mount list again if it does not know a path, because the file may be newer than its last
@@ -187,20 +186,19 @@ class Downloads:
         """Pass on the bytes of files, one behind the other.
 
         Raises:
-            As Fetcher.write_to for a single file; LinkError always.
+            LinkError.
         """
         for path in paths:
             try:
                 for name in await self._matching(path):
                     await self.fetcher.write_to(name, take)
             except MavftpfsError as exc:
-                self.fail(path, exc, alone=len(paths) == 1)
+                self.fail(path, exc)
 
     async def fetch_all(
-        self, wanted: Sequence[Wanted], *, alone: bool = False, note: Callable[[Fetched], None] | None = None
+        self, wanted: Sequence[Wanted], *, note: Callable[[Fetched], None] | None = None
     ) -> None:
-        """Download files, and continue after one that fails; alone: raise its error instead. note: called for
-        each downloaded file.
+        """Download files, and continue after one that fails. note: called for each downloaded file.
 
         Raises:
             LinkError, LocalDiskFull, and RequestTimeout for MAX_TIMEOUTS successive files, because the others
@@ -219,7 +217,7 @@ class Downloads:
                 timeouts = 0
             except MavftpfsError as exc:
                 timeouts = timeouts + 1 if isinstance(exc, RequestTimeout) else 0
-                self.fail(one.remote, exc, one.name, alone=alone or timeouts == MAX_TIMEOUTS)
+                self.fail(one.remote, exc, one.name, ends=timeouts == MAX_TIMEOUTS)
             progress.end(one.size)
         self.outcome.finished = True
 
@@ -232,10 +230,11 @@ class Downloads:
             self.outcome.fetched.append(fetched)
         self.reports.arrived(fetched)
 
-    def fail(self, path: bytes, error: MavftpfsError, name: str = "", *, alone: bool = False) -> None:
-        """Report a failure; or raise the error, if the other files would fail, too, or if there are none."""
+    def fail(self, path: bytes, error: MavftpfsError, name: str = "", *, ends: bool = False) -> None:
+        """Report a failure; or raise the error, if it ends the run, because the other files would fail,
+        too."""
         self.outcome.failed[path] = error
-        if alone or isinstance(error, LinkError | LocalDiskFull):
+        if ends or isinstance(error, LinkError | LocalDiskFull):
             raise error
         self.reports.failed(name or name_text(path), error)
 

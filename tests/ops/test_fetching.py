@@ -28,6 +28,7 @@ from mavftpfs.client.selection import Selection
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
+    ExitCode,
     FileBusy,
     FtpNak,
     MavftpfsError,
@@ -37,6 +38,7 @@ from mavftpfs.shared.errors import (
     SessionBusy,
     UsageError,
     VehicleLost,
+    exit_code_for,
 )
 from mavftpfs.shared.model import ROOT
 from tests.ops.faketree import MTIME, FakeFile, FakeTree, session_of
@@ -293,10 +295,13 @@ async def get_all(
 async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/d/a": b"1"})
     (tmp_path / "file").write_bytes(b"in the way")
-    with pytest.raises(UsageError, match=f"^{tmp_path / 'none' / 'a'}: No such file"):
-        await get_all(tree, b"/d/a", to=tmp_path / "none" / "a")
-    with pytest.raises(UsageError, match=f"^{tmp_path / 'file' / 'd'}: Not a directory"):
-        await get_all(tree, b"/d", to=tmp_path / "file")
+    for path, to, line in (
+        (b"/d/a", tmp_path / "none" / "a", f"/d/a: {tmp_path / 'none' / 'a'}: No such file or directory"),
+        (b"/d", tmp_path / "file", f"{tmp_path / 'file' / 'd'}: Not a directory"),
+    ):
+        outcome, said = await get_all(tree, path, to=to)
+        assert said == [line]
+        assert [exit_code_for(error) for error in outcome.failed.values()] == [ExitCode.USAGE]
     assert (tmp_path / "file").read_bytes() == b"in the way"
 
 
@@ -433,8 +438,11 @@ async def test_a_file_that_is_named_twice_comes_once(tmp_path: Path) -> None:
 async def test_a_pattern_for_one_file_means_a_directory_all_the_same(tmp_path: Path) -> None:
     await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*", to=tmp_path / "new")
     assert names_in(tmp_path / "new") == ["a"]
-    with pytest.raises(NotFound, match=r"nothing matches /l/\*\.bin"):
-        await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*.bin", to=tmp_path / "new")
+    outcome, said = await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*.bin", to=tmp_path / "new")
+    assert (said, [type(error) for error in outcome.failed.values()]) == (
+        ["nothing matches /l/*.bin"],
+        [NotFound],
+    )
 
 
 # -- sync -----------------------------------------------------------------------------------------
