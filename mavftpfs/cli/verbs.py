@@ -398,7 +398,8 @@ def _put(args: Args, locals_: Sequence[Path]) -> int:
     except NotDelivered as exc:
         if not _link_failed(exc):
             raise  # a refusal explains itself
-        exc.args = (f"{exc}; {_left_there(untouched=exc.there is False)}",)
+        parts = str(exc), _left_there(untouched=exc.there is False), left_by_killed_mounts_line()
+        exc.args = ("; ".join(filter(None, parts)),)
         raise
     return ExitCode.OK
 

@@ -237,15 +237,9 @@ def other_vehicles_heard(connection: Connection, options: Options) -> str:
 
 
 def process_name() -> str:
-    """Return this program's name for the hub's lists: its name, or the words of a mavftpfs command, with an
-    absolute mountpoint; and its process id."""
+    """Return this program's name for the hub's lists."""
     path = Path(sys.argv[0] if sys.argv else "")
     name = path.parent.name if path.name == "__main__.py" else path.name
-    if name == "mavftpfs":
-        first, *words = [word for word in sys.argv[1:4] if not word.startswith("-")] or [""]
-        if first == "mount" or ":" in first or "/" in first:
-            words = [os.path.abspath(word) if os.path.isdir(word) else word for word in words]
-        name = " ".join([first, *words])
     return f"{'python' if name in ('', '-c') else name} (process {os.getpid()})"
 
 

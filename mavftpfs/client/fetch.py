@@ -68,8 +68,6 @@ def next_read_size(size: int, took: float) -> int:
 
 
 PART_SUFFIX = ".part"
-MAX_RETURNS = 20
-"""How often a vehicle may vanish and return during one download."""
 
 
 class LocalDiskFull(UsageError):
@@ -275,7 +273,7 @@ class Fetcher:
                 UsageError: the local disk refuses the file. VehicleLost: the vehicle stayed silent for
                 connect_timeout. Otherwise as Files.open and File.read.
         """
-        for _ in range(MAX_RETURNS):
+        while True:
             try:
                 with local_disk(wanted.local):
                     return await self._fetch(wanted)
@@ -284,7 +282,6 @@ class Fetcher:
                     raise
                 if not await self.session.returned():
                     raise VehicleLost("the vehicle is silent") from exc
-        raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")
 
     async def write_to(self, remote: bytes, take: Take) -> None:
         """Pass the bytes of a file on, and verify them.

@@ -18,7 +18,7 @@ from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, command, mavftpfs, mounted_at, unmount, wait_until
 from tests.support.trees import content
-from tests.support.vehicles import Process, SimVehicle
+from tests.support.vehicles import Process, Program, SimVehicle
 
 MAVFTPFS = (sys.executable, "-m", "mavftpfs")
 QUICK = ("op_deadline=6",)
@@ -237,6 +237,23 @@ def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: 
         vehicle.resume()
         assert second.wait(60) == 0
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
+
+
+@pytest.mark.holds("promise 3")
+def test_a_put_says_where_a_killed_mount_left_its_file(field: Field, data: Path, state: Path) -> None:
+    vehicle = field.sim(field.local("card"), options=("--rate", "20000"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source)
+    put = Program("put", ["mavftpfs.__main__", "put", str(mount.path), str(data), "/x"], field.local("out"))
+    try:
+        wait_until("it is being sent", lambda: any(one["done"] for one in mount.status()["transfers"]))
+        mount.kill()
+        assert put.wait() == ExitCode.UNDELIVERED
+    finally:
+        put.kill()
+    assert "is gone; look at the vehicle's file before you use it; 1 file did not reach the" in put.text()
+    assert f"again moves it from {state.parent}/" in put.text()
+    command("umount", mount.path, code=ExitCode.UNDELIVERED)
 
 
 @pytest.mark.holds("promise 3")
