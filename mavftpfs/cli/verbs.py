@@ -44,6 +44,7 @@ from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import (
     ExitCode,
+    LinkClosed,
     LinkError,
     MavftpfsError,
     NotDelivered,
@@ -376,9 +377,12 @@ def _put(args: Args, locals_: Sequence[Path]) -> int:
     (path,), component = names.parse_paths([args.path])
     into = args.path.endswith("/")
     batches = [(local, upload.collect(local, recursive=args.recursive)) for local in locals_]
-    bar = Progress()
+    bar, through_mount = Progress(), False
 
     async def work(session: Session) -> None:
+        nonlocal through_mount
+        through_mount = session.mountpoint is not None
+
         def tell(remote: bytes, size: int, proof: str) -> None:
             verified = f"verified by {proof}" if proof else "verified"
             print(f"{_name(session.on_vehicle(remote))}: {readable_size(size)}, {verified}", flush=True)
@@ -396,19 +400,18 @@ def _put(args: Args, locals_: Sequence[Path]) -> int:
         with _on_interrupt(stopped), shown(bar):
             with_session(args, work, component, writing=True)
     except NotDelivered as exc:
-        if not _link_failed(exc):
+        if not _caused_by(exc, LinkError, RequestTimeout):
             raise  # a refusal explains itself
-        parts = str(exc), _left_there(untouched=exc.there is False), left_by_killed_mounts_line()
-        exc.args = ("; ".join(filter(None, parts)),)
+        gone = through_mount and _caused_by(exc, LinkClosed)
+        kept = "; see what the mount kept: mavftpfs recover" if gone else ""
+        exc.args = (f"{exc}; {_left_there(untouched=exc.there is False)}{kept}",)
         raise
     return ExitCode.OK
 
 
-def _link_failed(error: BaseException | None) -> bool:
-    """Return whether the reason of an error is a link or vehicle that did not answer."""
-    return error is not None and (
-        isinstance(error, LinkError | RequestTimeout) or _link_failed(error.__cause__)
-    )
+def _caused_by(error: BaseException | None, *kinds: type[MavftpfsError]) -> bool:
+    """Return whether an error, or one of its causes, is of these kinds."""
+    return error is not None and (isinstance(error, kinds) or _caused_by(error.__cause__, *kinds))
 
 
 def _left_there(*, untouched: bool) -> str:
