@@ -19,9 +19,9 @@ from mavftpfs.shared.model import ROOT, EntryKind, split
 MTIME = 1_700_000_000
 
 
-def session_of(tree: Any, root: bytes = ROOT, *, mountpoint: str | None = None) -> Session:
+def session_of(tree: Any, root: bytes = ROOT) -> Session:
     """Return a session on a tree, of a vehicle that is heard and does nothing else."""
-    return Session(cast(Files, tree), quiet, root, mountpoint)
+    return Session(cast(Files, tree), quiet, root)
 
 
 async def quiet() -> dict[str, Any]:

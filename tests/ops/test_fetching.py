@@ -24,7 +24,6 @@ from mavftpfs.client.fetch import (
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.logs import SyncRequest, check, sync
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.selection import Selection
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
@@ -282,13 +281,12 @@ async def get_all(
     tree: FakeTree,
     *paths: bytes,
     to: Path,
-    recursive: bool = True,
     into: bool = False,
     verify: Verify = "auto",
 ) -> tuple[Outcome, list[str]]:
     outcome, said = Outcome(), list[str]()
     downloads = Downloads(fetcher_of(tree, verify=verify), outcome, Noted([], said))
-    await downloads.get(paths, to, into=into, recursive=recursive)
+    await downloads.get(paths, to, into=into, recursive=True)
     return outcome, said
 
 
@@ -458,8 +456,6 @@ async def synced(
     tree: FakeTree,
     local: Path,
     *,
-    newest: int | None = None,
-    dry_run: bool = False,
     root: bytes = b"/",
     verify: Verify = "auto",
 ) -> tuple[Outcome, list[str], list[str]]:
@@ -467,7 +463,7 @@ async def synced(
     fetcher = fetcher_of(tree, root, verify)
     downloads = Downloads(fetcher, outcome, Noted(told, said))
     try:
-        await sync(downloads, SyncRequest(local, selection=Selection(newest), dry_run=dry_run))
+        await sync(downloads, SyncRequest(local))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said

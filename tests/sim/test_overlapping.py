@@ -48,12 +48,12 @@ async def begun(tree: Tree, path: bytes, data: bytes = DATA) -> OpenFile:
 
 
 @asynccontextmanager
-async def in_the_middle(file: OpenFile, waiting: int = 1, *, after: float = 1.05) -> AsyncIterator[None]:
-    """Enter when so many tasks have waited so many seconds for the delivery; leaving waits for its end."""
+async def in_the_middle(file: OpenFile, waiting: int = 1) -> AsyncIterator[None]:
+    """Enter when so many tasks have waited for the delivery for a second; leaving waits for its end."""
     async with trio.open_nursery() as nursery:
         for _ in range(waiting):  # one delivers, the others wait for their turn
             nursery.start_soon(file.fsync)
-        await trio.sleep(after)
+        await trio.sleep(1.05)
         yield
 
 

@@ -69,9 +69,9 @@ def speak(here: Rig) -> None:
     here.faults.cut_after(None)
 
 
-async def close_in_vain(tree: Tree, data: bytes = b"content") -> None:
+async def close_in_vain(tree: Tree) -> None:
     file = await tree.create(NEW, exclusive=True)
-    await file.write(0, data)
+    await file.write(0, b"content")
     with pytest.raises(MavftpfsError):
         await file.release()
 
@@ -149,9 +149,9 @@ async def mounted(profile: str, files: Mapping[bytes, bytes | None]) -> AsyncIte
         yield here, tree
 
 
-def silence(here: Rig, *, carried_out: bool, nth: int = 1, opcode: Opcode = Opcode.RENAME) -> None:
+def silence(here: Rig, *, carried_out: bool, nth: int = 1) -> None:
     """Fall silent at a rename."""
-    here.faults.at(opcode, lambda: fall_silent(here), nth=nth, drop=not carried_out)
+    here.faults.at(Opcode.RENAME, lambda: fall_silent(here), nth=nth, drop=not carried_out)
 
 
 async def interrupt(here: Rig, file: OpenFile, *, carried_out: bool, nth: int) -> None:

@@ -49,8 +49,8 @@ LONG = 20_000.0
 class Day:
     """A vehicle, and the companion computer whose watch downloads its logs."""
 
-    def __init__(self, local: Path, profile: str = "px4", link: LinkSettings = RADIO) -> None:
-        self.rig = Rig(profile, link=link)
+    def __init__(self, local: Path, profile: str = "px4") -> None:
+        self.rig = Rig(profile, link=RADIO)
         self.place = PLACES[profile]
         self.rig.card.add_directory(self.place)
         self.local = local

@@ -57,12 +57,12 @@ class Latecomer:
             self._kept = (wire, now)
 
 
-def come_late(here: Rig, seconds: float, opcode: Opcode, nth: int = 1) -> trio.Event:
-    """Have the nth request of a kind executed only so long after it came; the event is set then."""
+def come_late(here: Rig, seconds: float, opcode: Opcode) -> trio.Event:
+    """Have the next request of a kind executed only so long after it came; the event is set then."""
     numbers = count(1)
 
     def chosen(wire: bytes) -> bool:
-        return wire[_OPCODE] == opcode and next(numbers) == nth
+        return wire[_OPCODE] == opcode and next(numbers) == 1
 
     return come_again(here, seconds, chosen, at_once=False)
 

@@ -55,10 +55,12 @@ def _holds(condition: Callable[[], bool]) -> bool:
         return False
 
 
-def mavftpfs(*words: object, code: int = 0, timeout: float = COMMAND_TIMEOUT) -> tuple[str, str]:
+def mavftpfs(*words: object, code: int = 0) -> tuple[str, str]:
     """Run a command as a process; it must end with `code`. Return what it said on stdout and stderr."""
     argv = [sys.executable, "-m", "mavftpfs", *map(str, words)]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=timeout, cwd=PROJECT, check=False)
+    done = subprocess.run(
+        argv, capture_output=True, text=True, timeout=COMMAND_TIMEOUT, cwd=PROJECT, check=False
+    )
     assert done.returncode == code, f"{words}: exit {done.returncode}\n{done.stdout}{done.stderr}"
     assert suspects(done.stderr) == []
     return done.stdout, done.stderr
@@ -279,13 +281,13 @@ class Mount:
         """Return a file's content, read by a process of its own."""
         return b64decode(self.run("base64", path, timeout=timeout).stdout)
 
-    def errno_of(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
+    def errno_of(self, code: str, *args: str | Path) -> str:
         """Return the name of the errno of the OSError that a snippet ends with, '' if it succeeds."""
         wrapped = (
             f"import errno, os, sys\ntry:\n    exec({code!r})\n"
             "except OSError as error:\n    print(errno.errorcode[error.errno], end='')"
         )
-        return self.python(wrapped, *args, timeout=timeout)
+        return self.python(wrapped, *args)
 
     def unmount(self) -> int:
         """Unmount as a user does and return the daemon's exit code."""

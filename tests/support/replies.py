@@ -33,13 +33,11 @@ def sent(engine: Engine, now: float) -> list[Payload]:
     return requests
 
 
-def ack(
-    request: Payload, data: bytes = b"", *, session: int | None = None, offset: int | None = None
-) -> Payload:
-    """Return the ACK to a request; session and offset are echoed unless given."""
+def ack(request: Payload, data: bytes = b"", *, offset: int | None = None) -> Payload:
+    """Return the ACK to a request; its offset is echoed unless another is given."""
     return Payload(
         (request.seq + 1) & 0xFFFF,
-        request.session if session is None else session,
+        request.session,
         Opcode.ACK,
         len(data),
         request.opcode,

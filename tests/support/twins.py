@@ -37,7 +37,7 @@ class Twins:
     card: Path
     twin: Path
 
-    def both(self, script: str, *args: str | Path, timeout: float = 240) -> str:
+    def both(self, script: str, *args: str | Path) -> str:
         """Run a shell script here and there; both must succeed, print the same, and leave the same."""
         argv = ["bash", "-c", PRELUDE + script, "bash"]
         there = [str(arg) for arg in args]
@@ -50,7 +50,7 @@ class Twins:
             check=False,
         )
         assert local.returncode == 0, local.stderr
-        result = self.mount.run(*argv, self.shown, *there, timeout=timeout)
+        result = self.mount.run(*argv, self.shown, *there, timeout=240)
         differences = unified_diff(local.stdout.splitlines(), result.stdout.splitlines(), lineterm="", n=0)
         assert result.stdout == local.stdout, "\n".join(differences)
         self.compare()

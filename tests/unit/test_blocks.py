@@ -26,10 +26,9 @@ def make_cache(budget: int = 1024 * KIB) -> BlockCache:
     return BlockCache(budget, clock=trio.current_time, patience=PATIENCE)
 
 
-def deliver(blocks: Blocks, offset: int, data: bytes, *, batch: bool = True) -> None:
+def deliver(blocks: Blocks, offset: int, data: bytes) -> None:
     blocks.on_data(offset, data)
-    if batch:
-        blocks.on_batch(len(data))
+    blocks.on_batch(len(data))
     blocks.check_invariants()
 
 

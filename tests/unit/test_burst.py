@@ -11,14 +11,14 @@ SEQ = 65000
 RTO = 0.2
 
 
-def make(size: int = 10_000, *, start: int = 0, asked: int = 239) -> Burst:
-    return Burst(SEQ, start, size, asked, 0.0, RTO)
+def make(size: int = 10_000, *, asked: int = 239) -> Burst:
+    return Burst(SEQ, 0, size, asked, 0.0, RTO)
 
 
-def data(index: int, count: int = 239, *, step: int = 239, start: int = 0, complete: int = 0) -> Payload:
+def data(index: int, count: int = 239, *, step: int = 239) -> Payload:
     seq = (SEQ + 1 + index) & 0xFFFF
     content = bytes([index % 251]) * count
-    return Payload(seq, 0, Opcode.ACK, count, 15, complete, start + index * step, content)
+    return Payload(seq, 0, Opcode.ACK, count, 15, 0, index * step, content)
 
 
 def control(index: int, opcode: int, content: bytes = b"", offset: int = 0) -> Payload:

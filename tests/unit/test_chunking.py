@@ -12,7 +12,7 @@ from mavftpfs.protocol.payload import MAX_DATA
 pytestmark = pytest.mark.holds("fault long frames")
 
 
-def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0, step: float = 0.05) -> set[int]:
+def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0) -> set[int]:
     """Send one request after the other over a link that loses what is longer; return the sizes that went
     out."""
     sizes = set()
@@ -24,7 +24,7 @@ def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0, st
             chunks.on_lost(size, now, now)
         else:
             chunks.on_answered(size, 1, now, now)
-        now += step
+        now += 0.05
     return sizes
 
 

@@ -39,8 +39,8 @@ async def serving(path: Path, commands: Mapping[str, Command]) -> AsyncIterator[
             await server.closed.wait()
 
 
-async def ask_from_outside(path: Path, request: Reply, timeout: float = 90.0) -> Reply:
-    return await trio.to_thread.run_sync(partial(ask, path, request, timeout=timeout))
+async def ask_from_outside(path: Path, request: Reply) -> Reply:
+    return await trio.to_thread.run_sync(partial(ask, path, request, timeout=90.0))
 
 
 async def echo(request: Reply) -> Reply:

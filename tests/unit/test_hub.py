@@ -46,8 +46,9 @@ def attitude(source: Address) -> Frame:
     return parsed(Framer(source, stream=False).encode(*telemetry(0, 1000)))
 
 
-def foreign(source: Address, number: int, payload: bytes = b"whatever") -> bytes:
+def foreign(source: Address, number: int) -> bytes:
     """Return a frame of a dialect that nobody here knows."""
+    payload = b"whatever"
     head = bytes((len(payload), 0, 0, 9, *source)) + number.to_bytes(3, "little")
     return b"\xfd" + head + payload + b"\x12\x34"
 

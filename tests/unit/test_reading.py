@@ -7,7 +7,6 @@ import random
 import pytest
 
 from mavftpfs.protocol.burst import BurstTransfer
-from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
@@ -29,16 +28,14 @@ class Reader:
         self,
         *,
         bursts: bool = False,
-        size: int = SIZE,
-        block: int = 239,
         traits: Traits | None = None,
         limit: int = 4,
     ) -> None:
         self.engine = Engine(random.Random(1), Flow(limit=limit))
         self.engine.traits = traits or Traits()
-        self.sink = MemorySink(size)
+        self.sink = MemorySink(SIZE)
         kind = BurstTransfer if bursts else ReadTransfer
-        self.transfer = kind(0, size, self.sink, ChunkSize(block))
+        self.transfer = kind(0, SIZE, self.sink)
         self.engine.start(self.transfer, 0.0)
         self.now = 0.0
 
@@ -65,9 +62,9 @@ class Reader:
         self.engine.on_deadline(self.now)
 
 
-def bursting(*, block: int = 239, limit: int = 4, traits: Traits | None = None) -> tuple[Reader, Payload]:
+def bursting() -> tuple[Reader, Payload]:
     """Return a reader that reads all of the file in a burst, and its request."""
-    reader = Reader(bursts=True, block=block, limit=limit, traits=traits)
+    reader = Reader(bursts=True)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()
     return reader, request

@@ -111,10 +111,10 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
 # --- a process that is killed while a program writes
 
 
-def written(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
+def written(tmp_path: Path) -> tuple[SpoolDirectory, SpoolContent]:
     """A file that was written, and not closed."""
     directory = SpoolDirectory(tmp_path / "spool")
-    content = SpoolContent(Spool(directory.path), name)
+    content = SpoolContent(Spool(directory.path), b"/card/log.bin")
     content.put(0, b"so far")
     return directory, content
 

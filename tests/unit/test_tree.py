@@ -60,11 +60,11 @@ def listings(tree: Tree) -> int:
     return int(str(tree.status()["listings_asked"]))
 
 
-def hide(here: Rig, shown: bytes, instead: bytes = b"") -> None:
-    """Have listings show something else than this line."""
+def hide(here: Rig, line: bytes) -> None:
+    """Have listings leave a line out."""
 
     def change(request: Payload, reply: Payload) -> list[Payload]:
-        data = reply.data.replace(shown, instead) if request.opcode in LISTS else reply.data
+        data = reply.data.replace(line, b"") if request.opcode in LISTS else reply.data
         return [reply._replace(data=data, size=len(data))]
 
     here.server.change = change

@@ -218,9 +218,9 @@ def making(name: bytes, data: bytes | None) -> Model:
     return lambda state: state | {name: data}
 
 
-def rewriting(contents: Callable[[bytes], bytes], name: bytes = NAME) -> Model:
-    """Return a model that changes what a file holds, if it is there."""
-    return lambda state: state | {name: contents(state[name] or b"")} if name in state else None
+def rewriting(contents: Callable[[bytes], bytes]) -> Model:
+    """Return a model that changes what the file holds, if it is there."""
+    return lambda state: state | {NAME: contents(state[NAME] or b"")} if NAME in state else None
 
 
 def taking(name: bytes, target: bytes | None = None) -> Model:
