@@ -55,7 +55,7 @@ def assert_nothing_is_left(place: Path) -> None:
 
 
 def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> None:
-    """Also where the directory for temporaries has another name."""
+    """The directory for temporary files is reached by a symbolic link."""
     (tmp_path / "link").symlink_to(place)
     demo = start_demo(tmp_path / "link")
     out, _ = demo.communicate(timeout=HANG)

@@ -80,7 +80,7 @@ MOVING = {"ATC_RAT_PIT_P": "STAT_RUNTIME", "MC_PITCHRATE_P": "LND_FLIGHT_T_LO"}
 
 @pytest.mark.parametrize("vim", [VIM, BACKUP])
 def test_vim_sets_what_its_user_changed(texts: Texts, vim: str) -> None:
-    """Also though it reads the file once more to make a backup, and values have moved since."""
+    """vim reads the file once more to make a backup, and values have moved since."""
     before, moving = texts.values(), MOVING[texts.real]
     texts.shell(f"{vim} -c '%s/^{texts.real},.*/{texts.real},0.5/' {PAUSE} -c wq params.parm")
     after = texts.values()

@@ -347,7 +347,7 @@ async def test_outside_the_whitelist_stays_refused() -> None:
 async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_turn(
     count: int, beside_a_copy: bool
 ) -> None:
-    """Also where one of them is always under way, or where each turn begins beside one."""
+    """With two listings one is always in flight; beside a copy each turn begins beside a listing."""
     directories = [b"/l%d" % number for number in range(count)]
     files = {name + b"/a_long_name_of_a_log_%d.ulg" % i: b"" for name in directories for i in range(100)}
     files |= {b"/d/big": content(1_000_000)}

@@ -251,7 +251,7 @@ async def test_a_part_of_a_large_file_is_refused_where_it_would_be_sent_whole(
 
 @pytest.mark.parametrize("writes", [False, True])
 async def test_small_files_before_it_are_no_reason_to_refuse_a_part_of_a_large_one(writes: bool) -> None:
-    """They tell of round trips. As a rate, that was so little that to send 300 kB in 3 s was EFBIG."""
+    """Small files take round trips. Taken for a rate, they made 300 kB in 3 s EFBIG."""
     few, some = content(300), content(300_000)
     card = {b"/d/log": some} | {b"/d/%d" % number: few for number in range(40)}
     async with rig("px4", card, link=LinkSettings(rate=300_000.0, delay=0.02)) as here:

@@ -109,7 +109,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(caplog: pytest.Log
 async def test_another_vehicle_that_takes_the_address_is_not_read(
     tells: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is one that tells no id, because the mounted one told its own."""
+    """A vehicle that tells no id is another one, too, because the mounted one told its own."""
     scene = Crowd()
     if not tells:
         monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)

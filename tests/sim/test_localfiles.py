@@ -55,7 +55,7 @@ async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
 
 
 async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
-    """They are two devices: mv(1) then copies and removes."""
+    """The two are different devices to programs, so mv(1) copies and removes."""
     await write_file(tree, SWAP, b"local")
     for old, new in ((SWAP, FILE), (SWAP, b"/scripts/new"), (FILE, SWAP), (b"/scripts", TRASH)):
         with pytest.raises(CrossDevice):

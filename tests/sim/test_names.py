@@ -283,7 +283,7 @@ async def show(tree: Tree) -> None:
 @pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("profile", taking_turns(EVERY))
 async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str) -> None:
-    """Also before a request has timed out."""
+    """The heartbeats have stopped; no request has timed out yet."""
     async with rig(profile) as here:
         tree = await deep(here)
         here.link.cut()

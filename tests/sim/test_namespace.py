@@ -386,7 +386,7 @@ async def test_a_finish_that_is_refused_and_cannot_be_undone(torn: Rig) -> None:
 
 @pytest.mark.parametrize("moves", [False, True])
 async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(torn: Rig, moves: bool) -> None:
-    """Also if its directory gets another name first."""
+    """moves: its directory gets another name first."""
     tree = torn.mount()
     await tear(torn, tree)
     speak(torn)

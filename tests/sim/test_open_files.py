@@ -361,7 +361,7 @@ async def require_lost(reader: OpenFile) -> None:
 
 @pytest.mark.holds("promise 5")
 async def test_all_older_versions_are_lost(there: Rig) -> None:
-    """So is the version that a program opened before the file grew."""
+    """The version that a program opened before the file grew is lost, too."""
     tree = there.mount()
     first = await opened(tree)
     there.put(FILE, OLD + OLD, THEN + 200)

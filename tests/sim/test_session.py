@@ -218,7 +218,7 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> N
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_two_changes_wait_for_the_same_open_file(profile: str) -> None:
-    """They once woke each other without an end."""
+    """Two waiting changes once woke each other without an end."""
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
         reader, _ = await begin_to_read(connection, path(profile, "f"), 1000)
@@ -365,7 +365,7 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
 
 
 async def test_our_own_listings_make_nobody_wait_longer_for_another_client() -> None:
-    """They are answered, and in nobody's turn."""
+    """The vehicle answers listings, and they take no turn."""
     here = Rig("px4-2026", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         nursery.start_soon(read_by_another, here, 60)

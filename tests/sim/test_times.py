@@ -58,8 +58,8 @@ async def test_times_follow_a_rename_and_end_with_another_size(here: Rig, tree: 
 
 @pytest.mark.parametrize("data", [b"", b"data"])
 async def test_what_is_made_and_written_shows_the_time_of_day(here: Rig, tree: Tree, data: bytes) -> None:
-    """So it is where the vehicle tells no times: make(1) compares them, and `git gc` removes objects of 1980
-    at once."""
+    """The mount shows that time where the vehicle tells none, because make(1) compares times, and `git gc`
+    removes objects of 1980 at once."""
     await trio.sleep(100)
     now = EPOCH + trio.current_time()
     file = await tree.create(NEW, exclusive=True)

@@ -41,7 +41,7 @@ class _Meeting:
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to happen."""
+        """True if nothing more is to happen."""
         return self.nth <= 1 - self.times
 
 

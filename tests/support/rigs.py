@@ -139,7 +139,7 @@ class Rig:
 
     @property
     def renames(self) -> bool:
-        """Whether the card can rename."""
+        """True if the card can rename."""
         return self.profile in RENAMING
 
     # --- the card

@@ -100,7 +100,7 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """True until the process ends."""
         return self.popen.poll() is None
 
     def send_signal(self, number: signal.Signals) -> None:

@@ -1,4 +1,4 @@
-"""Which packets belong to a burst, and when it is over."""
+"""The packets that belong to a burst, and its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which answers tell that the network doubles requests, and which only that we asked twice.
+"""Answers that prove that the network doubles requests, and answers to our own retransmissions.
 
 For the first, ACKs are distrusted for ten minutes (`ServerSession.distrust`): a card that pauses must not do
 that.

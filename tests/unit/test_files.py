@@ -171,7 +171,7 @@ async def test_a_read_under_which_the_file_grew_ends_at_its_new_end(here: Rig) -
 
 @pytest.mark.holds("fault replaced file")
 async def test_a_file_that_others_replaced_lost_its_name(timed: Rig) -> None:
-    """So that the two do not meet in the kernel's page cache."""
+    """Otherwise the two would meet in the kernel's page cache."""
     tree = timed.mount()
     old = await tree.open(LOG)
     timed.put(LOG, DATA[::-1], MTIME + 9)

@@ -1,4 +1,4 @@
-"""Which vehicles a mount of all of them has."""
+"""The vehicles of a mount of all of them."""
 
 from __future__ import annotations
 

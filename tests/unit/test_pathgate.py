@@ -167,7 +167,7 @@ def test_a_lost_listing_of_the_root_goes_out_again() -> None:
 
 
 def test_a_lost_write_goes_out_again_behind_a_listing_of_the_root() -> None:
-    """Else it is refused, and a second refusal without an ACK between them would end the upload."""
+    """Otherwise PX4 refuses it, and a second refusal without an ACK between them would end the upload."""
     card = Card(known=False)
     card.sends(0.0)
     for request in card.out:

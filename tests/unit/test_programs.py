@@ -1,4 +1,4 @@
-"""Which program asks: threads of one process are one, and a number that is used again is another."""
+"""The program that asks: threads of one process are one, and a number that is used again is another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which reads open a window ahead, how it grows, and what bounds it."""
+"""The readahead window: the reads that open it, its growth and its bounds."""
 
 from __future__ import annotations
 

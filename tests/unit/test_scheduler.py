@@ -1,4 +1,4 @@
-"""Which user of the session is next, when a turn ends, as tables; what a reader wants of a file."""
+"""The next user of the session and the end of a turn, as tables; the ranges that a reader wants."""
 
 from __future__ import annotations
 
