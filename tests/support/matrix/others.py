@@ -105,7 +105,8 @@ class OtherClient:
 
 
 def replacing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
-    """Return what puts another file in the place of the file, by a rename."""
+    """Return what puts another file in the place of the file, by a rename. Where the server does not rename
+    over a file, the client removes the file before each try, because the mount may have placed its own."""
 
     async def act(scene: Scene) -> None:
         here, temporary = scene.here, b"/theirs"
@@ -115,10 +116,13 @@ def replacing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
             return
         here.put(temporary, THEIRS)
         client = OtherClient(here, heard)
-        if PROFILES[here.profile].storage is not Storage.POSIX:
-            await client.remove(here.root + FILE)
-        paths = here.root + temporary + b"\0" + here.root + FILE
-        await client.insist(partial(client.ask, Opcode.RENAME, paths))
+
+        async def attempt() -> bool:
+            if PROFILES[here.profile].storage is not Storage.POSIX:
+                await client.remove(here.root + FILE)
+            return await client.ask(Opcode.RENAME, here.root + temporary + b"\0" + here.root + FILE)
+
+        await client.insist(attempt)
         scene.effect()
 
     return act
