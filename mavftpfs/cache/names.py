@@ -355,6 +355,7 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
+        await self._remove_asides(target)
         own, shown = self._own, self._directories.entry(target)
         aside = own.need(target, Kind.OLD)
         if file is not None and file.unsure is not None:
@@ -387,15 +388,14 @@ class Names:
     # --- inside
 
     async def _remove_asides(self, path: bytes) -> None:
-        """Remove old files of a name that this mount left aside for some seconds: the name changes again.
+        """Remove the old files of a name that earlier changes left aside. Otherwise repair could give one of
+        them the name while the next change leaves it without a file.
 
         Raises:
             As VehicleStore.
         """
-        own = self._own
-        for aside in [aside for aside, target in own.targets.items() if target == path]:
-            if own.is_needed(aside, self._clock()) and own.needed[aside] < inf:
-                await self.remove_if_there(aside)
+        for aside in [aside for aside, target in self._own.targets.items() if target == path]:
+            await self.remove_if_there(aside)
 
     async def _swap(self, source: bytes, target: bytes, aside: bytes) -> bool:
         """Move the old file aside, and give the new one its name. Returns False if the old file was gone.

@@ -6,6 +6,7 @@ differ on the card: a late duplicate was executed, another client wrote, or the 
 
 from __future__ import annotations
 
+import errno
 import random
 from collections.abc import Callable
 from contextlib import suppress
@@ -404,6 +405,38 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
         await trio.sleep(30.0)
         assert copy.late is not None
         assert here.files() == {b"/d/f": content(500, 2), b"/d/k": b"x"}
+
+
+@pytest.mark.holds("promise 3")
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
+async def test_an_older_file_never_gets_the_name_while_the_next_is_placed(profile: str, moves: bool) -> None:
+    """The first replacement left its old file aside, and the vehicle refused to remove that. The directory is
+    listed when the second one has moved the name's file aside, and its next request is lost three times."""
+    async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": content(500, 3)}, link=CLEAN) as here:
+        tree = here.mount()
+        await write_file(tree, b"/d/k", b"x")  # what the card can is known from now on
+        here.connection.scheduler.server.distrust("a copy was late", reads=True)
+        await write_file(tree, b"/d/f", content(500, 2))
+        here.faults.refuse(Opcode.REMOVE_FILE, NakCode.FAIL_ERRNO, errno.EACCES, times=100)
+        await trio.sleep(11.0)
+        here.faults.call_off()
+        assert len(here.litter()) == 1
+
+        async def list_directory() -> None:
+            tree.forget_caches()
+            await tree.list(b"/d")
+
+        here.faults.at(Opcode.RENAME, lambda: here.nursery.start_soon(list_directory))
+        here.faults.at(Opcode.RENAME, lambda: None, nth=2, times=3, drop=True)
+        if moves:
+            await tree.rename(b"/d/g", b"/d/f")
+        else:
+            await write_file(tree, b"/d/f", content(500, 3))
+        assert here.data(b"/d/f") == content(500, 3)
+        await trio.sleep(30.0)
+        assert here.data(b"/d/f") == content(500, 3)
+        assert here.litter() == []
 
 
 @pytest.mark.holds("promise 2", "rule 14.12")
