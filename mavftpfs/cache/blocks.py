@@ -6,9 +6,8 @@ files: blocks of BLOCK_SIZE bytes, least recently used first out. Code between a
 nothing here awaits while state is half changed.
 
 Suspect bytes (promise 1): servers share session ids between clients, so a reply that matches in every field
-can carry bytes of another file. When the session layer notices that this may have happened (`on_suspect`),
-every byte is dropped, and bytes that still come from the present reader are ignored: the next read opens a
-new one.
+can carry bytes of another file. When the session layer notices that this may have happened, every byte that
+arrived lately is dropped, and the reader is closed (`Card.on_distrust`): the next read opens a new one.
 """
 
 from __future__ import annotations
@@ -150,19 +149,15 @@ class Blocks:
         size: bytes of the vehicle's file, by the reply to its last open.
         opened_at: when the vehicle opened the file that the present bytes come from, by the caches' clock.
         reader: where bytes come from, if the file is open there.
-        ignoring: bytes of the present reader are ignored, because they are suspect.
         received, received_at: bytes that arrived, and when.
     """
 
-    def __init__(self, cache: BlockCache, on_suspect: Callable[[], None]) -> None:
-        """`on_suspect` is called when the bytes are dropped because they are suspect."""
+    def __init__(self, cache: BlockCache) -> None:
         self.size = 0
         self.opened_at = NEVER
         self.reader: Reader | None = None
-        self.ignoring = False
         self.received, self.received_at = 0, NEVER
         self._cache = cache
-        self._tell_suspect = on_suspect
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
         self._waiters: list[_Waiter] = []
@@ -193,8 +188,6 @@ class Blocks:
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes that are not here yet, up to the opened size."""
-        if self.ignoring:
-            return
         count = len(data)
         block = self._blocks.get(offset // BLOCK_SIZE)
         at = offset % BLOCK_SIZE
@@ -239,13 +232,6 @@ class Blocks:
         """Give reads that wait more time: the reader waits for its turn."""
         for waiter in self._waiters:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
-
-    def on_suspect(self, reason: str) -> None:
-        """Drop every byte, given out or not; reads that wait ask again."""
-        if not self.ignoring:
-            self.ignoring = True
-            self.drop()
-            self._tell_suspect()
 
     def on_failed(self, error: Exception) -> None:
         """Reads that wait get the error; later ones ask again."""

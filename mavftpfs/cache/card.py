@@ -36,6 +36,10 @@ from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import Armed, FileBusy, FileChanged
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 
+PROVISIONAL = 10.0
+"""Seconds for which read bytes stay provisional, because another client is noticed late: servers answer it on
+its own link, and a router may pass on only some of that."""
+
 MAX_CLOSED = 2048
 """How many closed files are remembered, with the bytes that are here."""
 
@@ -51,7 +55,7 @@ class Card:
         own: names of temporary files. names: changes names. repair: see there.
         restarted_at: when the vehicle restarted, by the clock.
         blocked: nothing may be changed, because the vehicle is armed.
-        opening, reopening, fetching: work on a file that all who need it share. fetchers: the files that are
+        opening, fetching: work on a file that all who need it share. fetchers: the files that are
             fetched once their programs pause.
         parts: what broken files left on the card: temporary files, or parts under their own names.
         counts: comparisons by CRC32 and by size alone, and requests for a CRC32 that were not answered.
@@ -97,7 +101,6 @@ class Card:
         self.closed: OrderedDict[File, None] = OrderedDict()
         self.broken: list[File] = []
         self.opening: SingleFlight[File, bool | None] = SingleFlight()
-        self.reopening: SingleFlight[File, None] = SingleFlight()
         self.fetching: SingleFlight[File, None] = SingleFlight(nursery)
         self.fetchers: set[File] = set()
         self.throttle = Throttle(self.live, self.cache.meter, options.link_rate, clock)
@@ -108,6 +111,7 @@ class Card:
         self.repair.names = self.names
         self.restarted_at = -inf
         self.blocked = False
+        store.on_distrust(self.on_distrust)
 
     # --- files
 
@@ -121,7 +125,7 @@ class Card:
         file = self.find(path)
         if file is None:
             folder, name = self.root.home(path)
-            file = folder.children[name] = File(folder, name, self.cache, self._on_suspect)
+            file = folder.children[name] = File(folder, name, self.cache)
         return file
 
     def files_below(self, path: bytes) -> Iterator[File]:
@@ -251,10 +255,17 @@ class Card:
         self.restarted_at = self.clock()
         self.directories.rebooted()
 
-    def _on_suspect(self, file: File) -> None:
-        """Note that the bytes read of a file are suspect, and were dropped; the kernel may have copies."""
-        file.in_kernel = False
-        if file.has_name:
-            self.tell_changed(file.path)
-        if file in self.closed:
-            self.forget(file)  # opening it again costs less than comparing it with a listing
+    def on_distrust(self) -> None:
+        """Drop the bytes of files that are being read, or were read lately: they are suspect, and so are the
+        kernel's copies."""
+        since = self.clock() - PROVISIONAL
+        for file in [*self.live, *self.closed]:
+            if file.blocks.reader is None and file.blocks.received_at < since:
+                continue
+            file.blocks.close_reader()
+            file.blocks.drop()
+            file.in_kernel = False
+            if file.has_name:
+                self.tell_changed(file.path)
+            if file in self.closed:
+                self.forget(file)  # opening it again costs less than comparing it with a listing

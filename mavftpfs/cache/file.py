@@ -18,7 +18,7 @@ Locks: see `pathlocks`. A file's lock is taken before the path lock.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -124,12 +124,9 @@ class File(Entry):
             for the lock to take the name or the content away; they go before deliveries.
     """
 
-    def __init__(
-        self, folder: Folder, name: bytes, cache: BlockCache, on_suspect: Callable[[File], None]
-    ) -> None:
-        """`on_suspect` is called when its bytes were dropped because they are suspect."""
+    def __init__(self, folder: Folder, name: bytes, cache: BlockCache) -> None:
         super().__init__(folder, name)
-        self.content = Content(Blocks(cache, lambda: on_suspect(self)))
+        self.content = Content(Blocks(cache))
         self.state = State.CLEAN
         self.base: Known | None = None
         self.proven_at = NEVER

@@ -28,6 +28,7 @@ from mavftpfs.cache.content import Where
 from mavftpfs.cache.directories import COST_FACTOR, Directory, Found
 from mavftpfs.cache.file import Event, File, State
 from mavftpfs.cache.readahead import Readahead
+from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -113,7 +114,7 @@ async def _open(card: Card, file: File, entry: DirEntry) -> bool | None:
     blocks, path = file.blocks, file.path
     blocks.close_reader()
     blocks.drop()
-    blocks.ignoring = file.in_kernel = False
+    file.in_kernel = False
     reader = await card.store.open_reader(path, blocks)
     try:
         if reader.size < entry.size and not file.unsure:
@@ -156,31 +157,23 @@ async def _require_listed(card: Card, path: bytes, size: int) -> DirEntry:
     return entry
 
 
-async def _reopen(card: Card, file: File) -> None:
-    """Give a file a reader; run once for all reads that need it.
-
-    The vehicle opens the file when bytes are wanted. Only if bytes were suspect it opens the file now, and
-    the size is compared.
+async def _reopened(card: Card, file: File) -> Reader:
+    """Return a new reader of a file. The vehicle opens the file when bytes are wanted.
 
     Raises:
-        FileChanged: the file is smaller now. Else as RemoteStore.open_reader.
+        As RemoteStore.open_reader.
     """
-    blocks = file.blocks
     async with card.paths.steady(file) as path:
         file.require_base()
-        expected = None if blocks.ignoring else blocks.size
-        blocks.close_reader()
-        blocks.ignoring = False
-        reader = await card.store.open_reader(path, blocks, expected_size=expected)
+        reader = await card.store.open_reader(path, file.blocks, expected_size=file.blocks.size)
     if file not in card.live or not file.has_name:
         reader.close()
         raise LocalProtocolError(f"{file.path!r} was closed while it was read")
-    if compare(Known(blocks.size), Opened(reader.size)) is Sameness.OTHER:
+    if file.blocks.reader is not None:  # another read was faster
         reader.close()
-        on_replaced(card, file)
-        file.require_base()
-    blocks.close_reader()
-    blocks.reader = reader
+        return file.blocks.reader
+    file.blocks.reader = reader
+    return reader
 
 
 # --- fetching
@@ -273,13 +266,10 @@ async def _base_bytes(
     try:
         async with card.cache.reads:
             if blocks.missing(start, stop):
-                if blocks.reader is None or blocks.ignoring:
-                    await card.reopening.run(file, partial(_reopen, card, file))
-                if blocks.reader is None or blocks.ignoring:
-                    return None
-                blocks.reader.want(start, stop, demand=True)
+                reader = blocks.reader or await _reopened(card, file)
+                reader.want(start, stop, demand=True)
                 if ahead[0] < ahead[1]:
-                    blocks.reader.want(*ahead, demand=False)
+                    reader.want(*ahead, demand=False)
                 await blocks.wait_for(start, stop)
             return blocks.get(start, stop)
     except (FileChanged, FtpNak) as error:

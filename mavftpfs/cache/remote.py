@@ -39,12 +39,6 @@ class ReadSink(Protocol):
         """The reader waits for its turn, and the vehicle is not silent."""
         ...
 
-    def on_suspect(self, reason: str) -> None:
-        """While this file was read the session went wrong, or another FTP client was noticed: the bytes that
-        came are in doubt (promise 1). Another client is noticed late. So this may be called up to some
-        seconds after Reader.close; nothing else is."""
-        ...
-
     def on_failed(self, error: Exception) -> None:
         """The wanted bytes cannot be had: reads that wait get the error. The reader stays usable for later
         wants."""
@@ -96,7 +90,7 @@ class RemoteStore(Protocol):
 
     async def open_reader(self, path: bytes, sink: ReadSink, *, expected_size: int | None = None) -> Reader:
         """Open a path that is known to be a regular file. With `expected_size` it is opened when bytes are
-        wanted. The sink is called from the session's tasks until Reader.close (see on_suspect).
+        wanted. The sink is called from the session's tasks until Reader.close.
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong.
@@ -183,9 +177,13 @@ class VehicleStore(RemoteStore, Protocol):
     def epoch(self) -> float:
         """When what was read lately last came into doubt, by the caches' clock; -inf if never.
 
-        Proofs of before then are void. Each time is later than the one before, and is set before
-        `ReadSink.on_suspect` is called.
+        Proofs of before then are void. Each time is later than the one before.
         """
+        ...
+
+    def on_distrust(self, told: Callable[[], None]) -> None:
+        """Call `told()` whenever the epoch was raised: the session went wrong while a file was read, or
+        another FTP client was noticed, so bytes that were read lately may be another file's (promise 1)."""
         ...
 
     def in_doubt(self, since: float = inf) -> bool:

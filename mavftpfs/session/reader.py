@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from math import inf
-
 import trio
 
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.reading import ReadTransfer, Wants
-from mavftpfs.session.scheduler import RECENT, Future, Scheduler, SessionUser, Turn
+from mavftpfs.session.scheduler import Future, Scheduler, SessionUser, Turn
 from mavftpfs.session.serversession import REOPENS, OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
@@ -29,7 +27,7 @@ class FileStream(SessionUser):
     Attributes:
         size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK arrives, or with the
             error of the open.
-        closed: the sink is called no more, except that its bytes are suspect.
+        closed: the sink is called no more.
     """
 
     def __init__(self, path: bytes, sink: ReadSink, expected_size: int | None, scheduler: Scheduler) -> None:
@@ -44,7 +42,6 @@ class FileStream(SessionUser):
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # bytes of that transfer
-        self._last_data_at = -inf
         self._lost = 0  # number of lost sessions without progress
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
@@ -106,11 +103,6 @@ class FileStream(SessionUser):
         """Stop reading with an error, because the next file of that name is another one."""
         self._removed = True
         self._fail(FileChanged(f"{self.path!r} was removed or replaced"))
-
-    def on_suspect(self, reason: str) -> None:
-        """See SessionUser."""
-        if self._transfer is not None or self._last_data_at > self._scheduler.clock() - RECENT:
-            self._sink.on_suspect(reason)
 
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in the reads that wait, and drop their ranges."""
@@ -213,7 +205,7 @@ class FileStream(SessionUser):
             return
         count = transfer.received_bytes - self._received
         if count:
-            self._received, self._last_data_at, self._lost = transfer.received_bytes, now, 0
+            self._received, self._lost = transfer.received_bytes, 0
             if not self.closed:
                 self._sink.on_batch(count)
         if transfer.idle or transfer.done:

@@ -16,7 +16,6 @@ a copy waiting for three seconds at most.
 from __future__ import annotations
 
 import random
-from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -52,10 +51,6 @@ WAITED = 0.1
 LEAST_TURN, LONGEST_TURN = 0.5, 2.5
 TURN_TRIPS = 10.0
 """Seconds, and round trips, of a turn among equals; changing files costs up to five round trips."""
-
-RECENT = 10.0
-"""Seconds for which read bytes stay provisional, even of files closed since, because another client is
-noticed late: servers answer it on its own link, and a router may pass on only some of that."""
 
 IDLE_CLOSE = 1.5
 """Seconds for which a file stays open on the server without being read. PX4 frees its buffers after 2 s, and
@@ -131,9 +126,6 @@ class SessionUser:
 
     def on_removed(self) -> None:
         """Note that the file of its path was removed or replaced."""
-
-    def on_suspect(self, reason: str) -> None:
-        """Note that recently read bytes may be another file's."""
 
     def on_armed_changed(self) -> None:
         """Note that the vehicle was armed or disarmed."""
@@ -256,11 +248,9 @@ class Scheduler:
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
         self.server = ServerSession(driver, clock, rng, op_deadline, patient=patient)
-        self.server.on_reads_distrusted = self._on_reads_distrusted
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
         self.serving = trio.Event()
-        self._gone: deque[tuple[float, SessionUser]] = deque()  # with the time when they were removed
         self.holder: Turn | None = None
         self._driver = driver
         self._op_deadline = op_deadline
@@ -282,12 +272,7 @@ class Scheduler:
 
     def remove(self, user: SessionUser) -> None:
         """Unregister a reader or an upload. Calling this twice is harmless."""
-        if user in self.users:
-            del self.users[user]
-            now = self.clock()
-            self._gone.append((now, user))
-            while self._gone[0][0] < now - RECENT:
-                self._gone.popleft()
+        self.users.pop(user, None)
         self.refuse(user, LocalProtocolError("the file was closed"))
 
     def refuse(self, user: SessionUser, error: MavftpfsError) -> None:
@@ -470,12 +455,6 @@ class Scheduler:
                 user.on_removed()
 
     # --- news
-
-    def _on_reads_distrusted(self, why: str) -> None:
-        """Tell all users, also those that were removed since, that bytes read lately may be another
-        file's."""
-        for user in [*self.users, *(user for _, user in self._gone)]:
-            user.on_suspect(why)
 
     def on_armed_changed(self) -> None:
         """Stop uploads when the vehicle arms, and resume them when it disarms (promise 9)."""

@@ -126,7 +126,7 @@ class ServerSession:
         read before it, and not long before, may be another file's.
         quarantine: of names that were changed.
         others: other clients of this server.
-        on_reads_distrusted: called with the reason whenever the epoch is raised.
+        on_reads_distrusted: called whenever the epoch was raised.
         changed: where tasks park until turns, open files or the wishes of users change.
     """
 
@@ -152,7 +152,7 @@ class ServerSession:
         self.epoch = self._distrusted_at = -inf
         self.quarantine = Quarantine()
         self.others = OtherClients(rng)
-        self.on_reads_distrusted: Callable[[str], None] = lambda why: None
+        self.on_reads_distrusted: Callable[[], None] = lambda: None
         self._asked_sessions_at = -inf
         self.changed = trio.lowlevel.ParkingLot()
 
@@ -169,7 +169,7 @@ class ServerSession:
         if reads:
             self.epoch = max(self._distrusted_at, nextafter(self.epoch, inf))
             self.leave()
-            self.on_reads_distrusted(why)
+            self.on_reads_distrusted()
 
     def in_doubt(self, since: float = inf) -> bool:
         """Return whether ACKs are suspect: there was a `distrust` in the last ten minutes, or after

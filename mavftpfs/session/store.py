@@ -123,6 +123,10 @@ class Store:
         """Return when reads were last distrusted (see VehicleStore)."""
         return self._server.epoch
 
+    def on_distrust(self, told: Callable[[], None]) -> None:
+        """See VehicleStore."""
+        self._server.on_reads_distrusted = told
+
     def why_lost(self) -> str | None:
         """Return why the vehicle counts as lost (see RemoteStore)."""
         return self._vehicle.why_lost(self._clock())

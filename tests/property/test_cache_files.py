@@ -28,7 +28,7 @@ class Step:
 
 steps = st.builds(
     Step,
-    st.sampled_from(["data", "data", "data", "evict", "begin", "suspect", "clear"]),
+    st.sampled_from(["data", "data", "data", "evict", "clear"]),
     st.integers(0, 3 * BLOCK_SIZE),
     st.one_of(st.integers(0, 300), st.integers(0, 2 * BLOCK_SIZE)),
 )
@@ -38,7 +38,7 @@ steps = st.builds(
 def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step], seed: int) -> None:
     """After each step, what is readable equals a model of bytes."""
     cache = BlockCache(2 * BLOCK_SIZE, clock=lambda: 0.0, patience=30)
-    blocks = Blocks(cache, lambda: None)
+    blocks = Blocks(cache)
     blocks.size = size
     held: dict[int, int] = {}
     rng = random.Random(seed)
@@ -49,13 +49,8 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
             blocks.on_data(step.start, bytes([number]) * step.size)
             blocks.on_batch(step.size)
             for at in sample:
-                if step.start <= at < stop and not blocks.ignoring:
+                if step.start <= at < stop:
                     held.setdefault(at, number)
-        elif step.what == "begin":
-            blocks.ignoring = False
-        elif step.what == "suspect":
-            blocks.on_suspect("test")
-            held = {}
         elif step.what == "clear" or blocks.block(step.start // BLOCK_SIZE) is None:
             blocks.drop()
         else:

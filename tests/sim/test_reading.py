@@ -22,7 +22,7 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.support.replies import request
 from tests.support.rigs import Rig, rig
 from tests.support.takingturns import taking_turns
-from tests.support.transfers import ROOTS, MemorySink, begin_to_read, content, read_file
+from tests.support.transfers import ROOTS, begin_to_read, content, read_file
 
 STRANGER = Address(255, 190)
 
@@ -223,21 +223,17 @@ async def test_a_whole_read_survives_a_lost_session(profile: str) -> None:
 async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
     pause: float, doubted: bool
 ) -> None:
-    here = Rig("px4", {b"/f": b"hello"}, LinkSettings(delay=0.02))
-    async with here.connected() as connection:
-        sink = MemorySink(5)
-        reader = await connection.store.open_reader(b"/f", sink)
-        reader.want(0, 5, demand=True)
-        await sink.wait_for(0, 5)
-        reader.close()
+    async with rig("px4", {b"/f": b"hello"}, link=LinkSettings(delay=0.02)) as here:
+        file = await here.mount().open(b"/f")
+        assert await file.read(0, 5) == b"hello"
+        file.close()
         await trio.sleep(pause)
         here.another_asks(Opcode.NONE)
         await trio.sleep(0.5)
-        assert connection.vehicle.another_client_at is not None
-        assert bool(sink.suspicions) is doubted
-        await trio.sleep(11)
-        connection.scheduler.server.distrust("once more", reads=True)
-        assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
+        assert here.connection.vehicle.another_client_at is not None
+        assert here.invalidated == ([b"/f"] if doubted else [])
+        here.connection.scheduler.server.distrust("once more", reads=True)
+        assert len(here.invalidated) == doubted, "those bytes are gone"
 
 
 @pytest.mark.holds("rule 14.31")

@@ -127,13 +127,13 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(profile:
 async def test_a_read_whose_bytes_fell_into_doubt_leaves_the_reader_of_another_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async with opened("px4") as (_, _, handle):
+    async with opened("px4") as (here, _, handle):
         assert isinstance(handle, ReadHandle)
         blocks, readers, prove = handle.file.blocks, [], reading._prove
 
         async def doubt_comes(*args: object, **kwargs: object) -> None:
             monkeypatch.setattr(reading, "_prove", prove)
-            blocks.on_suspect("doubt")
+            here.connection.scheduler.server.distrust("doubt", reads=True)
             await handle.read(STEP, STEP)  # opens the file anew
             readers.append(blocks.reader)
 

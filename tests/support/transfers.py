@@ -36,7 +36,6 @@ class MemorySink:
         self.data = bytearray(size)
         self.have = ExtentSet()
         self.repeats = 0
-        self.suspicions: list[str] = []
         self.errors: list[Exception] = []
         self._news = trio.Event()
 
@@ -59,9 +58,6 @@ class MemorySink:
 
     def on_queued(self) -> None:
         """Nobody asks."""
-
-    def on_suspect(self, reason: str) -> None:
-        self.suspicions.append(reason)
 
     def on_failed(self, error: Exception) -> None:
         self.errors.append(error)

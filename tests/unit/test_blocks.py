@@ -17,7 +17,7 @@ PATIENCE = 30.0
 
 
 def make_blocks(cache: BlockCache, size: int) -> Blocks:
-    blocks = Blocks(cache, lambda: None)
+    blocks = Blocks(cache)
     blocks.size = size
     return blocks
 
@@ -175,12 +175,12 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
     assert [len(reading.wanted) for reading in readings] == [1, 1, 1, 1]
 
 
-# --- doubtful bytes
+# --- dropped bytes
 
 
-async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
+async def test_a_drop_wakes_reads_that_wait(nursery: trio.Nursery) -> None:
     blocks = make_blocks(make_cache(), 100)
     reading = await start_read(nursery, blocks, 0, 100)
-    blocks.on_suspect("test")
+    blocks.drop()
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [None]

@@ -23,7 +23,7 @@ CACHE = BlockCache(1 << 20, clock=lambda: 0.0, patience=1.0)
 
 
 def content_over(base: bytes | None) -> Content:
-    content = Content(Blocks(CACHE, lambda: None))
+    content = Content(Blocks(CACHE))
     content.on_opened(len(base or b""))
     content.spool(SPOOL, b"/f")
     return content
@@ -41,7 +41,7 @@ def shown(content: Content, base: bytes) -> bytes:
 
 def make_file() -> File:
     root = Folder()
-    file = root.children[b"f"] = File(root, b"f", CACHE, lambda file: None)
+    file = root.children[b"f"] = File(root, b"f", CACHE)
     return file
 
 
@@ -101,7 +101,7 @@ async def test_a_claim_goes_before_the_delivery_that_it_cancels() -> None:
 def test_a_rename_of_a_directory_moves_what_is_below_it() -> None:
     root = Folder()
     folder, name = root.home(b"/a/b/f")
-    file = folder.children[name] = File(folder, name, CACHE, lambda file: None)
+    file = folder.children[name] = File(folder, name, CACHE)
     other = root.need(b"/a/b").children
     moved = root.find(b"/a/b")
     assert moved is not None
