@@ -1,17 +1,15 @@
 """The one content of a file: which of its bytes are here, and where. Layer: cache.
 
-Each byte below `size` is one of three:
-- *held*: a program wrote it, or it was fetched beside written bytes; the local spool file has it;
-- *base*: below `base_limit` and not held: it is the vehicle's, and in memory (`blocks`) if it was read;
-- *zero*: a gap before a write beyond the old end, or an extension.
+Each byte below `size` is one of two:
+- *held*: a program wrote it, or it was fetched beside written bytes, or it is a zero of a gap before a write
+  beyond the old end; the local spool file has it;
+- *base*: not held, and below `base_limit`: it is the vehicle's, and in memory (`blocks`) if it was read.
 
 A file that nobody changed holds nothing: all of it is base. A file that is sent to the vehicle is *whole*:
 no byte of it is base. After the delivery the spool file serves reads until the last program closes the file.
 """
 
 from __future__ import annotations
-
-from enum import Enum
 
 from mavftpfs.cache.blocks import Blocks
 from mavftpfs.cache.spool import Spool, SpoolContent
@@ -20,14 +18,6 @@ from mavftpfs.shared.extents import ExtentSet
 
 STEP = 64 * 1024
 """Bytes read from the spool at once for a checksum."""
-
-
-class Where(Enum):
-    """Where a byte of the content is."""
-
-    HELD = "held"
-    BASE = "base"
-    ZERO = "zero"
 
 
 class Content:
@@ -46,54 +36,33 @@ class Content:
         self.size = 0
         self.base_limit = 0
         self.spooled: SpoolContent | None = None
-        self._held = ExtentSet()
 
     # --- what it is
 
     @property
     def held(self) -> ExtentSet:
-        """The extents that the spool has (a copy)."""
-        return ExtentSet(self._held)
+        """The extents that the spool has."""
+        return ExtentSet() if self.spooled is None else self.spooled.held
 
     @property
     def whole(self) -> bool:
         """Whether no byte of it is the vehicle's."""
-        return self._held.covers(0, min(self.base_limit, self.size))
+        return self.held.covers(0, min(self.base_limit, self.size))
 
-    def missing_base(self) -> list[tuple[int, int]]:
-        """Return the ranges of which only the vehicle has the bytes."""
-        return self._held.missing(0, min(self.base_limit, self.size))
-
-    def segments(self, start: int, stop: int) -> list[tuple[Where, int, int]]:
-        """Return where each part of [start, stop) is, cut at the file's size, ascending."""
-        found = []
-        at, end = start, min(stop, self.size)
-        for a, b in [*self._held.intersection(start, end), (end, end)]:
-            if at < min(a, self.base_limit):
-                found.append((Where.BASE, at, min(a, self.base_limit)))
-                at = min(a, self.base_limit)
-            if at < a:
-                found.append((Where.ZERO, at, a))
-            if a < b:
-                found.append((Where.HELD, a, b))
-            at = max(at, b)
-        return found
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """Return the parts of [start, stop) of which only the vehicle has the bytes, ascending."""
+        return self.held.missing(start, min(stop, self.base_limit, self.size))
 
     def get(self, start: int, stop: int) -> bytes:
-        """Return [start, stop), no byte of which may be the base's.
+        """Return [start, stop), cut at the file's size, no byte of which may be the base's.
 
         Raises:
             SpoolFailed.
         """
-        parts = []
-        for where, a, b in self.segments(start, stop):
-            assert where is not Where.BASE
-            if where is Where.HELD:
-                assert self.spooled is not None
-                parts.append(self.spooled.get(a, b))
-            else:
-                parts.append(bytes(b - a))
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+        assert self.spooled is not None
+        stop = min(stop, self.size)
+        assert self.spooled.held.covers(start, stop)
+        return self.spooled.get(start, stop) if start < stop else b""
 
     def crc32(self, stop: int | None = None) -> int:
         """Return the CRC32 of whole content, or of [0, stop), as the vehicle computes it (servers.md 10).
@@ -131,10 +100,8 @@ class Content:
             NoSpace, SpoolFailed: nothing changed.
         """
         assert self.spooled is not None
-        stop = offset + len(data)
-        self.spooled.put(offset, data)
-        self._held.add(offset, stop)
-        self.size = max(self.size, stop)
+        self.spooled.put(offset, data, zeros=max(0, offset - self.size))
+        self.size = max(self.size, offset + len(data))
 
     def truncate(self, size: int) -> None:
         """Cut, or extend with zeros.
@@ -145,8 +112,9 @@ class Content:
         assert self.spooled is not None
         if size < self.size:
             self.spooled.cut(size)
-            self._held.discard(size, max(size, self._held.end))
             self.base_limit = min(self.base_limit, size)
+        elif size > self.size:
+            self.spooled.put(size, b"", zeros=size - self.size)
         self.size = size
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
@@ -156,10 +124,8 @@ class Content:
             NoSpace, SpoolFailed.
         """
         assert self.spooled is not None
-        stop = min(offset + len(data), self.base_limit, self.size)
-        for start, end in self._held.missing(offset, stop):
-            self.spooled.put(start, memoryview(data)[start - offset : end - offset])
-            self._held.add(start, end)
+        for start, stop in self.missing(offset, offset + len(data)):
+            self.spooled.put(start, memoryview(data)[start - offset : stop - offset])
 
     # --- its end
 
@@ -180,10 +146,10 @@ class Content:
         self.blocks.drop()
         if self.spooled is not None:
             self.spooled.close()
-        self.spooled, self._held = None, ExtentSet()
+        self.spooled = None
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
-        assert self._held.end <= self.size
+        assert self.held.end <= self.size
         assert self.base_limit <= self.size
-        assert self.spooled is not None or self._held.empty
+        assert self.held.covers(self.base_limit, self.size)

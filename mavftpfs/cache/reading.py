@@ -24,7 +24,6 @@ from functools import partial
 import trio
 
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.content import Where
 from mavftpfs.cache.directories import COST_FACTOR, Directory, Found
 from mavftpfs.cache.file import Event, File, State
 from mavftpfs.cache.readahead import Readahead
@@ -230,14 +229,16 @@ async def _piece(
         return await _base_bytes(card, file, start, stop, ahead)
     parts: list[bytes | memoryview] = []
     while start < min(stop, content.size):
-        where, a, b = content.segments(start, stop)[0]  # anew: a program may have written meanwhile
-        if where is Where.BASE:
-            data = await _base_bytes(card, file, a, b, None)
-            if data is None:
-                return None
-            parts.append(data)
-        else:
-            parts.append(content.get(a, b))
+        end = min(stop, content.size)
+        a, b = next(iter(content.missing(start, end)), (end, end))  # anew: a program may have written
+        if a > start:
+            parts.append(content.get(start, a))
+            start = a
+            continue
+        data = await _base_bytes(card, file, a, b, None)
+        if data is None:
+            return None
+        parts.append(data)
         start = b
     return parts[0] if len(parts) == 1 else b"".join(parts)
 

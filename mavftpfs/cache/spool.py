@@ -37,7 +37,7 @@ class Spool:
     """The budget that the pending changes of all files share, in bytes.
 
     Attributes:
-        held: bytes of all files. full: there was no room for more, and nothing was freed since.
+        held: bytes of all files.
     """
 
     def __init__(
@@ -51,7 +51,6 @@ class Spool:
         description says of the vehicle, as JSON holds it."""
         self.vehicle = vehicle
         self.held = 0
-        self.full = False
         self.spool_max = spool_max
         self._directory = directory
         self._temporary: Path | None = None
@@ -67,7 +66,6 @@ class Spool:
     def remove_file(self, path: Path) -> None:
         """Remove a local file, and with the last one the directory, if it was made here."""
         remove(path)
-        self.full = False
         if self._temporary is not None:
             with contextlib.suppress(OSError):  # another file is in it
                 self._temporary.rmdir()
@@ -79,6 +77,7 @@ class SpoolContent:
 
     Attributes:
         name: the file's path on the vehicle, None once no program wants it any more.
+        held: the extents that are kept.
     """
 
     def __init__(self, spool: Spool, name: bytes | None = b"") -> None:
@@ -86,27 +85,23 @@ class SpoolContent:
         self._spool = spool
         self._file: int | None = None
         self._path: Path | None = None
-        self._stored = ExtentSet()
+        self.held = ExtentSet()
         self._told: dict[str, Any] | None = None  # the description beside the file, if there is one
         self._durable = False
 
-    def put(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep bytes.
+    def put(self, offset: int, data: bytes | memoryview, *, zeros: int = 0) -> None:
+        """Keep bytes. zeros: so many zeros before them, where the local file ended, are kept, too.
 
         Raises:
             NoSpace: the budget is used up, or the local disk is full. SpoolFailed: the local disk fails.
                 What was kept before is as it was.
         """
-        spool = self._spool
-        said = spool.full  # a failed attempt resets it as it cleans up
         try:
             self._open()
             self._write_down()
-            self._write(offset, data)
-        except NoSpace as error:
-            if not said:  # a program takes ENOSPC for a full card
-                log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
-            spool.full = True
+            self._write(offset, data, zeros)
+        except NoSpace as error:  # a program takes ENOSPC for a full card
+            log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
             raise
 
     def get(self, start: int, stop: int) -> bytes:
@@ -137,9 +132,9 @@ class SpoolContent:
             os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
         except OSError as exc:
             raise SpoolFailed(f"cannot cut {self._path}: {exc}") from exc
-        before = self._stored.total
-        self._stored.discard(size, max(size, self._stored.end))
-        self._spool.held += self._stored.total - before
+        before = self.held.total
+        self.held.discard(size, max(size, self.held.end))
+        self._spool.held += self.held.total - before
 
     def mark_unneeded(self) -> None:
         """Remove the description, until more is put: the vehicle has all of it, or no program wants it any
@@ -160,7 +155,7 @@ class SpoolContent:
         self._open()
         assert self._file is not None
         assert self._path is not None
-        if os.fstat(self._file).st_size < self._stored.end:
+        if os.fstat(self._file).st_size < self.held.end:
             raise SpoolFailed(f"{self._path} lost bytes that were in it")
         facts = {**facts, **self._spool.vehicle()}
         if self._durable and {**facts, "at": None} == {**(self._told or {}), "at": None}:
@@ -171,15 +166,10 @@ class SpoolContent:
         self._told, self._durable = facts, True
         return str(self._path)
 
-    def leave_budget(self) -> None:
-        """Stop counting these bytes, because other files need the room. Nothing is put from now on."""
-        self._spool.held -= self._stored.total
-        self._stored = ExtentSet()
-
     def close(self) -> None:
         """Forget the bytes: the vehicle has them, or no program wants them. Raises nothing."""
-        self._spool.held -= self._stored.total
-        self._stored = ExtentSet()
+        self._spool.held -= self.held.total
+        self.held = ExtentSet()
         if self._file is not None:
             try:
                 os.close(self._file)
@@ -224,25 +214,28 @@ class SpoolContent:
                 raise disk_error(exc, self._path) from exc
             self._told, self._durable = facts, False
 
-    def _write(self, offset: int, data: bytes | memoryview) -> None:
+    def _write(self, offset: int, data: bytes | memoryview, zeros: int) -> None:
         """Write new bytes before bytes that replace others: a full disk refuses the new ones, and nothing is
         replaced."""
         assert self._file is not None
         whole, stop = memoryview(data), offset + len(data)
-        old = self._stored.intersection(offset, stop)
-        more = len(data)
+        old = self.held.intersection(offset, stop)
+        more = zeros + len(data)
         for a, b in old:
             more -= b - a
         spool = self._spool
         if spool.held + more > spool.spool_max:
             raise NoSpace(f"{spool.held} bytes wait for the vehicle, at most {spool.spool_max} may")
         try:
-            for a, b in [*self._stored.missing(offset, stop), *old]:
+            if zeros:  # a put that failed may have left bytes there
+                os.ftruncate(self._file, offset - zeros)
+                os.ftruncate(self._file, offset)
+            for a, b in [*self.held.missing(offset, stop), *old]:
                 while a < b:
                     a += os.pwrite(self._file, whole[a - offset : b - offset], a)
         except OSError as exc:
             raise disk_error(exc, self._path) from exc
-        self._stored.add(offset, stop)
+        self.held.add(offset - zeros, stop)
         spool.held += more
 
 

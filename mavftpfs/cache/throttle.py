@@ -84,7 +84,7 @@ class Throttle:
         read = read or write
         if not write or not read:
             return MOST_REWRITE
-        missing = sum([stop - start for start, stop in file.content.missing_base()])
+        missing = sum([stop - start for start, stop in file.content.missing(0, file.size)])
         possible = int((REWRITE_SECONDS - missing / read) * write)
         return min(max(possible, LEAST_REWRITE), MOST_REWRITE)
 

@@ -134,7 +134,7 @@ def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None
         was_local = file.is_local
         file.content.spool(card.spool, file.path)
         try:
-            file.content.write(offset, data)
+            _with_room(card, partial(file.content.write, offset, data))
         except MavftpfsError:
             if not was_local:  # otherwise later opens would not ask the vehicle
                 file.content.forget()
@@ -150,13 +150,30 @@ def truncate(card: Card, file: File, size: int) -> None:
     """
     before = file.size
     file.content.spool(card.spool, file.path)
-    file.content.truncate(size)
+    _with_room(card, partial(file.content.truncate, size))
     _on_changed(card, file, min(before, size), Event.CHANGED if size else Event.EMPTIED)
     if not size:  # what was written before is gone, and so is the error that kept it from the vehicle
         file.changers.clear()
         file.error = None
         if file.has_name:
             card.forget_broken(file.path)
+
+
+def _with_room(card: Card, change: Callable[[], None]) -> None:
+    """Change a file's content. If there is no room here, the oldest broken files are forgotten first.
+
+    Raises:
+        NoSpace, SpoolFailed.
+    """
+    while True:
+        try:
+            return change()
+        except NoSpace:
+            if not card.broken:
+                raise
+            file = card.broken.pop(0)
+            log.warning("the part of %r is removed here, because pending changes need its room", file.path)
+            file.content.forget()
 
 
 def _on_changed(card: Card, file: File, start: int, event: Event) -> None:
@@ -210,7 +227,7 @@ async def _fetch(card: Card, file: File) -> None:
             value = crc32(await _fetch_step(card, file, at, min(at + STEP, base.size)), value)
         if file.base == base:
             file.base = replace(base, crc32=value)
-    while missing := content.missing_base():
+    while missing := content.missing(0, content.size):
         start, stop = missing[0]
         await _fetch_step(card, file, start, min(start + STEP, stop))
 
@@ -219,7 +236,7 @@ async def _fetch_step(card: Card, file: File, start: int, stop: int) -> bytes | 
     data = await reading.read(card, file, start, stop, base=True)
     if len(data) != stop - start or not file.is_local:
         raise FileChanged(f"{file.path!r} became shorter on the vehicle")
-    file.content.fill(start, data)
+    _with_room(card, partial(file.content.fill, start, data))
     return data
 
 
@@ -259,21 +276,8 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
         error,
     )
     persist(card, file)
-    if file.content.spooled is not None:
-        file.content.spooled.leave_budget()
-    _forget_oldest_parts(card)
     if attempt is not None:
         await attempt.upload.end()
-
-
-def _forget_oldest_parts(card: Card) -> None:
-    """Forget the oldest broken files if they hold more than the spool may, beside the spool."""
-    held = sum(file.content.held.total for file in card.broken)
-    for file in card.broken[:-1]:
-        if held > card.spool.spool_max:
-            held -= file.content.held.total
-            log.warning("the part of %r is removed here: later failed writes need its room", file.path)
-            card.forget_broken(file.path)
 
 
 def persist(card: Card, file: File) -> None:

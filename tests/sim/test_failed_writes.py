@@ -467,7 +467,7 @@ async def test_after_a_kill_the_next_mount_offers_the_part_and_puts_nothing_back
     again.close()
 
 
-async def test_a_part_takes_no_room_from_other_files(here: Rig) -> None:
+async def test_a_part_gives_its_room_to_other_files(here: Rig) -> None:
     tree = here.mount(op_deadline=DEADLINE)
     tree._card.spool.spool_max = 150_000
     file = await part_of(tree, FRESH)
@@ -476,7 +476,9 @@ async def test_a_part_takes_no_room_from_other_files(here: Rig) -> None:
     assert errno_for(told.value) == errno.ENOSPC
     await write_file(tree, FILE, PART)
     assert here.data(FILE) == PART
-    assert tree.broken() == [FRESH]
+    assert tree.broken() == []
+    with pytest.raises(MavftpfsError):
+        await file.write(0, b"x")
 
 
 async def test_the_oldest_parts_go_when_there_are_too_many(here: Rig) -> None:

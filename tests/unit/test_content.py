@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from mavftpfs.cache.blocks import BlockCache, Blocks
-from mavftpfs.cache.content import Content, Where
+from mavftpfs.cache.content import Content
 from mavftpfs.cache.entries import Folder
 from mavftpfs.cache.file import TRANSITIONS, Event, File, State
 from mavftpfs.cache.spool import Spool
@@ -31,8 +31,12 @@ def content_over(base: bytes | None) -> Content:
 
 def shown(content: Content, base: bytes) -> bytes:
     parts = []
-    for where, start, stop in content.segments(0, content.size):
-        parts.append(base[start:stop] if where is Where.BASE else content.get(start, stop))
+    at = 0
+    for start, stop in [*content.missing(0, content.size), (content.size, content.size)]:
+        if at < start:
+            parts.append(content.get(at, start))
+        parts.append(base[start:stop])
+        at = stop
     return b"".join(parts)
 
 
@@ -183,7 +187,7 @@ class ContentMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.content.whole)
     @rule()
     def deliver(self) -> None:
-        assert self.content.missing_base() == []
+        assert self.content.missing(0, self.content.size) == []
         assert self.content.get(0, self.content.size) == self.model
         self.content.on_delivered()
         self.base = bytes(self.model)

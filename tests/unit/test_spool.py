@@ -83,6 +83,9 @@ def test_a_disk_that_fills_up_on_the_way_takes_nothing(
         with pytest.raises(NoSpace):
             content.put(3, data)
     assert spool.held == 3
+    content.put(1000, b"far", zeros=997)
+    assert content.get(0, 1003) == b"old".ljust(1000, b"\0") + b"far"
+    content.cut(3)
     content.put(3, data)
     assert content.get(0, 3 + len(data)) == b"old" + data
 
