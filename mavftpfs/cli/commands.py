@@ -24,7 +24,7 @@ from mavftpfs.mount.members import Member
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.options import TABLE, Options
-from mavftpfs.shared.private import own_directories
+from mavftpfs.shared.private import log_file
 from mavftpfs.shared.readable import count_files, readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
@@ -152,7 +152,7 @@ def _start_logging(options: Options, *, foreground: bool, debug: bool) -> None:
         if foreground:
             daemon.log_to_stderr(level)
         else:
-            daemon.log_in_background(own_directories()[-1] / "mavftpfs.log", level)
+            daemon.log_in_background(log_file(), level)
     except OSError as exc:
         raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
     daemon.warn_of_gone(options)

@@ -15,7 +15,7 @@ from mavftpfs.link.ports import connect, names_in_use, port_name
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount import daemon
 from mavftpfs.shared.errors import ExitCode, UsageError
-from mavftpfs.shared.private import own_directories
+from mavftpfs.shared.private import log_file
 from mavftpfs.shared.readable import printable, readable_time
 
 PATIENCE = 5.0
@@ -48,7 +48,7 @@ def statuses(source: str | None) -> list[Status]:
 def _serve(args: argparse.Namespace, report: daemon.Report) -> int:
     from mavftpfs.hub.process import serve
 
-    daemon.log_in_background(own_directories()[-1] / "mavftpfs.log", logging.INFO)
+    daemon.log_in_background(log_file(), logging.INFO)
     report(ExitCode.OK, "")
     serve(args.source)
     return ExitCode.OK

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.shared.errors import MountFailed
-from mavftpfs.shared.private import own_directories, private_directory
 
 Reply = dict[str, Any]
 
@@ -36,8 +35,8 @@ MAX_LINE = 1 << 20
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
 SYSTEM = Path("/run/mavftpfs")
-SHORT = Path("/tmp")
-"""Holds the directory of sockets where the home's path is too long for one (the kernel takes 107 bytes)."""
+USERS = Path("/tmp")
+"""Has a directory for the sockets of each user: its path is short, and a logout does not remove it."""
 FOREIGN = "belongs to another user; only that user and root may use it by commands"
 """The reason why a mount refuses, although its files may be for everybody."""
 BOUND = Path("/proc/net/unix")
@@ -67,20 +66,22 @@ def socket_name(mountpoint: str) -> str:
     return digest[:20] + _SUFFIX
 
 
-def usable_directory(preferred: Path | None = None) -> Path:
-    """Return a directory for this user's sockets, and make it if necessary.
+def usable_directory() -> Path:
+    """Return the directory for this user's sockets, and make it if necessary.
 
     Raises:
-        ControlError: none can be made.
+        ControlError: it cannot be made, or other users may enter it.
     """
     if os.getuid() == 0 and _is_roots(SYSTEM):
         return SYSTEM
-    places = [*([] if preferred is None else [preferred]), *own_directories()]
-    places.append(SHORT / f"mavftpfs-{os.getuid()}")
-    found = private_directory(places, longest_name=len(socket_name("")))
-    if found is not None:
-        return found
-    raise ControlError(f"no private directory for the control socket (tried {', '.join(map(str, places))})")
+    directory = USERS / f"mavftpfs-{os.getuid()}"
+    with suppress(OSError):
+        with suppress(FileExistsError):
+            directory.mkdir(mode=0o700)
+        facts = directory.lstat()
+        if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o077:
+            return directory
+    raise ControlError(f"no control socket, because {directory} is not a directory of this user alone")
 
 
 def _is_roots(directory: Path) -> bool:

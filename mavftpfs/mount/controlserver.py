@@ -20,7 +20,7 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.client.control import MAX_LINE, ControlError, Reply, usable_directory
+from mavftpfs.client.control import MAX_LINE, Reply
 from mavftpfs.mount.fileserver import FileServer
 from mavftpfs.shared.errors import MavftpfsError
 
@@ -36,8 +36,6 @@ QUEUE = 128
 """Clients that may wait in the kernel's queue."""
 MAX_CLIENTS = 8
 """Clients that are served at once; others wait in the kernel's queue."""
-LOOK_PERIOD = 2.0
-"""Seconds between two checks whether the socket still exists."""
 _NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 _PAUSE = 0.1
 """Seconds until the next attempt to accept a connection, after no descriptor was free."""
@@ -45,10 +43,7 @@ _CREDENTIALS = struct.Struct("3i")
 
 
 class ControlServer:
-    """Answers requests at a socket path: one `command` after its name, and those for files.
-
-    Attributes: path: the socket's path; it changes if its directory is removed, as systemd does at logout.
-    """
+    """Answers requests at a socket path: one `command` after its name, and those for files."""
 
     def __init__(
         self,
@@ -66,8 +61,6 @@ class ControlServer:
         self._commands = commands
         self._refusal = refusal
         self._mode = mode
-        self._listener: trio.SocketListener | None = None
-        self._ours = 0
         self._accepting = trio.CancelScope()
         self._room = trio.Semaphore(MAX_CLIENTS)
         self._is_short = False
@@ -79,71 +72,35 @@ class ControlServer:
         Raises:
             OSError: the socket cannot be bound.
         """
-        self._bind()
+        listener = _bind(self.path, self._mode)
+        ours = self.path.lstat().st_ino
         try:
             async with trio.open_nursery() as clients:
                 task_status.started()
                 with self._accepting:
-                    async with trio.open_nursery() as tasks:
-                        tasks.start_soon(self._accept, clients)
-                        tasks.start_soon(self._stay_reachable)
-                self._stop_listening()
+                    await self._accept(listener, clients)
+                listener.socket.close()
         finally:
-            if self._is_in_place():  # the next mount may have bound its socket there meanwhile
-                self.path.unlink(missing_ok=True)
+            with suppress(OSError):  # the next mount may have bound its socket there meanwhile
+                if self.path.lstat().st_ino == ours:
+                    self.path.unlink()
             self.closed.set()
 
     def close(self) -> None:
         """Accept no more clients."""
         self._accepting.cancel()
 
-    def _bind(self) -> None:
-        self._listener = _bind(self.path, self._mode)
-        self._ours = self.path.lstat().st_ino
-
-    def _stop_listening(self) -> None:
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            listener.socket.close()
-
-    def _is_in_place(self) -> bool:
-        with suppress(OSError):
-            return self.path.lstat().st_ino == self._ours
-        return False
-
-    async def _stay_reachable(self) -> None:
-        while True:
-            self.be_reachable()
-            await trio.sleep(LOOK_PERIOD)
-
-    def be_reachable(self) -> None:
-        """Bind again, perhaps elsewhere, if the socket was removed."""
-        old = self._listener
-        if old is None or self._is_in_place():
-            return
-        try:
-            self.path = usable_directory(self.path.parent) / self.path.name
-            self._bind()
-        except (OSError, ControlError) as error:
-            log.debug("the control socket was removed, and has no other place: %s", error)
-            return
-        log.info("the control socket was removed, and is now %s", self.path)
-        old.socket.close()
-
-    async def _accept(self, nursery: trio.Nursery) -> None:
+    async def _accept(self, listener: trio.SocketListener, nursery: trio.Nursery) -> None:
         """Accept clients until cancelled, as many as there is room for."""
         while True:
             await self._room.acquire()
-            nursery.start_soon(self._serve_client, await self._next())
+            nursery.start_soon(self._serve_client, await self._next(listener))
 
-    async def _next(self) -> trio.SocketStream:
+    async def _next(self, listener: trio.SocketListener) -> trio.SocketStream:
         """Return the next connection. Log once per mount that no descriptor was free for one."""
         while True:
             try:
-                assert self._listener is not None
-                return await self._listener.accept()
-            except trio.ClosedResourceError:
-                await trio.lowlevel.checkpoint()  # there is another listener now
+                return await listener.accept()
             except OSError as error:
                 if error.errno not in _NO_DESCRIPTORS:
                     raise

@@ -233,8 +233,6 @@ class Life(ABC):
     def identity(self) -> dict[str, Any]:
         """Return the facts for any program that may look at the mount, JSON-able: the mount's identity and
         its control socket."""
-        if self._control is not None:
-            self._control.be_reachable()
         return {
             "mountpoint": self.request.mountpoint,
             "source": self.request.source,

@@ -115,19 +115,6 @@ def test_a_dead_mount_is_said_to_be_dead_and_watching_it_ends_when_it_is_cleared
         assert watch.stderr.read() == f"mavftpfs: no vehicle of yours is mounted on {mount.path}\n"
 
 
-def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
-    open_field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As root finds that of a user: each has a home, and a directory for sockets, of his own. Their paths are
-    short here, because that of a socket has to be."""
-    mount = open_field.prepare(open_field.sim(small_tree).source)
-    with monkeypatch.context() as elsewhere:
-        for name in ("HOME", "XDG_RUNTIME_DIR"):
-            elsewhere.setenv(name, str(open_field.local(name)))
-        mount.start()
-    assert command("status")[0].count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
-
-
 def by_nobody(mount: Mount, *words: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
     """Run a command of mavftpfs as another user."""
     return mount.run(*AS_NOBODY, *words, cwd=Path("/"), code=code)

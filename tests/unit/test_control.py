@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import shutil
 import socket
 import stat
 from collections.abc import AsyncIterator, Mapping
@@ -187,68 +186,36 @@ async def test_a_mount_of_a_version_that_tells_less_is_named_in_a_line(
     assert said.out.startswith("/mnt/old: its program is of version 0.0.9")
 
 
-async def test_a_socket_whose_directory_was_removed_is_bound_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As systemd removes a user's runtime directory at logout."""
-    with TemporaryDirectory(dir="/tmp") as name:
-        runtime, home = Path(name) / "run", Path(name) / "home"
-        monkeypatch.setattr(controlserver, "LOOK_PERIOD", 0.02)
-        monkeypatch.setattr(control, "SYSTEM", Path("/proc/none"))
-        monkeypatch.setattr(control, "own_directories", lambda: [home])
-        runtime.mkdir(mode=0o700)
-        async with serving(runtime / "s.sock", {"echo": echo}) as server:
-            shutil.rmtree(runtime)
-            runtime.touch()  # it is not made again by us
-            with trio.fail_after(60):
-                while server.path == runtime / "s.sock":  # noqa: ASYNC110
-                    await trio.sleep(0.01)
-            assert server.path == home / "s.sock"
-            assert (await ask_from_outside(server.path, {"command": "echo"}))["ok"]
-        assert not (home / "s.sock").exists()
-
-
 # -- places ---------------------------------------------------------------------------------------
 
 
-def test_a_private_directory_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    with TemporaryDirectory(dir="/tmp") as name:  # a socket's path may not be as long as pytest's directories
-        short = Path(name)
-        monkeypatch.setattr(control, "SYSTEM", short / "no" / "such" / "place")
-        places = [short / "missing" / "deep" / "x", short / "run" / "mavftpfs"]
-        monkeypatch.setattr(control, "own_directories", lambda: places)
-        chosen = control.usable_directory()
-        assert chosen == short / "run" / "mavftpfs"
-        assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
-        assert control.usable_directory(chosen) == chosen
+def test_a_private_directory_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "SYSTEM", tmp_path / "no" / "such" / "place")
+    monkeypatch.setattr(control, "USERS", tmp_path)
+    chosen = control.usable_directory()
+    assert chosen == tmp_path / f"mavftpfs-{os.getuid()}"
+    assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
+    assert control.usable_directory() == chosen
+    assert control._OURS.match(f"{chosen}/{control.socket_name('/mnt/drone')}")
 
 
+@pytest.mark.holds("promise 10")
+@pytest.mark.parametrize("kind", ["open", "link", "file"])
 def test_a_directory_that_others_may_enter_or_own_is_not_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    open_to_all, link = tmp_path / "open", tmp_path / "link"
-    open_to_all.mkdir()
-    open_to_all.chmod(0o777)
-    link.symlink_to(tmp_path)
-    too_long = tmp_path / ("x" * 100)
-    monkeypatch.setattr(control, "SYSTEM", open_to_all)
-    monkeypatch.setattr(control, "SHORT", too_long)
-    monkeypatch.setattr(control, "own_directories", lambda: [open_to_all, link, too_long])
-    with pytest.raises(ControlError, match="open"):
-        control.usable_directory()
-
-
-def test_a_home_that_is_too_deep_for_a_socket_costs_no_mount_its_socket(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control, "SYSTEM", tmp_path / "no" / "such" / "place")
-    monkeypatch.setattr(control, "own_directories", lambda: [tmp_path / ("x" * 100)])
-    with TemporaryDirectory(dir="/tmp") as short:
-        monkeypatch.setattr(control, "SHORT", Path(short))
-        chosen = control.usable_directory()
-        assert chosen == Path(short) / f"mavftpfs-{os.getuid()}"
-        assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
-        assert control._OURS.match(f"{chosen}/{control.socket_name('/mnt/drone')}")
+    monkeypatch.setattr(control, "USERS", tmp_path)
+    place = tmp_path / f"mavftpfs-{os.getuid()}"
+    if kind == "open":
+        place.mkdir()
+        place.chmod(0o777)
+    elif kind == "link":
+        place.symlink_to(tmp_path)
+    else:
+        place.touch()
+    with pytest.raises(ControlError, match=str(place)):
+        control.usable_directory()
 
 
 @pytest.mark.needs("root")
