@@ -35,7 +35,7 @@ from mavftpfs.link.hublink import (
 )
 from mavftpfs.link.messages import Address
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.ports import call, is_ours, may_share, next_caller, port_name, source_port, take_name
+from mavftpfs.link.ports import call, is_ours, next_caller, port_name, source_port, take_name
 from mavftpfs.link.samelink import same_link
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError
@@ -58,9 +58,7 @@ _COMPONENTS = 249
 _LEAST_OUTBOX = 4096
 _OUTBOX = 256 * 1024
 _USB = "/dev/ttyACM"
-_OTHERS = (
-    "{}: the hub of another user has this port; only that user, or root, may use forward= or stop the hub"
-)
+_OTHERS = "{}: the hub of another user has this port; only that user and root may share it or stop the hub"
 
 
 Sent: TypeAlias = tuple[Place, Frame, NetAddress | None]
@@ -211,7 +209,7 @@ class Hub:
             raise LinkClosed(
                 f"{self.spec.description} is shared already, so {spec.description} cannot be opened"
             )
-        if not may_share(sock, spec) or (hello.get("forward") and not is_ours(sock)):
+        if not is_ours(sock):
             raise LinkClosed(_OTHERS.format(spec.description))
         own, number = self._granted(Address(*map(int, hello["own"])), hello.get("number"))
         forward = tuple(map(str, hello.get("forward", ())))

@@ -1,7 +1,8 @@
-"""The names of ports: who has a port, and who may share it. Layer: link.
+"""The names of ports: who has a port. Layer: link.
 
 A program that opens a port holds the port's *name* as long as the port: an abstract Unix socket. A network
-namespace has each name once, and a name ends with its process. Other programs call there.
+namespace has each name once, and a name ends with its process. Other programs of that user and of root call
+there.
 """
 
 from __future__ import annotations
@@ -24,12 +25,6 @@ _PREFIX = "mavftpfs-port-"
 _NAMES = Path("/proc/net/unix")
 _QUEUE = 64
 _PAUSE = 0.05
-_SO_PEERGROUPS = 59
-_GROUPS = 1024
-_READ_WRITE = 0o6
-_ACL = "system.posix_acl_access"
-_ACL_USER = 2
-_PRIVILEGED = 1024
 _FIRST_SOURCE_PORT, _SOURCE_PORTS = 24_000, 8_000
 """Below the ports that Linux chooses itself."""
 
@@ -104,7 +99,7 @@ def call(name: str, spec: LinkSpec) -> socket.socket | None:
 
     Raises:
         Busy: the queue of waiting programs is full.
-        LinkClosed: the program is another user's, who may not have that port.
+        LinkClosed: the program is another user's.
     """
     try:
         sock = connect(name)
@@ -112,7 +107,7 @@ def call(name: str, spec: LinkSpec) -> socket.socket | None:
         raise Busy(f"{spec.description}: too many programs wait for this port; try again later") from exc
     except OSError:
         return None
-    if may_share(sock, spec):
+    if is_ours(sock):
         return sock
     pid = peer_of(sock).pid
     sock.close()
@@ -134,9 +129,6 @@ def names_in_use() -> list[str]:
     return sorted({"\0" + found for found in re.findall(rf"@({_PREFIX}\w+)", _NAMES.read_text())})
 
 
-# -- trust ----------------------------------------------------------------------------------------
-
-
 def peer_of(sock: socket.socket) -> Peer:
     """Return the process at the other end of a Unix socket."""
     layout = struct.Struct("3i")
@@ -144,41 +136,5 @@ def peer_of(sock: socket.socket) -> Peer:
 
 
 def is_ours(sock: socket.socket) -> bool:
-    """Return whether this user, or root, runs the other end."""
+    """Return whether this user, or root, runs the other end, and so may share the port."""
     return peer_of(sock).uid in (0, os.getuid())
-
-
-def may_share(sock: socket.socket, spec: LinkSpec) -> bool:
-    """Return whether the other end could open a port itself, and so may have the port's name, or share the
-    port. Any user may listen on a network port; a device has permissions."""
-    if is_ours(sock):
-        return True
-    if spec.kind is LinkKind.SERIAL:
-        return _may_open(sock, spec.device)
-    return spec.kind.listens and spec.port >= _PRIVILEGED
-
-
-def _may_open(sock: socket.socket, device: str) -> bool:
-    """Return whether the user at the other end may read and write a device: by its mode, or by the ACL that
-    logind gives to the user who sits at the computer."""
-    peer = peer_of(sock)
-    try:
-        groups = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _GROUPS)
-        facts = os.stat(device)
-    except OSError:  # the user is in very many groups, or the device is gone
-        return False
-    shift = 6 if peer.uid == facts.st_uid else 0
-    if shift == 0 and facts.st_gid in (peer.gid, *(one for (one,) in struct.iter_unpack("I", groups))):
-        shift = 3
-    return (facts.st_mode >> shift) & _READ_WRITE == _READ_WRITE or _acl_lets_in(peer.uid, device)
-
-
-def _acl_lets_in(uid: int, device: str) -> bool:
-    try:
-        acl = os.getxattr(device, _ACL)
-    except OSError:  # the device has no ACL
-        return False
-    entries = struct.iter_unpack("<HHI", acl[4:])
-    return any(
-        tag == _ACL_USER and mode & _READ_WRITE == _READ_WRITE and who == uid for tag, mode, who in entries
-    )

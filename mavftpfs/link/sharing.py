@@ -41,6 +41,7 @@ START_PATIENCE, COMING = 25.0, 5.0
 _TAKEN = (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN)
 _NO_NUMBER = "port 0 is a different port each time, so it cannot be shared; name a port"
 _OTHER_VERSION = "{}: process {} has this port, with another version of mavftpfs; end that first"
+_FOREIGN = "{}: process {} of another user has this port; only that user and root may share it"
 _UPGRADED = "mavftpfs was upgraded since this program started; restart it"
 _PAUSE, _LONGEST_PAUSE = 0.02, 1.0
 _SHARED = "%s is shared with another program from now on: a hub opens it, and all programs use the hub%s"
@@ -126,10 +127,10 @@ class SharedLink:
             with caller:
                 if "join" not in request:
                     continue
-                problem = f"{self.description} belongs to another user"
+                problem = _FOREIGN.format(self.description, os.getpid())
                 if request.get("protocol") != PROTOCOL:
                     problem = _OTHER_VERSION.format(self.description, os.getpid())
-                elif ports.may_share(caller, self._spec):
+                elif ports.is_ours(caller):
                     try:
                         return await self._started_hub(name)
                     except LinkClosed as exc:

@@ -35,6 +35,7 @@ from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
 from tests.support.vehicles import free_udp_port
+from tests.unit.test_ports import as_nobody
 
 pytestmark = pytest.mark.real_time
 
@@ -152,6 +153,19 @@ async def test_a_hub_may_be_asked_and_stopped_by_another_version_but_not_joined(
             assert reply in await here.asked({"protocol": PROTOCOL + 1, **request})
         await here.asked({"protocol": PROTOCOL + 1, "stop": True})
         await here.ended.wait()
+
+
+@pytest.mark.needs("root")
+@pytest.mark.holds("promise 10")
+async def test_another_user_neither_joins_a_hub_nor_stops_it(autojump_clock: trio.testing.MockClock) -> None:
+    async with running() as here:
+        for request in {"protocol": PROTOCOL, "join": here.source}, {"stop": True}:
+            with as_nobody():
+                sock = here.call()
+            with sock:
+                tell(sock, request)
+                assert "another user" in (await hear(sock, 60) or {}).get("refused", "")
+        assert not here.ended.is_set()
 
 
 async def test_no_more_programs_are_let_in_than_there_are_addresses(

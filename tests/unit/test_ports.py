@@ -1,28 +1,22 @@
-"""The names of ports, and which users may share one."""
+"""The names of ports, and which users share one."""
 
 from __future__ import annotations
 
 import os
-import socket
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from mavftpfs.link.ports import call, may_share, names_in_use, port_name, take_name
-from mavftpfs.link.uri import LinkSpec, parse_source
+from mavftpfs.link.ports import call, connect, is_ours, names_in_use, port_name, take_name
+from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
 from tests.support.vehicles import HOST, free_udp_port
 
 NOBODY = 65534
 as_root = pytest.mark.needs("root")
 """Only root can be another user."""
-
-
-def serial(path: Path) -> LinkSpec:
-    return parse_source(f"serial://{path}:57600")
 
 
 def test_what_excludes_each_other_has_one_name(tmp_path: Path) -> None:
@@ -70,55 +64,27 @@ def as_nobody() -> Iterator[None]:
         os.setgroups(groups)
 
 
-def is_believed(spec: LinkSpec) -> bool:
-    """Return whether another user who has the name of a port counts as having the port."""
+@as_root
+@pytest.mark.holds("promise 10")
+def test_another_user_s_claim_to_a_port_is_refused() -> None:
+    spec = parse_source(f"udpin:{HOST}:{free_udp_port()}")
     with as_nobody():
         name = take_name(port_name(spec))
     assert name is not None
-    with name:
-        try:
-            sock = call(port_name(spec), spec)
-        except LinkClosed:
-            return False
-        assert sock is not None
-        sock.close()
-        return True
+    with name, pytest.raises(LinkClosed, match=f"process {os.getpid()} of another user"):
+        call(port_name(spec), spec)
 
 
 @as_root
-def test_another_user_has_a_port_only_where_that_user_may_open_it(tmp_path: Path) -> None:
-    device = tmp_path / "tty"
-    device.touch()
-    device.chmod(0o660)
-    assert is_believed(parse_source(f"udpin:{HOST}:{free_udp_port()}"))
-    assert not is_believed(parse_source(f"tcp:{HOST}:{free_udp_port()}"))
-    assert not is_believed(serial(device))
-    device.chmod(0o666)
-    assert is_believed(serial(device))
-
-
-def access_list(user: int) -> bytes:
-    """Return an ACL by which this user may read and write, and the file's group and others may not."""
-    nobody = 0xFFFFFFFF
-    entries = [(1, 6, nobody), (2, 6, user), (4, 0, nobody), (16, 6, nobody), (32, 0, nobody)]
-    return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *entry) for entry in entries)
-
-
-@as_root
-@pytest.mark.parametrize("right", ["owner", "group", "access list", "none"])
-def test_a_device_is_shared_with_those_who_may_open_it(tmp_path: Path, right: str) -> None:
-    device = tmp_path / "tty"
-    device.touch()
-    device.chmod(0o660)
-    os.chown(device, *(NOBODY if right == one else 0 for one in ("owner", "group")))
-    if right == "access list":
-        os.setxattr(device, "system.posix_acl_access", access_list(NOBODY))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as name:
-        name.bind("")  # the kernel chooses a name
-        name.listen()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
-            with as_nobody():
-                sock.connect(name.getsockname())
-            theirs, _ = name.accept()
-            with theirs:
-                assert may_share(theirs, serial(device)) is (right != "none")
+@pytest.mark.holds("promise 10")
+def test_another_user_does_not_share_a_port_and_root_does() -> None:
+    spec = parse_source(f"udpin:{HOST}:{free_udp_port()}")
+    taken = take_name(port_name(spec))
+    assert taken is not None
+    with taken:
+        with as_nobody():
+            theirs = connect(port_name(spec))
+        with theirs, taken.accept()[0] as caller:
+            assert not is_ours(caller)
+        with connect(port_name(spec)), taken.accept()[0] as caller:
+            assert is_ours(caller)
