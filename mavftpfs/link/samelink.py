@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import socket
 
 from mavftpfs.link.uri import LOOPBACK, LinkKind, LinkSpec
 
 _ANYWHERE = {"0.0.0.0", "::"}
+_HERE = {LOOPBACK, "localhost", "::1"}
 _LISTENING = {LinkKind.UDP_OUT: LinkKind.UDP_IN, LinkKind.TCP_OUT: LinkKind.TCP_IN}
 
 
@@ -33,15 +32,4 @@ def _reaches(one: LinkSpec, other: LinkSpec) -> bool:
     """Return whether one link sends to where the other listens."""
     if _LISTENING.get(one.kind) is not other.kind or one.port != other.port:
         return False
-    host = LOOPBACK if one.host == "localhost" else one.host
-    return host == other.host or (other.host in _ANYWHERE and _is_here(host))
-
-
-def _is_here(host: str) -> bool:
-    """Return whether a numeric address belongs to this computer."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        try:
-            sock.bind((str(ipaddress.ip_address(host)), 0))
-        except (OSError, ValueError):
-            return False
-        return True
+    return one.host == other.host or (one.host in _HERE and other.host in _HERE | _ANYWHERE)
