@@ -240,8 +240,7 @@ class UserAttributes:
     """The attributes that programs set on one path, so that `cp -p`, `rsync -a`, `tar` and `touch` see them.
 
     None = not set. mode: permission bits; times in nanoseconds since 1970 UTC. mtime_ns: of a directory; the
-    tree knows those of files, and when these change. changed_ns: when a directory's entries, or its times,
-    were last changed through this mount.
+    tree knows those of files, and when these change.
     """
 
     mode: int | None = None
@@ -249,7 +248,6 @@ class UserAttributes:
     gid: int | None = None
     atime_ns: int | None = None
     mtime_ns: int | None = None
-    changed_ns: int | None = None
 
     def show(self, entry: Any, found: Stat) -> None:
         """Put the set attributes into `entry` (pyfuse3.EntryAttributes); found: the tree's own."""
@@ -259,19 +257,15 @@ class UserAttributes:
             entry.st_uid = self.uid
         if self.gid is not None:
             entry.st_gid = self.gid
-        if found.kind is EntryKind.DIRECTORY:
-            entry.st_ctime_ns = max(self.changed_ns or 0, entry.st_mtime_ns)
-            entry.st_mtime_ns = entry.st_ctime_ns if self.mtime_ns is None else self.mtime_ns
+        if found.kind is EntryKind.DIRECTORY and self.mtime_ns is not None:
+            entry.st_mtime_ns = self.mtime_ns
         entry.st_atime_ns = entry.st_mtime_ns if self.atime_ns is None else self.atime_ns
 
 
 class UserAttributeTable:
     """The attributes set on a bounded number of paths; the table forgets the least recently changed first.
 
-    Kept by path for the life of the mount: the kernel forgets inodes at will. A directory has the time that
-    was set, until entries are made, removed or renamed in it. From then on it has the time of the last such
-    change, or the vehicle's time if that is later. A memory card keeps no time for it, and programs that look
-    for changes by it (make, mail readers, git's untracked cache) would see none.
+    Kept by path for the life of the mount: the kernel forgets inodes at will.
     """
 
     def __init__(self, limit: int = MAX_KEPT) -> None:
@@ -291,12 +285,6 @@ class UserAttributeTable:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(path)
         return kept
-
-    def entries_changed(self, directory: bytes, now_ns: int) -> None:
-        """Note that an entry was made, removed or renamed in a directory, so that a set time is no longer
-        valid."""
-        kept = self.at(directory)
-        kept.mtime_ns, kept.changed_ns = None, now_ns
 
     def drop(self, path: bytes) -> None:
         """Forget a path, because the file is gone."""

@@ -18,7 +18,6 @@ import logging
 import mmap
 import os
 import stat as stat_bits
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, NoReturn
 
@@ -84,10 +83,8 @@ class Operations(pyfuse3.Operations):
         refresh: Refresh = _no_refresh,
         space: Callable[[], Space | None] = lambda: None,
         told: Callable[[], dict[str, Any]] = dict,
-        now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`told()`: the value of the mount's attribute, JSON-able. `now_ns()`: the time of day, nanoseconds
-        since 1970 UTC."""
+        """`told()`: the value of the mount's attribute, JSON-able."""
         super().__init__()
         self._tree = tree
         self.op_deadline = presentation.op_deadline
@@ -95,7 +92,6 @@ class Operations(pyfuse3.Operations):
         self._refresh = refresh
         self._space = space
         self._told = told
-        self._now_ns = now_ns
         self._set_by_users = UserAttributeTable()
         self.inodes = InodeTable() if inodes is None else inodes
         self.files: HandleTable[FileHandle] = HandleTable()
@@ -222,7 +218,7 @@ class Operations(pyfuse3.Operations):
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
         self._lose_name(self.inodes.reserve(path))
-        self._made(path, mode)
+        self._set_by_users.at(path).mode = stat_bits.S_IMODE(mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
         info = FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
@@ -344,7 +340,7 @@ class Operations(pyfuse3.Operations):
             if (await self._tree.stat(path)).kind is EntryKind.FILE:
                 await self._tree.set_times(path, attr.st_mtime_ns)
             else:
-                kept.mtime_ns, kept.changed_ns = attr.st_mtime_ns, self._now_ns()
+                kept.mtime_ns = attr.st_mtime_ns
 
     # -- names ------------------------------------------------------------------------------------
 
@@ -353,8 +349,9 @@ class Operations(pyfuse3.Operations):
         """Make a directory."""
         path = self._child(parent_inode, name)
         await self._tree.mkdir(path)
-        self._set_by_users.entries_changed(path, self._now_ns())
-        return await self._new_entry(path, mode)
+        self._set_by_users.at(path).mode = stat_bits.S_IMODE(mode)
+        found = await self._tree.stat(path)
+        return self._attributes(self.inodes.lookup(path), found)
 
     @handler
     async def rmdir(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
@@ -428,22 +425,15 @@ class Operations(pyfuse3.Operations):
 
     # -- what changed, through the kernel or not --------------------------------------------------
 
-    def note_entry(self, path: bytes) -> None:
-        """Note that a name was made or removed; the kernel asks for its directory's attributes by itself."""
-        self._set_by_users.entries_changed(split(path)[0], self._now_ns())
-
     def note_gone(self, path: bytes) -> None:
         """Note that a name was removed."""
         self.inodes.unlink(path)
         self._set_by_users.drop(path)
-        self.note_entry(path)
 
     def note_renamed(self, old: bytes, new: bytes) -> None:
         """Note that a name, and everything below it, has another path."""
         self.inodes.rename(old, new)
         self._set_by_users.move(old, new)
-        self.note_entry(old)
-        self.note_entry(new)
 
     # -- helpers ----------------------------------------------------------------------------------
 
@@ -512,16 +502,6 @@ class Operations(pyfuse3.Operations):
         if inode.path is not None and self._tree.is_only_read(inode.path):
             entry.st_mode &= ~_WRITE_BITS
         return entry
-
-    def _made(self, path: bytes, mode: int) -> None:
-        kept = self._set_by_users.at(path)
-        kept.mode, kept.atime_ns = stat_bits.S_IMODE(mode), self._now_ns()
-        self.note_entry(path)
-
-    async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
-        self._made(path, mode)
-        found = await self._tree.stat(path)
-        return self._attributes(self.inodes.lookup(path), found)
 
     async def _attributes_of(self, ino: int) -> EntryAttributes:
         inode = self._inode(ino)

@@ -57,20 +57,18 @@ class ToldFiles:
         file = await self._tree.open(path, write=write, truncate=truncate, append=append)
         if truncate:
             self._invalidator.on_changed(path)
-        return ToldFile(file, path, self._operations, self._invalidator)
+        return ToldFile(file, path, self._invalidator)
 
     async def create(self, path: bytes, *, exclusive: bool) -> ToldFile:
         """See Files."""
         _require_on_card(path)
         file = await self._tree.create(path, exclusive=exclusive)
-        self._operations.note_entry(path)
         await _told(self._invalidator.forget_name, path)
-        return ToldFile(file, path, self._operations, self._invalidator)
+        return ToldFile(file, path, self._invalidator)
 
     async def mkdir(self, path: bytes) -> None:
         """See Files."""
         await self._tree.mkdir(path)
-        self._operations.note_entry(path)
         await _told(self._invalidator.forget_name, path)
 
     async def rmdir(self, path: bytes) -> None:
@@ -104,10 +102,9 @@ class ToldFiles:
 class ToldFile:
     """Implements client.files.File."""
 
-    def __init__(self, file: OpenFile, path: bytes, operations: Operations, invalidator: Invalidator) -> None:
+    def __init__(self, file: OpenFile, path: bytes, invalidator: Invalidator) -> None:
         self._file = file
         self._path = path
-        self._operations = operations
         self._invalidator = invalidator
 
     @property
