@@ -111,7 +111,7 @@ def status_lines(facts: Status) -> Iterator[str]:
     for endpoint in facts["endpoints"]:
         ago = endpoint["heard_ago"]
         heard = "not heard" if ago is None else f"heard {readable_time(ago)} ago"
-        yield f"  forward {endpoint['endpoint']}: {endpoint['problem'] or heard}"
+        yield f"  forward {endpoint['endpoint']}: {heard}"
     for double in facts["doubles"]:
         yield f"  {said_of_double(double['system'], double['address'])}"
 

@@ -52,7 +52,6 @@ HELLO_PATIENCE = 10.0
 _DOUBLE = "%s says that it is %d/%d, too: two vehicles with one system id, or frames that a router sends back"
 _POLL = 0.003
 _LOOK = 1.0
-_RETRY = 2.0
 _COMPONENTS = 249
 """mavftpfs programs have component ids from 1 to 249, each its own; a router's is above."""
 _LEAST_OUTBOX = 4096
@@ -80,15 +79,13 @@ class _Client:
 
 @dataclass(slots=True)
 class _Endpoint:
-    """The side of a ground station, or of another program that `forward=` names. link: None while the
-    endpoint is closed."""
+    """The side of a ground station, or of another program that `forward=` names. link: None until it is
+    open."""
 
     side: int
     text: str
-    spec: LinkSpec
     scope: trio.CancelScope = field(default_factory=trio.CancelScope)
     link: Link | None = None
-    problem: str = ""
 
 
 async def run_hub(spec: LinkSpec) -> None:
@@ -181,7 +178,7 @@ class Hub:
             async with self._one_by_one:  # opens an endpoint once, even if two programs want it
                 client = self._admitted(sock, hello)
                 try:
-                    await self._open_endpoints(client.forward, nursery, patient=bool(hello.get("again")))
+                    await self._open_endpoints(client.forward, nursery)
                 except BaseException:
                     self._forget(client)
                     raise
@@ -252,45 +249,34 @@ class Hub:
 
     # -- endpoints
 
-    async def _open_endpoints(self, texts: Sequence[str], nursery: trio.Nursery, *, patient: bool) -> None:
-        for text in texts:
-            if text in self._endpoints:
-                continue
-            spec = parse_source(text)
-            endpoint = self._endpoints[text] = _Endpoint(next(self._sides), text, spec)
-            self.router.add(endpoint.side, Kind.ENDPOINT, fixed=spec.kind is not LinkKind.UDP_IN)
-            if patient:
-                nursery.start_soon(self._serve_endpoint, endpoint, True)
-                continue
-            try:
-                await nursery.start(self._serve_endpoint, endpoint, False)
-            except LinkClosed as exc:
-                del self._endpoints[text]
-                raise LinkClosed(f"forward={exc}") from exc
+    async def _open_endpoints(self, texts: Sequence[str], nursery: trio.Nursery) -> None:
+        """Open the endpoints that are not open yet.
 
-    async def _serve_endpoint(
-        self,
-        endpoint: _Endpoint,
-        patient: bool,
-        task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED,
-    ) -> None:
-        """Open an endpoint, and pass on its frames. patient: retry if it cannot be opened."""
-        may_come_later = endpoint.spec.kind is LinkKind.TCP_OUT
+        Raises:
+            LinkClosed: one cannot be opened; the text gives the reason.
+        """
+        for text in texts:
+            if text not in self._endpoints:
+                endpoint = self._endpoints[text] = _Endpoint(next(self._sides), text)
+                try:
+                    await nursery.start(self._serve_endpoint, endpoint)
+                except MavftpfsError as exc:
+                    del self._endpoints[text]
+                    raise LinkClosed(f"forward={exc}") from exc
+
+    async def _serve_endpoint(self, endpoint: _Endpoint, task_status: trio.TaskStatus[None]) -> None:
+        """Open an endpoint, and pass on its frames. A peer of `tcp` may appear later.
+
+        Raises:
+            LinkClosed: it cannot be opened.
+        """
+        spec = parse_source(endpoint.text)
         try:
             with endpoint.scope:
-                while True:
-                    try:
-                        async with open_link(endpoint.spec, patient=may_come_later) as link:
-                            endpoint.link, endpoint.problem = link, ""
-                            task_status.started()
-                            await self._read(endpoint.side, link)
-                    except LinkClosed as exc:
-                        if not patient:
-                            raise
-                        if not endpoint.problem:
-                            log.warning("forward=%s", exc)
-                        endpoint.problem = str(exc)
-                    await trio.sleep(_RETRY)
+                async with open_link(spec, patient=spec.kind is LinkKind.TCP_OUT) as endpoint.link:
+                    self.router.add(endpoint.side, Kind.ENDPOINT, fixed=spec.kind is not LinkKind.UDP_IN)
+                    task_status.started()
+                    await self._read(endpoint.side, endpoint.link)
         finally:
             self.router.remove(endpoint.side)  # only now: until its end the task may pass on a frame
 
@@ -417,8 +403,8 @@ class Hub:
         endpoints = []
         for endpoint in self._endpoints.values():
             heard = self.router.senders.heard_at(endpoint.side)
-            facts = {"endpoint": endpoint.text, "problem": endpoint.problem or None}
-            endpoints.append({**facts, "heard_ago": None if heard is None else round(now - heard, 1)})
+            ago = None if heard is None else round(now - heard, 1)
+            endpoints.append({"endpoint": endpoint.text, "heard_ago": ago})
         return {
             "source": self.spec.description,
             "pid": os.getpid(),

@@ -175,13 +175,11 @@ class Refused(LinkClosed):
     """The hub refuses a program; the text gives the reason."""
 
 
-async def join(
-    sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: Seat | None, *, again: bool = False
-) -> HubLink:
+async def join(sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: Seat | None) -> HubLink:
     """Ask the program at the other end of a socket for a share of the port; return the link once the hub
     grants it.
 
-    seat: the seat until now. again: this program had the link before, so the endpoints may open later.
+    seat: the seat until now.
 
     Raises:
         Refused: the hub refuses; the text gives the reason.
@@ -196,7 +194,6 @@ async def join(
         "forward": wanted.forward,
         "name": wanted.name,
         "beats": wanted.beats,
-        "again": again,
     }
     try:
         set_buffers(sock)

@@ -83,7 +83,7 @@ class SharedLink:
                 if sock is None:
                     sock = await self._hold_port(task_status)
                     lost_at, said = trio.current_time(), ""
-                hub = await join(sock, self._spec, self._wanted, self.seat, again=self._was_open)
+                hub = await join(sock, self._spec, self._wanted, self.seat)
                 async with background(hub.run, hub.aclose):
                     with self._used(hub, task_status):
                         await hub.wait_closed()

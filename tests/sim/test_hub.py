@@ -76,7 +76,7 @@ class Running:
 
 
 @asynccontextmanager
-async def running(*forward: str, source: str = "", again: bool = False) -> AsyncIterator[Running]:
+async def running(*forward: str, source: str = "") -> AsyncIterator[Running]:
     """Run a hub of a port, with one client that had the port and asks for these endpoints."""
     source = source or f"udpin:{HOST}:{free_udp_port()}"
     spec = parse_source(source)
@@ -94,7 +94,7 @@ async def running(*forward: str, source: str = "", again: bool = False) -> Async
             sock = await next_caller(name)
             sock.setblocking(False)
             assert "hub" in (await hear(sock, 60) or {})
-        first = await join(sock, spec, PortRequest(US, forward), None, again=again)
+        first = await join(sock, spec, PortRequest(US, forward), None)
         yield Running(source, ended)
         await first.aclose()
 

@@ -7,7 +7,6 @@ import resource
 import signal
 import socket
 import sys
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import Any
@@ -144,32 +143,6 @@ async def test_the_last_client_of_a_killed_hub_has_the_port_itself_and_keeps_its
             assert two.seat == seat
             assert three.seat is not None
             assert three.seat.own == US
-
-
-def bind_when_free(sock: socket.socket, number: int) -> None:
-    deadline = time.monotonic() + 30
-    while True:
-        try:
-            sock.bind((HOST, number))
-            return
-        except OSError:
-            assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-async def test_an_endpoint_that_is_taken_when_its_hub_was_killed_does_not_cut_the_vehicle(port: Port) -> None:
-    taken = free_udp_port()
-    async with port.shared(f"udpin:{HOST}:{taken}") as link:
-        await port.hears(link)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            await kill_hub(port)
-            bind_when_free(other, taken)  # our task does not run meanwhile
-            await port.hears(link)
-            (facts,) = await trio.to_thread.run_sync(ports.statuses, port.source)
-            assert "in use" in facts["endpoints"][0]["problem"]
-        with trio.fail_after(60):
-            while facts["endpoints"][0]["problem"]:
-                (facts,) = await trio.to_thread.run_sync(ports.statuses, port.source)
 
 
 async def test_programs_that_begin_at_once_all_share_the_port(port: Port) -> None:
