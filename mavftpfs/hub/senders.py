@@ -19,7 +19,6 @@ The hub learns nothing from a frame with a wrong CRC: it is KNOWN where its send
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from enum import Enum
 from typing import NamedTuple
@@ -34,7 +33,6 @@ MEMORY = 60.0
 """Seconds of silence after which a sender is forgotten, once a new sender appears on its side."""
 MOST_SENDERS = 512
 """The most senders of one side. If a program makes up more within 5 s, only the first ones count."""
-_SWEEP = 1.0
 
 
 class Place(NamedTuple):
@@ -58,8 +56,6 @@ class Senders:
 
     def __init__(self) -> None:
         self._heard: dict[Address, dict[Place, float]] = {}
-        self._counts: Counter[int] = Counter()
-        self._swept: dict[int, float] = {}
         self._seconds: dict[Address, tuple[NetAddress, float]] = {}
 
     def __contains__(self, sender: Address) -> bool:
@@ -86,7 +82,6 @@ class Senders:
         if not self._has_room(place.side, now):
             return Belief.REFUSED
         self._heard.setdefault(sender, {})[place] = now
-        self._counts[place.side] += 1
         return Belief.NEW
 
     def doubles(self) -> dict[Address, NetAddress]:
@@ -124,8 +119,6 @@ class Senders:
         """Forget the senders of a side."""
         for sender, place, _ in list(self._at(side)):
             self._forget(sender, place)
-        del self._counts[side]
-        self._swept.pop(side, None)
 
     def _at(self, side: int) -> Iterator[tuple[Address, Place, float]]:
         """Yield each sender of a side, its place there, and when it was last heard."""
@@ -135,20 +128,17 @@ class Senders:
                     yield sender, place, at
 
     def _has_room(self, side: int, now: float) -> bool:
-        """Return whether one more sender of a side may be noted. Forget silent senders, but search for them
-        at most once a second, because a program may make up thousands."""
-        if now - self._swept.get(side, float("-inf")) >= _SWEEP:
-            self._swept[side] = now
-            patience = MEMORY if self._counts[side] < MOST_SENDERS else PATIENCE
-            for sender, place, at in list(self._at(side)):
-                if now - at > patience:
-                    self._forget(sender, place)
-        return self._counts[side] < MOST_SENDERS
+        """Return whether one more sender of a side may be noted. Forget those that are silent."""
+        there = list(self._at(side))
+        patience = MEMORY if len(there) < MOST_SENDERS else PATIENCE
+        silent = [(sender, place) for sender, place, at in there if now - at > patience]
+        for sender, place in silent:
+            self._forget(sender, place)
+        return len(there) - len(silent) < MOST_SENDERS
 
     def _forget(self, sender: Address, place: Place) -> None:
         """Forget that a sender is at a place."""
         del self._heard[sender][place]
-        self._counts[place.side] -= 1
         if not self._heard[sender]:
             del self._heard[sender]
             self._seconds.pop(sender, None)
