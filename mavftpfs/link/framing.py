@@ -63,6 +63,7 @@ _SIGNED = 1
 HIGHEST_ID = 0xFFFF
 """The longest frame of any public dialect; a longer claim would make garbage hold 280 bytes back."""
 _UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
+_PREFIX = re.compile("^MAV_(TYPE|COMP_ID)_")
 _MAGIC = re.compile(b"[\xfd\xfe]")
 _READABLE = frozenset((0, 2, 76, 77, 110, 148, 253, 261))  # the ids of messages whose fields matter
 _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
@@ -84,6 +85,12 @@ def _target_offsets() -> dict[int, tuple[int, int | None]]:
 
 TARGETS = _target_offsets()
 """For each message that names a target: the offsets of the target's system and component in its payload."""
+
+
+def word_of(enumeration: str, number: int) -> str | None:
+    """Return the word for a value in MAVLink's definitions, such as `ground rover`; None if there is none."""
+    entry = dialect.enums[enumeration].get(number)
+    return None if entry is None else _PREFIX.sub("", entry.name).replace("_", " ").lower()
 
 
 def is_known(message_id: int) -> bool:

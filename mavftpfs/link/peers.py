@@ -4,42 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from mavftpfs.link.framing import word_of
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Heartbeat
 from mavftpfs.shared.readable import autopilot_name
 
-_COMPONENTS = {
-    1: "autopilot",
-    68: "telemetry radio",
-    **dict.fromkeys(range(100, 106), "camera"),
-    154: "gimbal",
-    158: "peripheral",
-    190: "mission planner",
-    191: "companion computer",
-    **dict.fromkeys(range(192, 195), "companion computer"),
-    240: "MAVLink router",
-}
-_TYPES = {
-    **{1: "fixed wing", 2: "quadrotor", 3: "coaxial helicopter", 4: "helicopter", 5: "antenna tracker"},
-    **{7: "airship", 8: "balloon", 9: "rocket", 10: "rover", 11: "boat", 12: "submarine"},
-    **{13: "hexarotor", 14: "octorotor", 15: "tricopter", 29: "dodecarotor"},
-    **dict.fromkeys(range(19, 26), "VTOL"),
-    **{6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-B receiver", 30: "camera"},
-    **{33: "gimbal", 34: "battery", 36: "battery", 35: "parachute", 37: "telemetry radio"},
-}
-"""Common MAV_COMPONENT and MAV_TYPE values."""
+_NOTHING_TOLD = 0
+"""MAV_TYPE_GENERIC."""
 
 
 def describe_peer(heartbeat: Heartbeat) -> str:
     """Return a description of a heartbeat's sender."""
-    kind = _TYPES.get(heartbeat.vehicle_type)
-    if heartbeat.vehicle_type == MAV_TYPE_GCS:
+    number = heartbeat.vehicle_type
+    if number == MAV_TYPE_GCS:
         return "ground station"
+    kind = None if number == _NOTHING_TOLD else word_of("MAV_TYPE", number)
     if heartbeat.autopilot == MAV_AUTOPILOT_INVALID:
-        return (
-            kind
-            or _COMPONENTS.get(heartbeat.source.component)
-            or f"component of type {heartbeat.vehicle_type}"
-        )
+        return kind or word_of("MAV_COMPONENT", heartbeat.source.component) or f"component of type {number}"
     words = [autopilot_name(heartbeat.autopilot), *([kind] if kind else [])]
     return f"{' '.join(words)}, {'armed' if heartbeat.armed else 'disarmed'}"
 

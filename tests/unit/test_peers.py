@@ -18,8 +18,10 @@ from mavftpfs.link.peers import describe_peer
         (6, 190, 8, False, "ground station"),
         (30, 100, 8, False, "camera"),
         (0, 154, 8, False, "gimbal"),
-        (18, 191, 8, False, "companion computer"),
-        (77, 200, 8, False, "component of type 77"),
+        (18, 191, 8, False, "onboard controller"),
+        (0, 191, 8, False, "onboard computer"),
+        (0, 1, 3, False, "ArduPilot, disarmed"),
+        (77, 222, 8, False, "component of type 77"),
         (99, 1, 99, False, "autopilot type 99, disarmed"),
     ],
 )
