@@ -14,9 +14,8 @@ from mavftpfs.shared.errors import ExitCode
 
 HEARD_LATELY = 10.0
 """Seconds after its last heartbeat for which starting a vehicle's mount is worthwhile."""
-FIRST_PAUSE = 1.0
-LONGEST_PAUSE = 30.0
-"""Seconds before a failed mount is started again; doubled each time."""
+PAUSE = 5.0
+"""Seconds before a failed mount is started again."""
 MOST = 64
 """The most vehicles of one mount, because any program can send heartbeats with any id."""
 
@@ -49,7 +48,6 @@ class Member:
     state: MemberState = MemberState.HEARD
     heard_at: float = float("-inf")
     due_at: float = float("-inf")
-    pause: float = FIRST_PAUSE
     problem: str = ""
 
     @property
@@ -68,7 +66,7 @@ class Member:
     def mounted(self) -> None:
         """Note that its mount is up."""
         self._go_to(MemberState.MOUNTED)
-        self.pause, self.problem = FIRST_PAUSE, ""
+        self.problem = ""
 
     def ended(self, code: int, problem: str, now: float) -> None:
         """Note that its mount's process ended, with an exit code."""
@@ -77,8 +75,7 @@ class Member:
             return
         self._go_to(MemberState.FAILED)
         self.problem = problem
-        self.due_at = now + self.pause
-        self.pause = min(self.pause * 2, LONGEST_PAUSE)
+        self.due_at = now + PAUSE
 
 
 class Members:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, Heartbeat
-from mavftpfs.mount.members import HEARD_LATELY, LONGEST_PAUSE, MOST, Members, MemberState
+from mavftpfs.mount.members import HEARD_LATELY, MOST, PAUSE, Members, MemberState
 from mavftpfs.shared.errors import ExitCode
 
 
@@ -35,26 +35,13 @@ def test_a_mount_is_started_once_and_again_after_it_failed() -> None:
     assert due(members, 0.0) == []
     member.ended(2, "no vehicle", 0.0)
     assert member.problem == "no vehicle"
-    assert due(members, 0.5) == []
-    assert due(members, 1.0) == ["1"]
+    assert due(members, PAUSE / 2) == []
+    assert due(members, PAUSE) == ["1"]
     member.start()
     member.mounted()
     assert member.problem == ""
     member.ended(-9, "killed", 5.0)
-    assert due(members, 6.0) == ["1"]
-
-
-def test_failures_in_a_row_are_tried_again_less_and_less_often() -> None:
-    members = Members()
-    members.hear(beat(1), 0.0)
-    (member,) = members
-    pauses = []
-    for _ in range(8):
-        member.start()
-        member.ended(3, "no", 100.0)
-        pauses.append(member.due_at - 100.0)
-    assert pauses == sorted(pauses)
-    assert pauses[-1] == LONGEST_PAUSE
+    assert due(members, 5.0 + PAUSE) == ["1"]
 
 
 def test_a_silent_vehicle_is_not_mounted_again_before_it_is_heard() -> None:
