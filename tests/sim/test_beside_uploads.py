@@ -62,17 +62,6 @@ async def upload(here: Rig, name: bytes, data: bytes) -> None:
     assert here.data(b"/d/" + name) == data
 
 
-async def copy(tree: Tree, name: bytes, data: bytes) -> None:
-    """Do what cp does; each error of flush and release shows."""
-    file = await tree.create(b"/d/" + name, exclusive=True)
-    for at in range(0, len(data), 50_000):
-        await file.write(at, data[at : at + 50_000])
-    try:
-        await file.flush()
-    finally:  # the kernel releases it in any case
-        await file.release()
-
-
 async def trickle(tree: Tree, path: bytes, pause: float = 1.0) -> None:
     """Write a log that is never closed."""
     file = await tree.create(path, exclusive=True)
@@ -93,7 +82,7 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str) -> Non
         await trio.sleep(10)
         for number in range(4):
             with trio.fail_after(15):
-                await copy(tree, b"b%d" % number, b"b" * 1000)
+                await write_file(tree, b"/d/b%d" % number, b"b" * 1000)
             assert here.data(b"/d/b%d" % number) == b"b" * 1000
             file = await tree.open(b"/d/other")
             with trio.fail_after(15):
@@ -112,12 +101,12 @@ async def test_where_it_empties_files_the_second_waits_as_long_as_the_first_move
     async with here.mounted(b"/d") as tree:
         here.faults.requests.clear()
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(copy, tree, b"big", data)
+            nursery.start_soon(write_file, tree, b"/d/big", data)
             await trio.sleep(10)
             assert await read_file(here.connection, here.root + b"/d/other") == b"q" * 3000  # the trial
             await trio.sleep(2)
             began = trio.current_time()
-            nursery.start_soon(copy, tree, b"small", b"b" * 1000)
+            nursery.start_soon(write_file, tree, b"/d/small", b"b" * 1000)
             await here.connection.store.list_directory(here.root + b"/d")
             assert trio.current_time() - began < 3
         assert trio.current_time() - began > 2 * OP_DEADLINE
@@ -379,7 +368,7 @@ async def test_a_client_that_lists_beside_an_upload_on_nuttx_does_not_pass_for_a
     here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.1))
     here.card.add_directory(b"/etc")
     async with here.mounted(b"/d") as tree, trio.open_nursery() as nursery:
-        nursery.start_soon(copy, tree, b"new", data)
+        nursery.start_soon(write_file, tree, b"/d/new", data)
         await trio.sleep(0.5)
         for _ in range(13):  # an answer each, one after the other
             here.another_asks(Opcode.LIST_DIRECTORY, b"/etc")

@@ -26,7 +26,7 @@ from mavftpfs.shared.errors import (
     NotFound,
     WriteFailed,
 )
-from tests.support.rigs import KINDS, Rig, card, read_file, rig, write_file
+from tests.support.rigs import KINDS, Rig, card, open_to_copy, read_file, rig, write_file
 from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("promise 3")
@@ -49,16 +49,9 @@ async def mount(here: Rig, spool: SpoolDirectory | None = None) -> Tree:
     return tree
 
 
-async def opened(tree: Tree, path: bytes) -> OpenFile:
-    """Open a file as `cp` does."""
-    if path == FILE:
-        return await tree.open(path, write=True, truncate=True)
-    return await tree.create(path, exclusive=True)
-
-
 async def part_of(tree: Tree, path: bytes) -> OpenFile:
     """Write a part of a file, until some of it is on its way to the card."""
-    file = await opened(tree, path)
+    file = await open_to_copy(tree, path)
     await file.write(0, PART)
     await trio.sleep(1.0)
     return file
@@ -388,7 +381,7 @@ def told(copies: list[Path]) -> dict[str, tuple[bytes, str]]:
 async def test_the_last_part_is_kept(here: Rig, spool: SpoolDirectory, tmp_path: Path) -> None:
     tree = await mount(here, spool)
     for data in (b"first", b"second"):
-        file = await opened(tree, FRESH)
+        file = await open_to_copy(tree, FRESH)
         await file.write(0, data)
         with pytest.raises(FileTooLarge):
             await file.write(BEYOND, b"x")
@@ -569,7 +562,7 @@ async def test_the_file_of_others_under_the_name_of_a_part_stays(theirs: bytes) 
 async def test_the_close_of_another_program_does_not_send_an_emptied_file(here: Rig) -> None:
     """Until the program that emptied the file has written, the card keeps a whole file."""
     tree = await mount(here)
-    first = await opened(tree, FILE)
+    first = await open_to_copy(tree, FILE)
     await first.write(0, PART)
     async with trio.open_nursery() as nursery:
         nursery.start_soon(first.release)
@@ -585,7 +578,7 @@ async def test_the_close_of_another_program_does_not_send_an_emptied_file(here: 
 async def test_the_error_of_an_earlier_copy_does_not_send_an_emptied_file(here: Rig) -> None:
     """A shell empties the file and closes a copy of the descriptor before it writes."""
     tree = await mount(here)
-    first = await opened(tree, FILE)
+    first = await open_to_copy(tree, FILE)
     await first.write(0, PART)
     here.faults.refuse(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC, times=1)
     with pytest.raises(MavftpfsError):

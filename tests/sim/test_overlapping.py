@@ -22,7 +22,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FileChanged, FtpNak, LinkError, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.rigs import KINDS, RENAMING, Rig, card, read_file, rig
+from tests.support.rigs import KINDS, RENAMING, Rig, card, open_to_copy, rig
 from tests.support.transfers import content
 
 FILE, NEW, OTHER = b"/d/file", b"/d/new", b"/d/other"
@@ -40,9 +40,7 @@ slow = card({FILE: OLD, OTHER: OLD}, profiles=["px4", "ardupilot5", "mavsdk"], l
 
 async def begun(tree: Tree, path: bytes, data: bytes = DATA) -> OpenFile:
     """Return a file that is written whole and not delivered."""
-    file = await (
-        tree.create(path, exclusive=True) if path == NEW else tree.open(path, write=True, truncate=True)
-    )
+    file = await open_to_copy(tree, path)
     await file.write(0, data)
     return file
 
@@ -198,186 +196,7 @@ async def test_a_name_that_stays_gets_its_file(slow: Rig, refused: bool) -> None
     await settle(slow, tree)
 
 
-GOOD = LinkSettings(rate=50_000.0, delay=0.02)
-AT_ONCE = LinkSettings()
-"""Called off, a delivery may have got what it waited for, and may just be about to go on."""
-
-BYTES, NEWER, PLAIN = content(3000, 1), content(3500, 2), content(500, 3)
-MOST_REQUESTS = 120
-
-
-async def create(tree: Tree) -> OpenFile:
-    await tree.unlink(FILE)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, NEWER)
-    return file
-
-
-async def replace(tree: Tree) -> OpenFile:
-    return await begun(tree, FILE, NEWER)
-
-
-async def change(tree: Tree) -> OpenFile:
-    file = await tree.open(FILE, write=True)
-    await file.write(100, NEWER[100:])
-    return file
-
-
-async def empty(tree: Tree) -> OpenFile:
-    await tree.unlink(FILE)
-    return await tree.create(FILE, exclusive=True)
-
-
-async def cut(tree: Tree) -> OpenFile:
-    file = await tree.open(FILE, write=True)
-    await file.truncate(1000)
-    return file
-
-
-Write = Callable[[Tree], Awaitable[OpenFile]]
-WRITES: dict[Write, bytes] = {
-    create: NEWER,
-    replace: NEWER,
-    change: BYTES[:100] + NEWER[100:],
-    empty: b"",
-    cut: BYTES[:1000],
-}
-"""How a file is made, or one changed that has BYTES, and what it is then; nothing of that is delivered."""
-
-Take = Callable[[Tree], Awaitable[None]]
-
-
-async def unlink(tree: Tree) -> None:
-    await tree.unlink(FILE)
-
-
-async def rename_over(tree: Tree) -> None:
-    await tree.rename(OTHER, FILE)
-
-
-TAKES: dict[Take, dict[bytes, bytes]] = {unlink: {OTHER: PLAIN}, rename_over: {FILE: PLAIN}}
-"""How it loses its name, and what is there then."""
-
-
-async def overtake(
-    count: int,
-    profile: str,
-    link: LinkSettings,
-    write: Write,
-    act: Callable[[Tree, OpenFile, trio.Event], Awaitable[float]],
-) -> tuple[Rig, float | None]:
-    """Act when `count` requests of a delivery came; return how long that took, None if it needed fewer.
-
-    act: is given the tree, the file and what tells that it is delivered; returns how long it took.
-    """
-    taken: float | None = None
-    async with rig(profile, {FILE: BYTES, OTHER: PLAIN}, link=link, seed=count + 1) as here:
-        tree = here.mount(inplace=not here.renames)
-        await tree.list(b"/d")
-        file = await write(tree)
-        now, delivered = trio.Event(), trio.Event()
-        here.faults.after(count, now.set)
-
-        async def flush() -> None:
-            await file.fsync()
-            delivered.set()
-
-        here.nursery.start_soon(flush)
-        with trio.move_on_after(60):
-            await now.wait()
-            if not delivered.is_set():
-                taken = await act(tree, file, delivered)
-        await delivered.wait()
-        await file.release()
-        if taken is not None:
-            await settle(here, tree)
-        return here, taken
-
-
-async def at_each_request(attempt: Callable[[int], Awaitable[float | None]], *, step: int = 1) -> None:
-    """Try something when so many requests of a delivery came, until it needs fewer (None). attempt: returns
-    how long that took, a few round trips at most."""
-    for count in range(1, MOST_REQUESTS, step):
-        taken = await attempt(count)
-        if taken is None:
-            assert count > 2
-            return
-        assert taken < PROMPT, f"after request {count}"
-    raise AssertionError("it was never delivered")
-
-
-@pytest.mark.holds("fault overlap")
-@pytest.mark.parametrize(
-    ("profile", "link", "write", "take"),
-    [
-        ("px4", GOOD, change, rename_over),
-        ("px4", AT_ONCE, create, unlink),
-        ("px4-nuttx", GOOD, replace, unlink),
-        ("ardupilot", GOOD, empty, rename_over),
-        ("ardupilot5", AT_ONCE, replace, unlink),
-        ("mavsdk", GOOD, create, unlink),
-    ],
-)
-async def test_a_name_goes_at_any_request_of_its_delivery(
-    profile: str, link: LinkSettings, write: Write, take: Take
-) -> None:
-    expected = WRITES[write]
-
-    async def act(tree: Tree, file: OpenFile, delivered: trio.Event) -> float:
-        began = trio.current_time()
-        await take(tree)
-        took = trio.current_time() - began
-        await delivered.wait()
-        with suppress(*(FileChanged,) if write is change else ()):  # a part may be nowhere any more
-            assert bytes(await file.read(0, len(expected) + 1)) == expected
-        await file.write(len(expected), b"more")
-        assert bytes(await file.read(len(expected), 5)) == b"more"
-        await file.flush()
-        if take is rename_over:
-            assert await read_file(tree, FILE) == PLAIN
-        return took
-
-    async def attempt(count: int) -> float | None:
-        here, taken = await overtake(count, profile, link, write, act)
-        assert taken is None or here.files() == TAKES[take], f"after request {count}"
-        return taken
-
-    await at_each_request(attempt)
-
-
-@pytest.mark.holds("fault overlap")
-@pytest.mark.parametrize(
-    ("profile", "write", "then"),
-    [
-        ("px4", change, content(5000, 4)),
-        ("px4-nuttx", replace, content(700, 4)),
-        ("ardupilot", cut, content(700, 4)),
-        ("littlefs", replace, b""),
-        ("mavsdk", create, content(5000, 4)),
-    ],
-    ids=lambda value: len(value) if isinstance(value, bytes) else None,
-)
-async def test_emptied_at_any_request_of_its_delivery(profile: str, write: Write, then: bytes) -> None:
-    """The program empties by O_TRUNC, and then writes something else."""
-
-    async def act(tree: Tree, file: OpenFile, delivered: trio.Event) -> float:
-        began = trio.current_time()
-        opened = await tree.open(FILE, write=True, truncate=True)
-        took = trio.current_time() - began
-        await opened.write(0, then)
-        await delivered.wait()
-        await opened.release()
-        assert (await tree.stat(FILE)).size == len(then)
-        return took
-
-    async def attempt(count: int) -> float | None:
-        here, taken = await overtake(count, profile, GOOD, write, act)
-        assert taken is None or here.files() == {FILE: then, OTHER: PLAIN}, f"after request {count}"
-        return taken
-
-    await at_each_request(attempt, step=2)
-
-
+BYTES, NEWER = content(3000, 1), content(3500, 2)
 RADIO = LinkSettings(rate=6000.0, delay=0.05)
 
 

@@ -346,14 +346,7 @@ async def test_another_clients_session_is_left_alone(profile: str) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
     here = Rig(profile, {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
-        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
-
-        async def rival_reads() -> None:
-            while True:
-                await trio.sleep(1.0)
-                here.another_asks(Opcode.READ_FILE)
-
-        nursery.start_soon(rival_reads)
+        nursery.start_soon(read_by_another, here, 60)
         await trio.sleep(2.0)
         began = trio.current_time()
         with pytest.raises(SessionBusy):
@@ -465,15 +458,7 @@ async def test_a_client_that_opened_a_file_just_before_us_is_waited_for() -> Non
     """Several commands of ours at once all open theirs when one of them has closed its file."""
     here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
-
-        async def rival() -> None:
-            here.another_asks(Opcode.OPEN_FILE_RO, b"/d/theirs")
-            for _ in range(20):
-                await trio.sleep(1.0)
-                here.another_asks(Opcode.READ_FILE)
-            here.another_asks(Opcode.TERMINATE_SESSION)
-
-        nursery.start_soon(rival)
+        nursery.start_soon(read_by_another, here, 20)
         assert await read_file(connection, b"/d/f") == DATA
         times = here.faults.times(Opcode.OPEN_FILE_RO)
         assert len(times) == 2, "it was refused once, and asked again when the other one had closed its file"

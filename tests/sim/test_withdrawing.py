@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 import trio
 
-from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError, NotFound
-from tests.support.rigs import KINDS, Rig, card, read_file
+from tests.support.rigs import KINDS, Rig, card, open_to_copy, read_file
 from tests.support.transfers import content
 
 pytestmark = pytest.mark.holds("promise 2", "promise 3")
@@ -32,20 +31,13 @@ async def tree(here: Rig) -> Tree:
     return tree
 
 
-async def opened(tree: Tree, path: bytes) -> OpenFile:
-    """Open a file that is to be written whole."""
-    if path == FILE:
-        return await tree.open(path, write=True, truncate=True)
-    return await tree.create(path, exclusive=True)
-
-
 @pytest.mark.parametrize("after", [0, 30])
 @pytest.mark.parametrize("path", [FILE, FRESH])
 async def test_what_could_not_be_delivered_never_comes(
     here: Rig, tree: Tree, path: bytes, after: int
 ) -> None:
     """The link is cut before, or while, the mount sends the file."""
-    file = await opened(tree, path)
+    file = await open_to_copy(tree, path)
     here.faults.cut_after(after)
     await file.write(0, NEW)
     with pytest.raises(MavftpfsError):
@@ -67,7 +59,7 @@ async def test_an_interrupted_name_is_looked_at(here: Rig, tree: Tree, path: byt
     """The vehicle does not answer the rename that gives the file its name."""
     if not here.renames:
         return
-    file = await opened(tree, path)
+    file = await open_to_copy(tree, path)
     await file.write(0, NEW)
     here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0))
     with pytest.raises(MavftpfsError):
@@ -82,7 +74,7 @@ async def test_an_interrupted_name_is_looked_at(here: Rig, tree: Tree, path: byt
 
 
 async def test_it_is_what_it_was_for_everybody(here: Rig, tree: Tree) -> None:
-    file, fresh = await opened(tree, FILE), await opened(tree, FRESH)
+    file, fresh = await open_to_copy(tree, FILE), await open_to_copy(tree, FRESH)
     reader = await tree.open(FILE)
     await file.write(0, NEW)
     await fresh.write(0, NEW)
@@ -96,7 +88,7 @@ async def test_it_is_what_it_was_for_everybody(here: Rig, tree: Tree) -> None:
 
 
 async def test_what_is_there_is_there(here: Rig, tree: Tree) -> None:
-    file = await opened(tree, FRESH)
+    file = await open_to_copy(tree, FRESH)
     await file.write(0, NEW)
     await file.fsync()
     assert await file.take_back() is True
@@ -104,7 +96,7 @@ async def test_what_is_there_is_there(here: Rig, tree: Tree) -> None:
 
 
 async def test_what_others_write_too_is_theirs(here: Rig, tree: Tree) -> None:
-    file = await opened(tree, FRESH)
+    file = await open_to_copy(tree, FRESH)
     other = await tree.open(FRESH, write=True)
     await file.write(0, b"ours")
     await other.write(4, b"theirs")
@@ -119,7 +111,7 @@ async def test_a_listing_does_not_wait_because_its_requests_came_late(here: Rig,
     handle, held = here.server.handle, []
     here.faults.orphans = True
     here.server.handle = lambda *request: held.append(request)  # type: ignore[method-assign]
-    file = await opened(tree, FRESH)
+    file = await open_to_copy(tree, FRESH)
     await file.write(0, NEW)
     with pytest.raises(MavftpfsError):
         await file.fsync()

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 import trio
 
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
@@ -290,12 +291,17 @@ async def read_file(tree: Tree, path: bytes) -> bytes:
         file.close()
 
 
+async def open_to_copy(tree: Tree, path: bytes) -> OpenFile:
+    """Make a file, or empty the one that is there, as `cp` does before it writes."""
+    try:
+        return await tree.create(path, exclusive=True)
+    except AlreadyExists:
+        return await tree.open(path, write=True, truncate=True)
+
+
 async def write_file(tree: Tree, path: bytes, data: bytes, step: int = PIECE) -> None:
     """Make or replace a file, as `cp` does: every error shows."""
-    try:
-        file = await tree.create(path, exclusive=True)
-    except AlreadyExists:
-        file = await tree.open(path, write=True, truncate=True)
+    file = await open_to_copy(tree, path)
     try:
         for at in range(0, len(data), step):
             await file.write(at, data[at : at + step])
