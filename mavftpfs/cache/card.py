@@ -181,6 +181,7 @@ class Card:
         file.lose_name()
         file.content.on_unneeded()
         file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
+        self.throttle.waiting.unpark_all()
         if not file.handles:
             self.live.pop(file, None)
             file.content.forget()

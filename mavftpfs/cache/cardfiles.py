@@ -148,27 +148,16 @@ class CardFiles(Source):
         had = file.undelivered
         try:
             await handle.truncate(size)
-            if file.writers > 1:
-                handle.close()  # the others deliver it
-            else:
-                await delivery.deliver(card, file)  # an error undoes the call, and breaks no file
-                await handle.release()
+            if file.writers == 1:  # else the others deliver it
+                await delivery.deliver(card, file)
         except BaseException:
-            handle.close()
-            if not had and not file.writers:
-                await self._undo_truncate(file)
+            # A call that was interrupted cannot wait for the lock: who has that, delivers the file.
+            others = had or file.writers > 1 or file.lock.locked()
+            if file.undelivered and not (others or file.lies_in_place):
+                await writing.drop(card, file)
             raise
-
-    async def _undo_truncate(self, file: File) -> None:
-        """Forget the change of a call that failed: its bytes are not wanted. If the vehicle may have some of
-        them, the change is kept, and delivered later."""
-        card = self._card
-        async with file.lock, card.paths.steady(file, lasting=True):
-            await uploads.abandon(card, file)
-            if file.writers or not file.undelivered or file.unsure:
-                return
-            writing.undo(card, file)
-        card.maybe_forget(file)
+        finally:
+            handle.close()
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime until the file changes."""

@@ -29,6 +29,7 @@ class Content:
         base_limit: below this, bytes that are not held are the vehicle's. 0: none is, so the file is replaced
             whatever the vehicle has under its name by then.
         spooled: the local file; None while nobody changed the file.
+        summed: how many bytes of the base went into a checksum so far, from its beginning, and their CRC32.
     """
 
     def __init__(self, blocks: Blocks) -> None:
@@ -36,6 +37,7 @@ class Content:
         self.size = 0
         self.base_limit = 0
         self.spooled: SpoolContent | None = None
+        self.summed = 0, 0
 
     # --- what it is
 
@@ -117,6 +119,11 @@ class Content:
             self.spooled.put(size, b"", zeros=size - self.size)
         self.size = size
 
+    def sum_up(self, data: bytes | memoryview) -> None:
+        """Note the next bytes of the base for its checksum."""
+        at, value = self.summed
+        self.summed = at + len(data), crc32(data, value)
+
     def fill(self, offset: int, data: bytes | memoryview) -> None:
         """Hold bytes of the base, where nothing newer is held.
 
@@ -132,7 +139,7 @@ class Content:
     def on_delivered(self) -> None:
         """Note that the vehicle has these bytes: the next change lies over them."""
         assert self.spooled is not None
-        self.base_limit = self.size
+        self.base_limit, self.summed = self.size, (0, 0)
         self.spooled.mark_unneeded()
 
     def on_unneeded(self) -> None:
@@ -146,7 +153,7 @@ class Content:
         self.blocks.drop()
         if self.spooled is not None:
             self.spooled.close()
-        self.spooled = None
+        self.spooled, self.summed = None, (0, 0)
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""

@@ -34,7 +34,7 @@ class ReadHandle(OpenFile):
         self._card = card
         self.file = file
         self._readahead = Readahead(file.size)
-        self._closed = False
+        self._closed = self._ended = False
         self._keep_cache = same and file.in_kernel and not file.is_local
         file.in_kernel = not file.is_local
         file.handles += 1
@@ -68,7 +68,8 @@ class ReadHandle(OpenFile):
             stop = min(offset + size, self.size)
             if offset >= stop:
                 return b""
-            data = await reading.read(self._card, self.file, offset, stop, self._readahead)
+            data = await reading.read(self._card, self.file, offset, stop, self._readahead, ended=self._ended)
+            self._ended |= stop == self.size
             if stop == min(offset + size, self.size):  # else its end moved meanwhile
                 return data
 

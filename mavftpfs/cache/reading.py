@@ -179,10 +179,18 @@ async def _reopened(card: Card, file: File) -> Reader:
 
 
 async def read(
-    card: Card, file: File, start: int, stop: int, ahead: Readahead | None = None, *, base: bool = False
+    card: Card,
+    file: File,
+    start: int,
+    stop: int,
+    ahead: Readahead | None = None,
+    *,
+    base: bool = False,
+    ended: bool = False,
 ) -> bytes | memoryview:
     """Return [start, stop) of a file, cut at its end, proven to be its own. ahead: what to fetch before it is
-    asked for. base: of the vehicle's file, whatever programs changed.
+    asked for. base: of the vehicle's file, whatever programs changed. ended: the program read the end before,
+    so no later read of it would prove these bytes.
 
     Raises:
         FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak, SpoolFailed.
@@ -193,7 +201,7 @@ async def read(
         data = await _pieces(card, file, start, stop, ahead, base)
         if data is not None:
             if base or not file.content.whole or not file.is_local:
-                await _prove(card, file, at_end=stop >= file.size)
+                await _prove(card, file, at_end=ended or stop >= file.size)
             if card.epoch == epoch:
                 return data
         if card.epoch != epoch:
@@ -292,7 +300,9 @@ def _known(card: Card, file: File) -> Known:
 def _needs_proof(card: Card, file: File, *, at_end: bool) -> bool:
     """Return whether a listing is to tell that a file is still the vehicle's, before bytes are given out.
 
-    at_end: the read reaches the end of the file, so it does not wait for the pause between two listings.
+    at_end: the read, or an earlier one, reached the end of the file, so it does not wait for the pause
+    between two listings. Any other read may get bytes of the next file of this name; then the read that
+    reaches the end fails.
     """
     if file.base is None or file.unsure or not file.has_name:
         return False

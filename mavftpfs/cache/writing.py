@@ -23,9 +23,8 @@ import trio
 from mavftpfs.cache import reading, uploads
 from mavftpfs.cache.blocks import NEVER
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Event, File, State
+from mavftpfs.cache.file import Attempt, Event, File, State
 from mavftpfs.cache.reserved import require_writable
-from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     FileBusy,
     FileChanged,
@@ -215,26 +214,30 @@ async def make_whole(card: Card, file: File) -> None:
 
 
 async def _fetch(card: Card, file: File) -> None:
-    """Fetch what is missing. Where listings tell no times, the whole old file is read to know its checksum.
-    The delivery compares that before it replaces the old file."""
+    """Fetch what is missing.
+
+    Where listings tell no times, the delivery compares checksums before it replaces the old file. That of the
+    old file is made of the bytes that are fetched: the whole old file is read once, also the end of a file
+    that was cut. A fetch that failed continues where it stopped, so bytes of two versions make a checksum
+    that neither has.
+    """
     content, base = file.content, file.base
     if base is None:
         return  # others removed it meanwhile, so nothing of it is missing
-    whole_base = content.base_limit == base.size <= card.options.verify_max
-    if whole_base and not card.directories.tells_times:
-        value = 0
-        for at in range(0, base.size, STEP):
-            value = crc32(await _fetch_step(card, file, at, min(at + STEP, base.size)), value)
+    if not card.directories.tells_times and base.crc32 is None and base.size <= card.options.verify_max:
+        while (at := content.summed[0]) < base.size:
+            content.sum_up(await _fetch_step(card, file, at, min(at + STEP, base.size)))
         if file.base == base:
-            file.base = replace(base, crc32=value)
+            file.base = replace(base, crc32=content.summed[1])
     while missing := content.missing(0, content.size):
         start, stop = missing[0]
         await _fetch_step(card, file, start, min(start + STEP, stop))
 
 
 async def _fetch_step(card: Card, file: File, start: int, stop: int) -> bytes | memoryview:
+    spooled = file.content.spooled
     data = await reading.read(card, file, start, stop, base=True)
-    if len(data) != stop - start or not file.is_local:
+    if len(data) != stop - start or spooled is None or file.content.spooled is not spooled:
         raise FileChanged(f"{file.path!r} became shorter on the vehicle")
     _with_room(card, partial(file.content.fill, start, data))
     return data
@@ -249,17 +252,9 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     Nothing of the file is placed, and the vehicle's file, if there is one, has the name again. The part that
     was written is kept for the recovery directory. The caller has the file's lock, and the file is DIRTY.
     """
-    path, attempt = file.path, file.attempt
+    path, attempt = file.path, _detach(card, file)
     file.on(Event.FAILED)
     file.error = error
-    if attempt is not None:
-        uploads.forget_attempt(file, attempt)
-        if not attempt.in_place and attempt.upload.may_exist:
-            card.parts.append(attempt.path)
-    if file.base is None and file.lies_in_place:
-        card.parts.append(path)
-    if not file.lies_in_place:
-        card.names.settle(file)
     card.live.pop(file, None)
     file.lose_name()
     card.forget_broken(path)
@@ -278,6 +273,37 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     persist(card, file)
     if attempt is not None:
         await attempt.upload.end()
+
+
+async def drop(card: Card, file: File) -> None:
+    """Forget the pending changes of a file, because the call that made them failed. Programs that have the
+    file open get FileChanged. Nobody has the file's lock.
+
+    The file loses its name before this waits for anything, because the caller may be cancelled.
+    """
+    path, attempt = file.path, _detach(card, file)
+    card.lose_name(file)
+    file.content.forget()
+    file.content.on_opened(0 if file.base is None else file.base.size)
+    card.forget_time(path)
+    card.tell_changed(path)
+    card.retry_later()
+    if attempt is not None:
+        await attempt.upload.end()
+
+
+def _detach(card: Card, file: File) -> Attempt | None:
+    """Note that nothing of a file is to be placed; return the attempt to send it, which the caller ends."""
+    attempt = file.attempt
+    if attempt is not None:
+        uploads.forget_attempt(file, attempt)
+        if not attempt.in_place and attempt.upload.may_exist:
+            card.parts.append(attempt.path)
+    if file.base is None and file.lies_in_place:
+        card.parts.append(file.path)
+    if not file.lies_in_place:
+        card.names.settle(file)
+    return attempt
 
 
 def persist(card: Card, file: File) -> None:
@@ -302,17 +328,3 @@ def describe(file: File, wall: Callable[[], float]) -> dict[str, object]:
         "error": None if file.error is None else readable(str(file.error)),
         "at": wall(),
     }
-
-
-def undo(card: Card, file: File) -> None:
-    """Forget what a failed call changed: programs see the vehicle's file again. If the call noticed that
-    others replaced that, open handles get FileChanged. The caller has the lock."""
-    size, stale = 0 if file.base is None else file.base.size, file.state is State.STALE
-    file.content.forget()
-    file.content.on_opened(size)
-    file.state, file.error = State.CLEAN, None
-    file.changers.clear()
-    file.blocks.close_reader()
-    card.tell_changed(file.path)
-    if stale:
-        reading.lose_base(card, file)

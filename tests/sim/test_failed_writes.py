@@ -350,6 +350,18 @@ async def test_truncating_by_name_is_undone_and_leaves_nothing(here: Rig) -> Non
     assert here.files() == {FILE: OLD}
 
 
+async def test_a_truncation_by_name_that_is_interrupted_leaves_nothing(here: Rig) -> None:
+    tree = await mount(here)
+    here.faults.cut_after(6)
+    with trio.move_on_after(2.0) as scope:
+        await tree.truncate(FILE, 2_000)
+    assert scope.cancelled_caught
+    here.faults.cut_after(None)
+    await trio.sleep(300)
+    assert (tree.undelivered(), tree.broken()) == ([], [])
+    assert here.files() == {FILE: OLD}
+
+
 @pytest.mark.parametrize("path", [FILE, FRESH])
 async def test_what_is_taken_back_leaves_nothing_here_either(each: Rig, path: bytes) -> None:
     """As `put` and the library do: what they sent is still where it came from."""

@@ -330,6 +330,38 @@ async def test_a_file_without_a_name_waits_for_no_vehicle(here: Rig, over: bool)
     assert (tree.undelivered(), tree.status()["bytes_held"]) == ([], 0)
 
 
+async def test_a_writer_that_waits_goes_on_when_its_file_is_removed() -> None:
+    link = LinkSettings(rate=4_000.0, delay=0.02)
+    async with rig("px4", {OTHER: DATA}, link=link) as here:
+        tree = here.mount()
+        file, done = await tree.create(NEW, exclusive=True), trio.Event()
+
+        async def fill() -> None:
+            for number in range(40):
+                await file.write(number * PIECE, content(PIECE))
+            done.set()
+
+        here.nursery.start_soon(fill)
+        await trio.sleep(30)
+        assert not done.is_set()
+        await tree.unlink(NEW)
+        with trio.fail_after(0.5):
+            await done.wait()
+        file.close()
+
+
+async def test_zeros_that_a_program_made_are_not_fetched(here: Rig, tree: Tree) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.truncate(100_000)
+    await file.write(100_000, b"end")
+    await file.fsync()
+    assert bytes(await file.read(0, 1000)) == bytes(1000)
+    await file.write(100_000, b"END")
+    await file.release()
+    assert here.data(NEW) == bytes(100_000) + b"END"
+    assert here.count(Opcode.READ_FILE, Opcode.BURST_READ_FILE) == 0
+
+
 # --- a file that was replaced while it was open gives ESTALE for good
 
 OLD, LATER = b"old" * 300, b"NEW" * 300

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 import pytest
 import trio
@@ -14,6 +15,7 @@ import trio
 from mavftpfs.cache import reading
 from mavftpfs.cache.handles import ReadHandle
 from mavftpfs.cache.tree import OpenFile, Tree
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import Armed, FileChanged
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -298,3 +300,108 @@ async def test_a_truncation_by_name_that_notices_another_file_tells_those_who_re
             await read_on(handle, STEP)
         assert await copy(tree) == NEW[: len(OLD)]
         handle.close()
+
+
+LARGE, CHANGE = 300_000, b"x" * 100
+ONE, TWO = content(LARGE, 5), content(LARGE, 6)
+QUICK = ConnectOptions(op_deadline=5.0)
+
+
+async def replace_while_the_rest_is_fetched(here: Rig) -> None:
+    """Be silent in the middle of fetching, of which the program hears nothing, and have the file replaced."""
+    here.faults.cut_after(700)
+    await trio.sleep(20)
+    here.faults.cut_after(None)
+    here.replace(PATH, TWO, THEN + 100)
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+async def test_the_rest_of_a_changed_file_is_of_one_version(profile: str) -> None:
+    """px4: listings tell no times."""
+    files = {PATH: ONE, b"/large": content(2_000_000, 9)}
+    async with rig(profile, files, options=QUICK) as here:
+        tree = here.mount(op_deadline=5.0, cache_size=1 << 20)
+        file = await tree.open(PATH, write=True)
+        await file.write(290_000, CHANGE)
+        await replace_while_the_rest_is_fetched(here)
+        await copy(tree, b"/large")  # the blocks of the file leave the cache
+        with pytest.raises(FileChanged):
+            await file.flush()
+        await trio.sleep(100)
+        assert here.data(PATH) == TWO
+        file.close()
+
+
+@pytest.mark.parametrize("when", ["never", "before", "meanwhile"])
+async def test_the_rest_of_a_file_that_is_cut_is_of_one_version(when: str) -> None:
+    """Listings tell no times; nothing leaves the cache."""
+    async with rig("px4", {PATH: ONE}, options=QUICK) as here:
+        tree = here.mount(op_deadline=5.0)
+        file = await tree.open(PATH, write=True)
+        if when == "before":
+            await file.truncate(250_000)
+        await file.write(1_000, CHANGE)
+        await replace_while_the_rest_is_fetched(here)
+        if when == "meanwhile":
+            await file.truncate(250_000)
+        with pytest.raises(FileChanged):
+            await file.release()
+        await trio.sleep(60)
+        assert here.data(PATH) == TWO
+
+
+async def test_bytes_that_are_read_before_a_file_is_cut_are_not_mixed_with_its_successors() -> None:
+    async with rig("px4", {PATH: ONE}) as here:
+        tree = here.mount()
+        file = await tree.open(PATH, write=True)
+        assert bytes(await file.read(0, STEP)) == ONE[:STEP]
+        here.replace(PATH, TWO, THEN + 100)
+        await file.truncate(250_000)
+        await file.write(1_000, CHANGE)
+        with pytest.raises(FileChanged):
+            await file.release()
+        assert here.data(PATH) == TWO
+
+
+async def test_fetched_bytes_that_come_late_do_not_fill_the_next_version(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A listing of a long directory is waited for, and meanwhile the program writes another file."""
+    async with mounted("mavsdk") as (here, tree):
+        file = await tree.open(PATH, write=True)
+        await file.write(40_000, CHANGE)
+        prove, proceed, entered = reading._prove, trio.Event(), trio.Event()
+
+        async def slow(*args: Any, **kwargs: Any) -> None:
+            entered.set()
+            await proceed.wait()
+            await prove(*args, **kwargs)
+
+        monkeypatch.setattr(reading, "_prove", slow)
+        await entered.wait()
+        monkeypatch.setattr(reading, "_prove", prove)
+        await file.truncate(0)
+        await file.write(40_000, b"y" * 10_000)
+        await file.fsync()
+        expected = bytes(40_000) + b"y" * 10_000
+        assert here.data(PATH) == expected
+        proceed.set()
+        await trio.sleep(10)
+        assert bytes(await file.read(0, 50_000)) == expected
+        await file.write(49_000, b"z")
+        await file.release()
+        assert here.data(PATH) == expected[:49_000] + b"z" + expected[49_001:]
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_a_program_that_read_the_end_first_gets_one_version(profile: str) -> None:
+    """As unzip reads. No later read of the end proves its bytes."""
+    async with opened(profile) as (here, tree, handle):
+        assert await handle.read(len(OLD) - STEP, STEP) == OLD[-STEP:]
+        listing = tree._card.directories.known(split(PATH)[0])
+        assert listing is not None
+        listing.ended_at = float("inf")
+        await trio.sleep(IDLE)
+        replace(here)
+        with pytest.raises(FileChanged):
+            await handle.read(0, STEP)
