@@ -37,6 +37,8 @@ NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
 _QUEUE = 5
 """Requests that may wait; the server drops more silently."""
+LATENCY = 0.010
+"""Seconds from an idle queue to the first answer."""
 _STEAL_AFTER = 3.0
 """Seconds without a request after which another client may take a session."""
 
@@ -296,7 +298,7 @@ class ArduPilot(Firmware):
             return
         self._queue.append(parse(wire, source))
         if self._wake is None:
-            self._wake = now + self.profile.latency
+            self._wake = now + LATENCY
 
     def advance(self, now: float) -> None:
         """See Firmware."""

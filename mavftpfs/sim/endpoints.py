@@ -15,7 +15,6 @@ import sys
 import tty
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from dataclasses import replace
 from io import FileIO
 from typing import TextIO
 
@@ -199,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
         LinkClosed: the link cannot be opened.
     """
     rng = random.Random(args.seed)
-    profile = replace(PROFILES[args.profile], longest_reply=args.clamp)
+    profile = PROFILES[args.profile]
     try:
         tree = DirectoryTree(args.directory)
     except OSError as exc:
@@ -219,7 +218,6 @@ def run(args: argparse.Namespace) -> int:
         address=AUTOPILOT._replace(system=args.system),
         telemetry=args.telemetry,
         armed=args.armed,
-        tells_storage=args.tells_storage,
     )
     trio.run(_serve, args.link, vehicle, model, sys.stdout)
     return 0

@@ -55,14 +55,10 @@ class Profile:
     # Requests
     list_with_time: bool = False
     """The server answers opcode 16; otherwise that is an unknown opcode."""
-    bare_time_directories: bool = False
-    """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
     unknown_code: int = 7
     """NAK code for an unknown opcode (ArduPilot before mid-2026: 1)."""
     virtual_trees: tuple[bytes, ...] = ()
     """The `@` trees that exist (ArduPilot, PX4 of 2026)."""
-    exact_virtual_sizes: bool = False
-    """Sizes of generated files are right (PX4 of 2026: @PARAM/param.pck)."""
     double_nul: bool = False
     """Listing entries end in two zero bytes (ArduPilot before mid-2026)."""
     drop_long_names: bool = False
@@ -77,9 +73,6 @@ class Profile:
     longest_reply: int = MAX_DATA
     """Data bytes of a reply to a read or a burst at most. PX4 may send less over a radio (servers.md 7)."""
 
-    tells_storage: bool = True
-    """The vehicle sends STORAGE_INFORMATION on request (MAVSDK's server does not)."""
-
     # Sessions
     sessions: int = 1
     idle_close: float | None = None
@@ -88,29 +81,20 @@ class Profile:
     """OpenFileWO cuts the file to nothing (MAVSDK)."""
     write_only_creates: bool = True
     """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
-    open_replaces: bool = False
-    """An open closes any other client's file (PX4 of September 2026); otherwise the server refuses it."""
-    checks_sender: bool = False
-    """The server repeats an answer only to the client that asked, and without stray bytes (PX4 of September
-    2026)."""
 
     # PX4
+    of_2026: bool = False
+    """PX4 of September 2026. An open closes any other client's file; earlier versions refuse it. The server
+    repeats an answer only to the client that asked, and without stray bytes. A path with `..` in it is
+    protected. Bursts and writes with no file open are InvalidSession, and reading no bytes is EOF; earlier,
+    session 0 is enough. The scratch buffer is not freed after 2 s, and the whitelist for writes looks at the
+    open file's path. Opcode 16 lists directories as a bare D<name>. @PARAM/param.pck has its right size."""
     logs: bytes = b""
-    """The directory that `@MAV_LOG` names (PX4 of 2026)."""
-    refuses_parent: bool = False
-    """A path with `..` in it is protected (PX4 of September 2026)."""
-    needs_open_file: bool = False
-    """Bursts and writes with no file open are InvalidSession, and reading no bytes is EOF (PX4 of September
-    2026); otherwise session 0 is enough."""
-    keeps_buffers: bool = False
-    """The scratch buffer is not freed after 2 s, and the whitelist for writes looks at the open file's path
-    (PX4 of September 2026)."""
+    """The directory that `@MAV_LOG` names."""
     writable_root: bytes = b""
     """Writes must start with this; the check looks at a scratch buffer (servers.md 8)."""
 
     # Timing
-    latency: float = 0.010
-    """ArduPilot: from an idle queue to the first answer."""
     request_cost: float = 0.0
     """Time each request takes, during which the server does nothing else."""
     stall_chance: float = 0.0
@@ -184,7 +168,6 @@ _MAVSDK = Profile(
     name="mavsdk",
     family=Family.MAVSDK,
     about="MAVSDK's own server: one session, times, no size of the card",
-    tells_storage=False,
     list_with_time=True,
     path_limit=239,
     write_only_truncates=True,
@@ -216,16 +199,10 @@ _ALL = (
         version=0x01120000,
         log_place="log",
         idle_close=30.0,
-        open_replaces=True,
-        checks_sender=True,
+        of_2026=True,
         logs=b"/log",
-        refuses_parent=True,
-        needs_open_file=True,
-        keeps_buffers=True,
         list_with_time=True,
-        bare_time_directories=True,
         virtual_trees=(b"@PARAM",),
-        exact_virtual_sizes=True,
     ),
     _ARDUPILOT,
     _ARDUPILOT5,

@@ -211,7 +211,7 @@ class Px4(px4ops.PathRequests):
         if not (idle and lately and quick and self._started is not None):
             return False
         repeated = self._cached is not None and HEADER.unpack_from(wire)[0] + 1 == self._cached_seq
-        named = self._path if self.profile.keeps_buffers else self.scratch
+        named = self._path if self.profile.of_2026 else self.scratch
         return not repeated and not (self._writing and self.is_protected(named))
 
     def _wait(self, wire: bytes, source: Address) -> None:
@@ -257,7 +257,7 @@ class Px4(px4ops.PathRequests):
 
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         seq, session, opcode, size, _, _, offset = fields = HEADER.unpack_from(wire)
-        if now - self._last_request > _BUFFER_LIFE and not self.profile.keeps_buffers:
+        if now - self._last_request > _BUFFER_LIFE and not self.profile.of_2026:
             self.scratch = b""  # freed, and allocated again without initialisation
         self._last_request = now
         if size > MAX_DATA:
@@ -275,7 +275,7 @@ class Px4(px4ops.PathRequests):
         """Return whether the last answer was to a request with this number."""
         if self._cached is None or seq + 1 != self._cached_seq:
             return False
-        return source == self._cached_target or not self.profile.checks_sender
+        return source == self._cached_target or not self.profile.of_2026
 
     def _dispatch(self, request: Request, wire: bytes, now: float) -> None:
         try:
@@ -338,7 +338,7 @@ class Px4(px4ops.PathRequests):
         assert self._cached is not None
         self.replays += 1
         missing = MAX_DATA - _CACHED_DATA
-        behind = bytes(missing) if self.profile.checks_sender else self.rng.randbytes(missing)
+        behind = bytes(missing) if self.profile.of_2026 else self.rng.randbytes(missing)
         self._transmit(self._cached_target, self._cached + behind, now)
 
     def cost(self, opcode: int) -> float:
@@ -403,7 +403,7 @@ class Px4(px4ops.PathRequests):
     def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
         """Open a file. The ACK reports the size before a truncation, and later reads end at that size."""
         if self._file is not None:
-            if not self.profile.open_replaces:
+            if not self.profile.of_2026:
                 raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
             self._close()
         self.scratch = path
@@ -422,7 +422,7 @@ class Px4(px4ops.PathRequests):
         seq, session, opcode, size, _, complete, offset = fields
         try:
             data = self._file.read(offset, size)
-            if not data and self.profile.needs_open_file:
+            if not data and self.profile.of_2026:
                 raise Refusal(_EOF)
         except Refusal as refusal:
             self._reply(source, wire, self._refuse(refusal.code), now)
@@ -444,7 +444,7 @@ class Px4(px4ops.PathRequests):
         raise OSError(errno.EACCES if nuttx else errno.EBADF, "opened for writing")
 
     def _check_session(self, session: int) -> None:
-        if self._file is None and (session != 0 or self.profile.needs_open_file):
+        if self._file is None and (session != 0 or self.profile.of_2026):
             raise Refusal(NakCode.INVALID_SESSION)
 
     def _write(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
@@ -466,7 +466,7 @@ class Px4(px4ops.PathRequests):
 
     def _check_write(self, session: int) -> None:
         self._check_session(session)
-        self.check_writable(self._path if self.profile.keeps_buffers else self.scratch)
+        self.check_writable(self._path if self.profile.of_2026 else self.scratch)
         if self._file is None or not self._writing:
             raise OSError(errno.EBADF, "not open for writing")
 

@@ -48,7 +48,7 @@ class PathRequests(Firmware):
 
     def resolve(self, path: bytes) -> bytes:
         """Return the server's path for a client's path."""
-        if self.profile.refuses_parent and b".." in path.split(b"/"):
+        if self.profile.of_2026 and b".." in path.split(b"/"):
             raise Refusal(NakCode.FILE_PROTECTED)
         if self.profile.logs and path.startswith(_LOGS):
             return self.profile.logs + path[len(_LOGS) :]
@@ -182,7 +182,7 @@ def _entry_text(profile: Profile, directory: bytes, entry: TreeEntry, with_time:
         text = b"F%b\t%d" % (name, size)
         return text + b"\t%d" % stat.mtime if with_time else text
     if stat.kind is Kind.DIRECTORY and name not in (b".", b".."):
-        if with_time and not profile.bare_time_directories:
+        if with_time and not profile.of_2026:
             return b"D%b\t0\t%d" % (name, stat.mtime)
         return b"D" + name
     return b"S"

@@ -51,7 +51,7 @@ class Storage:
         self._rng = rng
         self._fat = self.kind in (profiles.Storage.FATFS, profiles.Storage.NUTTX_FAT)
         self.virtual = virtual or VirtualTrees(
-            profile.virtual_trees, exact=profile.exact_virtual_sizes, says_so=profile.sessions > 1
+            profile.virtual_trees, exact=profile.of_2026, says_so=profile.sessions > 1
         )
         self._writing: weakref.WeakSet[_FatFile] = weakref.WeakSet()
 

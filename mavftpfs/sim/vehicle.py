@@ -150,7 +150,6 @@ class SimVehicle:
     Args:
         telemetry: bytes per second of other messages beside heartbeat and system time.
         armed: at the start; after a reboot it is always disarmed.
-        tells_storage: whether it answers a request for STORAGE_INFORMATION; None: as the profile does.
         signing_key: as for Framer.
 
     Attributes:
@@ -168,7 +167,6 @@ class SimVehicle:
         address: Address = AUTOPILOT,
         telemetry: float = 0.0,
         armed: bool = False,
-        tells_storage: bool | None = None,
         signing_key: bytes | None = None,
     ) -> None:
         self.server = FtpServer(tree, profile, rng=rng)
@@ -179,7 +177,6 @@ class SimVehicle:
         self.armed = armed
         self.tells_time = True
         self.on_news: Callable[[], None] = lambda: None
-        self.tells_storage = profile.tells_storage if tells_storage is None else tells_storage
         self.heard: dict[Address, Heartbeat] = {}
         self._uid = rng.getrandbits(64) ^ address.system  # differs for a second vehicle of the same seed
         self._booted_at: float | None = None
@@ -327,7 +324,7 @@ class SimVehicle:
             frame = self._version()
         elif asks and wanted == SYSTEM_TIME_ID:
             frame = self._system_time(now)
-        elif asks and wanted == STORAGE_INFORMATION_ID and self.tells_storage:
+        elif asks and wanted == STORAGE_INFORMATION_ID and self.profile.family is not Family.MAVSDK:
             size = (CAPACITY_MIB, CAPACITY_MIB / 4, CAPACITY_MIB * 3 / 4)
             frame = self.framer.encode("storage_information", self._boot_ms(now), 1, 1, 2, *size, 0, 0)
         result = _UNSUPPORTED if frame is None else _ACCEPTED

@@ -13,6 +13,7 @@ import pytest
 import trio
 
 from mavftpfs.session.connection import Connection
+from mavftpfs.sim.ardupilot import LATENCY
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.rigs import Rig
@@ -174,7 +175,7 @@ async def test_nobody_waits_long_beside_a_copy(way: str, what: str, profile: str
     copy = Copy(profile, LINKS[link], samples=SAMPLES if "radio" in link else FEWER)
     async with copy.rig.connected() as connection:
         waits = await (copy.waits if way == "download" else copy.waits_beside_upload)(connection, what)
-    working = PROFILES[profile].latency if link.startswith("far") and profile in SHORT_QUEUES else 0.0
+    working = LATENCY if link.startswith("far") and profile in SHORT_QUEUES else 0.0
     assert p95(waits) <= copy.allowed(way, FRAMES[what], working=working)
 
 

@@ -121,10 +121,8 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
     assert [(f.source, f.target) for f in of(FtpRun, client.hear(0.5))] == [(DRONE, gcs)]
 
 
-@pytest.mark.parametrize(
-    ("client", "told"), [(Client("px4"), 1), (Client("mavsdk"), 0), (Client("px4", tells_storage=False), 0)]
-)
-def test_the_size_of_the_card_is_told_by_profile_unless_told_otherwise(client: Client, told: int) -> None:
+@pytest.mark.parametrize(("client", "told"), [(Client("px4"), 1), (Client("mavsdk"), 0)])
+def test_the_size_of_the_card_is_told_by_autopilots(client: Client, told: int) -> None:
     client.tell(client.framer.encode_request_message(DRONE, STORAGE_INFORMATION_ID))
     assert len(of(StorageInformation, client.hear())) == told
 
