@@ -35,7 +35,6 @@ class LinkStats:
 
     received_bytes: int = 0
     sent_bytes: int = 0
-    writes: int = 0
     dropped_sends: int = 0
     reopened: int = 0
 

@@ -325,8 +325,8 @@ class Framer(FrameBuffer[Message]):
                 case 253:
                     message = StatusText(source, str(m.text).partition("\0")[0])
                 case 261:
-                    size = (m.total_capacity, m.used_capacity, m.available_capacity)
-                    message = StorageInformation(source, m.storage_id, m.storage_count, m.status, *size)
+                    size = (m.total_capacity, m.available_capacity)
+                    message = StorageInformation(source, m.storage_id, *size)
         except (dialect.MAVError, AttributeError, TypeError, ValueError):
             return  # whole and valid, but its fields make no sense
         out.append(message)

@@ -78,10 +78,7 @@ class StorageInformation:
 
     source: Address
     storage_id: int
-    storage_count: int
-    status: int
     total_capacity: float
-    used_capacity: float
     available_capacity: float
 
 

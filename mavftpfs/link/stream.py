@@ -140,5 +140,4 @@ class StreamLink(PipeLink):
             self._drop_pipe()
             return len(data)
         self.stats.sent_bytes += sent
-        self.stats.writes += 1
         return sent

@@ -78,7 +78,6 @@ class UdpLink(PipeLink):
         except OSError:  # no route or no buffer, and waiting would not help
             self.stats.dropped_sends += 1
             return len(data)
-        self.stats.writes += 1
         self.stats.sent_bytes += sent
         return sent
 

@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from mavftpfs.parameters.values import WIDTHS, Kind, Number, Parameter
+from mavftpfs.parameters.values import WIDTHS, Kind, Parameter
 from mavftpfs.shared.errors import RemoteProtocolError
 
 MAGIC = 0x671B
@@ -97,11 +97,6 @@ def _unpack_entry(data: bytes, at: int, last: bytes) -> tuple[Parameter, bytes, 
         raise RemoteProtocolError(f"the parameter file has an unknown type at byte {at}") from None
 
 
-def pack_value(kind: Kind, value: Number) -> bytes:
-    """Return the bytes of a value that fits its type."""
-    return _VALUES[kind].pack(value)
-
-
 def pack_upload(parameters: Sequence[Parameter]) -> list[bytes]:
     """Return an upload that sets these values, in pieces that no request may split: the header with the
     first entry, then one entry each.
@@ -121,7 +116,8 @@ def _entries(parameters: Sequence[Parameter]) -> Iterator[bytes]:
         name = parameter.name.encode("ascii")
         shared = _shared(last, name)
         lengths = shared | (len(name) - shared - 1) << 4
-        yield bytes([parameter.kind, lengths]) + name[shared:] + pack_value(parameter.kind, parameter.value)
+        value = _VALUES[parameter.kind].pack(parameter.value)
+        yield bytes([parameter.kind, lengths]) + name[shared:] + value
         last = name
 
 

@@ -27,11 +27,6 @@ class Kind(IntEnum):
     FLOAT = 4
 
     @property
-    def width(self) -> int:
-        """Bytes of a value."""
-        return WIDTHS[self]
-
-    @property
     def mavlink(self) -> int:
         """The number of the same type in MAVLink messages (MAV_PARAM_TYPE)."""
         return _MAVLINK[self]
@@ -128,7 +123,7 @@ def fit(kind: Kind, number: Number) -> Number:
             return nearest_float(number)
         except OverflowError:
             raise BadValue(f"{str(number)[:20]} is too large for a 32-bit float") from None
-    most = 1 << (8 * kind.width - 1)
+    most = 1 << (8 * WIDTHS[kind] - 1)
     if isinstance(number, float) and not number.is_integer():
         raise BadValue(f"{number} is not a whole number, and this is {_SAID[kind]}")
     if not -most <= number < most:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mavftpfs.parameters.packed import HEADER, MAGIC, MAGIC_DEFAULTS, pack_upload, unpack
 from mavftpfs.parameters.text import parse, render_all, render_changed, render_qgc
-from mavftpfs.parameters.values import Kind, Parameter, fit, float_text, same
+from mavftpfs.parameters.values import WIDTHS, Kind, Parameter, fit, float_text, same
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.sim.parameters import Parameter as Served
 from mavftpfs.sim.parameters import Selection, Table
@@ -23,7 +23,7 @@ NAMES = st.text(LETTERS, min_size=1, max_size=MAX_NAME).filter(lambda name: not 
 def value_of(kind: Kind) -> st.SearchStrategy[int | float]:
     if kind is Kind.FLOAT:
         return FLOATS
-    most = 1 << (8 * kind.width - 1)
+    most = 1 << (8 * WIDTHS[kind] - 1)
     return st.integers(-most, most - 1)
 
 

@@ -69,7 +69,7 @@ MESSAGES: list[tuple[Any, Message]] = [
     ),
     (
         drone().storage_information_encode(5, 1, 2, 2, 1024.0, 24.0, 1000.0, 0.0, 0.0),
-        StorageInformation(DRONE, 1, 2, 2, 1024.0, 24.0, 1000.0),
+        StorageInformation(DRONE, 1, 1024.0, 1000.0),
     ),
     (drone().attitude_encode(1, 0, 0, 0, 0, 0, 0), Other(DRONE, 30)),
 ]

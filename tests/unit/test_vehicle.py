@@ -192,8 +192,8 @@ def test_facts_are_taken_from_the_target_alone() -> None:
     assert vehicle.ftp_flag is None
     vehicle.on_message(OURS, 0.0)
     assert vehicle.ftp_flag is True
-    vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
-    vehicle.on_message(StorageInformation(PILOT, 1, 2, 2, 16.0, 1.0, 15.0), 0.0)
-    vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
+    vehicle.on_message(StorageInformation(PILOT, 2, 8.0, 7.0), 0.0)
+    vehicle.on_message(StorageInformation(PILOT, 1, 16.0, 15.0), 0.0)
+    vehicle.on_message(StorageInformation(PILOT, 2, 8.0, 7.0), 0.0)
     assert vehicle.storage is not None
     assert vehicle.storage.total_capacity == 16.0
