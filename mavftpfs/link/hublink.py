@@ -170,10 +170,6 @@ class HubLink(PipeLink):
         return len(data)
 
 
-class Refused(LinkClosed):
-    """The hub refuses a program; the text gives the reason."""
-
-
 async def join(sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: Seat | None) -> HubLink:
     """Ask the program at the other end of a socket for a share of the port; return the link once the hub
     grants it.
@@ -181,9 +177,8 @@ async def join(sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: S
     seat: the seat until now.
 
     Raises:
-        Refused: the hub refuses; the text gives the reason.
         Busy: the other program ended, or is about to start the hub: call again.
-        LinkClosed: the other program does not answer.
+        LinkClosed: the hub refuses, and the text gives the reason; or the other program does not answer.
     """
     hello = {
         "protocol": PROTOCOL,
@@ -203,7 +198,7 @@ async def join(sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: S
                 f"{spec.description}: process {peer_of(sock).pid} has this port and does not answer; end it"
             )
         if "refused" in reply:
-            raise Refused(str(reply["refused"]))
+            raise LinkClosed(str(reply["refused"]))
         if "own" not in reply:
             raise Busy(f"{spec.description}: the program that had this port ended")
         link = HubLink(sock, spec.description, _OUTBOX_LIMIT)

@@ -129,12 +129,10 @@ class Page(NamedTuple):
     """The content of one page.
 
     strings: number of its non-empty strings, by which the next page's offset grows (servers.md 14.28).
-    unshown: how many of them name something that cannot be shown.
     """
 
     entries: list[DirEntry]
     strings: int
-    unshown: int
 
 
 def parse_page(data: bytes, *, with_time: bool = False) -> Page:
@@ -143,7 +141,7 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
     A last string without NUL counts: a server that fills all 239 bytes may have cut the NUL only.
     """
     entries: list[DirEntry] = []
-    strings = unshown = 0
+    strings = 0
     for text in data.split(b"\0"):
         if not text:
             continue
@@ -157,9 +155,7 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
             size = int(fields[0]) if fields and kind is EntryKind.FILE else 0
             mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
             entries.append(DirEntry(name, kind, size, mtime or None))
-        elif text[:1] != b"S" and name not in (b".", b".."):
-            unshown += 1  # neither a skip mark, nor the directory itself or its parent
-    return Page(entries, strings, unshown)
+    return Page(entries, strings)
 
 
 class ListDirectory(Operation):
@@ -176,7 +172,6 @@ class ListDirectory(Operation):
         complete: False when a cap, empty pages or a name that fits no reply hid something: absence of a name
             then proves nothing.
         end: the offset at which the server said EOF, and behind which it has nothing; None if not known.
-        unshown: names that cannot be shown (with a slash, a tab, or unparsable).
         strings: how many strings were received so far, which is where the next page begins.
         on_page: called for each page, where it is not None.
 
@@ -195,7 +190,6 @@ class ListDirectory(Operation):
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
         self.entries: list[DirEntry] = []
         self.complete = True
-        self.unshown = 0
         self.on_page: Callable[[], None] | None = None
         self._path = path
         self._with_time = with_time
@@ -258,7 +252,6 @@ class ListDirectory(Operation):
             self.finish()
             return
         self.strings += page.strings
-        self.unshown += page.unshown
         known = len(self._names)
         for entry in page.entries:  # a page may name something twice, too
             if entry.name not in self._names:

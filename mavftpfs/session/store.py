@@ -168,7 +168,7 @@ class Store:
                 traits.lists_times = False
         entries = tuple(operation.entries)
         took = self._clock() - started
-        return Listing(entries, took, operation.complete, operation.unshown, operation.end)
+        return Listing(entries, took, operation.complete, operation.end)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None

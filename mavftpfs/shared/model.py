@@ -47,13 +47,12 @@ class Listing:
     """A whole directory, without duplicates and unusable names.
 
     took: seconds that the sweep needed. complete: False if the vehicle did not show everything, so that
-    absence proves nothing. unshown: number of names that could not be shown. end: see ListDirectory.
+    absence proves nothing. end: see ListDirectory.
     """
 
     entries: tuple[DirEntry, ...]
     took: float
     complete: bool = True
-    unshown: int = 0
     end: int | None = None
 
 

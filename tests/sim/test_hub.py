@@ -21,7 +21,6 @@ from mavftpfs.link.hublink import (
     Facts,
     HubLink,
     PortRequest,
-    Refused,
     hear,
     join,
     pack_facts,
@@ -134,7 +133,7 @@ async def test_of_two_programs_that_want_an_endpoint_that_cannot_be_both_are_tol
     trio.socket.set_custom_hostname_resolver(SlowNames())
 
     async def is_refused() -> None:
-        with pytest.raises(Refused, match="unknown"):
+        with pytest.raises(LinkClosed, match="unknown"):
             await here.joined(endpoint)
 
     endpoint = f"udpout:nowhere.example:{free_udp_port()}"
@@ -174,7 +173,7 @@ async def test_no_more_programs_are_let_in_than_there_are_addresses(
     async with running() as here, AsyncExitStack() as stack:
         for _ in range(248):
             stack.push_async_callback((await here.joined()).aclose)
-        with pytest.raises(Refused, match="249 programs"):
+        with pytest.raises(LinkClosed, match="249 programs"):
             await here.joined()
         clients = (await here.status())["clients"]
         assert len({tuple(client["address"]) for client in clients}) == 249
@@ -222,7 +221,7 @@ async def test_only_the_same_port_is_shared(autojump_clock: trio.testing.MockClo
     async with running() as here:
         anywhere, elsewhere = (here.source.replace(HOST, host) for host in ("0.0.0.0", "127.0.0.2"))
         await (await here.joined(source=anywhere)).aclose()
-        with pytest.raises(Refused, match="is shared already"):
+        with pytest.raises(LinkClosed, match="is shared already"):
             await here.joined(source=elsewhere)
 
 
