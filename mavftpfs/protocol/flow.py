@@ -184,6 +184,7 @@ class Flow:
         self._bucket.rate = self._bwlimit
         self._cost = float(FULL)  # bytes that a usual request and its answer take on the link
         self._hurried, self._ready_at, self.sent_at = False, inf, -inf
+        self._lacks = -inf  # bytes that the bucket has to hold before one more request goes out
         self._starting, self._flat = True, 0
         self._before_silence = 0
         # What is known of the path.
@@ -226,6 +227,7 @@ class Flow:
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
+        self._lacks = -inf
         capped = self._queues_few and not (paced and self.alone)
         window = self.cap if capped and not self._before_silence else self.window
         room = window - in_flight
@@ -261,7 +263,9 @@ class Flow:
         if level >= room * cost:
             return room
         room = max(0, int(level / cost))
-        self._ready_at = min(self._ready_at, self._bucket.holds_at((room + 1) * cost - overdraft))
+        self._lacks = cost - overdraft
+        if not room:
+            self._ready_at = min(self._ready_at, self._bucket.holds_at(self._lacks))
         self.limited = self._bucket.rate == self._bwlimit
         self._round.starved |= self.limited
         return room
@@ -281,6 +285,8 @@ class Flow:
         they and their answers carry, at most."""
         self._bucket.charge(count * OVERHEAD + size)
         self.sent_at = now
+        if self._bucket.level(now) < self._lacks:  # otherwise there was room for more, and nothing to send
+            self._ready_at = min(self._ready_at, self._bucket.holds_at(self._lacks))
 
     def on_starved(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""

@@ -346,6 +346,16 @@ def test_a_low_limit_does_not_hide_that_the_vehicle_is_silent(bwlimit: float) ->
     assert now == pytest.approx(30.0)
 
 
+def test_who_waits_for_one_answer_is_not_woken_before_its_timer() -> None:
+    """With room for more requests than the bucket ever holds, the engine was once woken every few us."""
+    engine = make()
+    engine.flow._bucket.rate = 1e8
+    asked(engine)
+    for now in (0.0, 0.1, 0.9):
+        assert sent(engine, now) == []
+        assert engine.next_deadline() == pytest.approx(1.0)
+
+
 # --- window and priority
 
 
