@@ -267,7 +267,8 @@ def on_delivered(card: Card, file: File, sent: Known) -> None:
         crc32 = file.crc32()
     file.on(Event.PLACED)
     file.base, file.unsure = Known(file.size, crc32=crc32), None
-    file.prove(card.clock())
+    file.fresh_at = card.clock()
+    file.prove(file.fresh_at)
     file.content.on_delivered()
     file.blocks.close_reader()
     file.blocks.drop()

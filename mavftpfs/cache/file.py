@@ -108,7 +108,8 @@ class File(Entry):
     Attributes:
         content: its bytes. state: see State.
         base: what the vehicle is known to have under its name; None if it has nothing there.
-        proven_at: when the vehicle was last seen to have that, by the caches' clock.
+        proven_at: when the vehicle was last seen to have that, by the caches' clock. fresh_at: when it was
+            last opened or delivered, so that no byte here is older.
         attempt: the attempt to send it that is under way.
         unsure: what this mount was placing under the name when it was interrupted.
         changes: counts the changes of the content. failed_at: that count when a delivery last failed.
@@ -129,7 +130,7 @@ class File(Entry):
         self.content = Content(Blocks(cache))
         self.state = State.CLEAN
         self.base: Known | None = None
-        self.proven_at = NEVER
+        self.proven_at = self.fresh_at = NEVER
         self.attempt: Attempt | None = None
         self.error: MavftpfsError | None = None
         self.handles = self.writers = 0

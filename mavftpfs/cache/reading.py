@@ -2,8 +2,8 @@
 
 **Is what is here still the vehicle's file?** An open() decides:
 - yes, if a fresh listing shows the size and the mtime that are known;
-- yes, if that was proven, by the reply to an open or by a listing, less than `dir_timeout` ago, and no later
-  listing contradicts. Then the vehicle is not asked;
+- yes, if that was proven less than `dir_timeout` ago, and no later listing contradicts. Then the vehicle is
+  not asked. Where listings tell no times, only the reply to an open proves it;
 - otherwise the file is opened on the vehicle, and the bytes that are here are forgotten: equal sizes without
   an mtime prove nothing.
 
@@ -103,8 +103,8 @@ def _may_serve(card: Card, file: File, found: Found, answer: Sameness) -> bool:
     if fresh and answer is Sameness.SAME and found.directory.listed_at > card.epoch:
         file.prove(found.directory.listed_at)
         return True
-    recent = card.clock() - file.proven_at < card.options.proof_time
-    return recent and file.proven_at > card.epoch
+    proven_at = file.proven_at if answer is Sameness.SAME else file.fresh_at
+    return card.clock() - proven_at < card.options.proof_time and proven_at > card.epoch
 
 
 async def _open(card: Card, file: File, entry: DirEntry) -> bool | None:
@@ -133,7 +133,8 @@ async def _open(card: Card, file: File, entry: DirEntry) -> bool | None:
     blocks.reader = reader
     file.content.on_opened(reader.size)
     file.base = Known(reader.size, entry.mtime if entry.size == reader.size else None)
-    file.prove(card.clock())
+    file.fresh_at = card.clock()
+    file.prove(file.fresh_at)
     if entry.size != reader.size:  # the kernel was told another one
         card.directories.learn_size(path, reader.size)
         card.tell_changed(path)

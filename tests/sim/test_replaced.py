@@ -112,6 +112,17 @@ async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int | 
         assert await copy(tree) == (NEW[:size] if size else OLD)
 
 
+async def test_listings_without_times_do_not_keep_an_old_version_for_programs_that_open_it() -> None:
+    """A program has the old one open."""
+    async with opened("px4") as (here, tree, handle):
+        await read_on(handle)
+        replace(here)
+        for _ in range(6):
+            await trio.sleep(5.0)
+            await tree.list(split(PATH)[0])
+        assert await copy(tree) == NEW[: len(OLD)]
+
+
 @pytest.mark.parametrize("profile", TIMED)
 @pytest.mark.parametrize("closed", [False, True])
 async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(profile: str, closed: bool) -> None:
