@@ -7,7 +7,6 @@ changes: until a listing shows another size or mtime than the first listing afte
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -25,9 +24,6 @@ MAX_MTIME = 9_000_000_000
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
-
-MAX_TIMES = 100_000
-"""How many mtimes that users set are remembered."""
 
 _LOG_DATE = re.compile(rb"/log/(\d{4})-(\d{2})-(\d{2})(?:/(\d{2})_(\d{2})_(\d{2})[^/]*\.ulg)?\Z")
 
@@ -84,20 +80,17 @@ class _Time:
 
 
 class Times:
-    """mtimes that users set in one folder, by name; the least recently set are forgotten first."""
+    """mtimes that users set in one folder, by name."""
 
     def __init__(self) -> None:
-        self._times: OrderedDict[bytes, _Time] = OrderedDict()
+        self._times: dict[bytes, _Time] = {}
 
     def __len__(self) -> int:
         return len(self._times)
 
     def set(self, name: bytes, nanoseconds: int) -> None:
         """Show this mtime from now on."""
-        self._times.pop(name, None)
         self._times[name] = _Time(nanoseconds)
-        if len(self._times) > MAX_TIMES:
-            self._times.popitem(last=False)
 
     def peek(self, name: bytes) -> int | None:
         """Return the mtime that was set, in nanoseconds, whatever a listing says; for a file with pending

@@ -10,9 +10,8 @@ from mavftpfs.cache.file import File, State
 from mavftpfs.cache.handles import ReadHandle, WriteHandle
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.source import Opening, Source
-from mavftpfs.shared import readonly
-from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotDeliveredYet, NotFound, ReadOnly
-from mavftpfs.shared.model import EntryKind, is_virtual, join, split
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotDeliveredYet, NotFound
+from mavftpfs.shared.model import EntryKind, join, split
 
 
 class CardFiles(Source):
@@ -22,10 +21,6 @@ class CardFiles(Source):
         self._card = card
 
     # --- asking
-
-    def is_only_read(self, path: bytes) -> bool:
-        """See Source."""
-        return is_virtual(path)
 
     async def stat(self, path: bytes) -> Stat:
         """Return attributes; the root's cost no traffic."""
@@ -106,7 +101,6 @@ class CardFiles(Source):
 
     async def _open_for_writing(self, path: bytes, *, truncate: bool) -> WriteHandle:
         card = self._card
-        self._require_writable(path)
         card.require_disarmed()
         await uploads.remove_parts(card, path)
         async with card.paths.hold(path, shared=True):
@@ -122,7 +116,6 @@ class CardFiles(Source):
     async def create(self, path: bytes, *, exclusive: bool) -> WriteHandle:
         """Make a file, or open the one that is there."""
         card = self._card
-        self._require_writable(path)
         card.require_disarmed()
         await uploads.remove_parts(card, path)
         async with card.paths.hold(path, shared=True):
@@ -140,7 +133,6 @@ class CardFiles(Source):
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file, and deliver it, unless another program has it open for writing."""
         card = self._card
-        self._require_writable(path)
         card.require_changeable()
         async with card.paths.hold(path, shared=True):
             file = await writing.for_writing(card, path, truncate=size == 0)
@@ -161,36 +153,26 @@ class CardFiles(Source):
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime until the file changes."""
-        self._require_writable(path)
         folder, name = self._card.root.home(path)
         folder.times.set(name, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory."""
-        self._require_writable(path)
         await namespace.mkdir(self._card, path)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory."""
-        self._require_writable(path)
         await namespace.rmdir(self._card, path)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file."""
-        self._require_writable(path)
         await namespace.unlink(self._card, path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """Rename a file or directory."""
-        self._require_writable(old)
-        self._require_writable(new)
         await namespace.rename(self._card, old, new, noreplace=noreplace)
 
     # --- inside
-
-    def _require_writable(self, path: bytes) -> None:
-        if is_virtual(path):
-            raise ReadOnly(readonly.virtual(path))
 
     def _require_not_root(self, path: bytes) -> None:
         if path == self._card.options.root:

@@ -125,9 +125,6 @@ class Directories:
         self.sweeps = 0
         self._forget_server()
 
-    def __len__(self) -> int:
-        return len(self._recent)
-
     @property
     def entry_count(self) -> int:
         """Names remembered over all listings."""

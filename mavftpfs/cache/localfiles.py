@@ -92,10 +92,6 @@ class LocalFiles(Source):
 
     # --- what the tree asks
 
-    def is_only_read(self, path: bytes) -> bool:
-        """See Source."""
-        return False
-
     async def stat(self, path: bytes) -> Stat:
         """Return attributes. Raises NotFound."""
         return self._stat(self.find(path))

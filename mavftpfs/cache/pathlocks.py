@@ -22,23 +22,14 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 import trio
 
+from mavftpfs.cache.entries import Entry
 from mavftpfs.shared.errors import RequestTimeout
 
 SLACK = 5.0
 """Seconds that a change may take longer than its patience, to find out what became of it."""
-
-
-class Named(Protocol):
-    """A file whose name may change."""
-
-    @property
-    def path(self) -> bytes:
-        """Its present name."""
-        ...
 
 
 class PathLocks:
@@ -81,7 +72,7 @@ class PathLocks:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
 
     @asynccontextmanager
-    async def steady(self, file: Named, *, lasting: bool = False) -> AsyncIterator[bytes]:
+    async def steady(self, file: Entry, *, lasting: bool = False) -> AsyncIterator[bytes]:
         """Keep the path of a file, and those above it, unchanged for a body that opens or delivers the file.
 
         Yields the path, which may have changed before the body begins. lasting: see hold.

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import ReadOnly
 
@@ -28,10 +29,6 @@ class Opening:
 class Source:
     """Where files of one kind come from. Paths are the vehicle's; see Tree for what each call does."""
 
-    def is_only_read(self, path: bytes) -> bool:
-        """Return whether nothing can ever be written at a path, whatever the vehicle does."""
-        return True
-
     async def stat(self, path: bytes) -> Stat:
         """Return attributes."""
         raise NotImplementedError
@@ -41,8 +38,9 @@ class Source:
         raise NotImplementedError
 
     async def crc32(self, path: bytes) -> int:
-        """Return the CRC32 of what a reader gets."""
-        raise NotImplementedError
+        """Return the CRC32 (start value 0, no final xor) of what a reader gets."""
+        file = await self.open(path, Opening())
+        return crc32(await file.read(0, file.size))
 
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file."""

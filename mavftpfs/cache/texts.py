@@ -27,7 +27,6 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.source import Opening, Source
 from mavftpfs.cache.virtual import SnapshotHandle, VirtualTrees
 from mavftpfs.parameters.text import Problem
-from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     FtpNak,
@@ -178,9 +177,10 @@ class Texts(Source, ABC, Generic[B]):
         parent, name = split(path)
         return parent == self.directory and (name in self.names or name == LAST_ERROR)
 
-    def is_only_read(self, path: bytes) -> bool:
-        """See Source."""
-        return split(path)[1] == LAST_ERROR
+    def may_be_written(self, path: bytes) -> bool:
+        """Return whether a path is that of a text that can be saved, or of the texts' directory, in which
+        editors try to make files before they save."""
+        return path == self.directory or (self.owns(path) and split(path)[1] != LAST_ERROR)
 
     async def stat(self, path: bytes) -> Stat:
         """Return attributes. Raises NotFound; else as show."""
@@ -228,12 +228,6 @@ class Texts(Source, ABC, Generic[B]):
                 raise
         shown = await self.show(name, reread=not how.truncate)
         return TextHandle(self, name, shown, how)
-
-    async def crc32(self, path: bytes) -> int:
-        """Return the CRC32 (start value 0, no final xor) of what a reader gets. Raises as show."""
-        name = split(path)[1]
-        text = self.error_text if name == LAST_ERROR else (await self.show(name, reread=False)).text
-        return crc32(text)
 
     def note_other_file(self, program: Program | None) -> None:
         """Note that a program tried to make a file beside the texts."""

@@ -110,9 +110,7 @@ class Tree:
         """Return whether nothing can ever be written at a path, whatever the vehicle does: below `@`
         directories all but the texts, the directories of these and local files. No traffic."""
         remote = self._remote(path)
-        # Editors try to make files in these directories before they save.
-        of_texts = any(remote == texts.directory for texts in self._texts)
-        return not of_texts and self._source(remote).is_only_read(remote)
+        return is_virtual(remote) and not any(texts.may_be_written(remote) for texts in self._texts)
 
     def negative_valid_for(self, path: bytes) -> float:
         """Return for how many seconds a caller may remember that stat(path) raised NotFound.
@@ -341,8 +339,6 @@ class Tree:
             "bytes_local": self._local.used,
             "bytes_cached": cache.bytes_cached + self._virtual.bytes_cached,
             "rate": cache.meter.shown.at(card.clock()),
-            "listings_cached": len(card.directories),
-            "entries_cached": card.directories.entry_count,
             "listings_asked": card.directories.sweeps,
         }
 

@@ -25,7 +25,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.source import Opening, Source
-from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
@@ -239,9 +239,6 @@ class VirtualTrees(Source):
         """
         if how.write:
             self._refuse(path)
-        return await self._open(path)
-
-    async def _open(self, path: bytes) -> SnapshotHandle:
         found = await self._find(path)
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
@@ -268,15 +265,6 @@ class VirtualTrees(Source):
         seen = self._look(path)
         if seen.data is not None:
             self._seen[path] = Seen(seen.data, -math.inf)
-
-    async def crc32(self, path: bytes) -> int:
-        """Return the CRC32 (start value 0, no final xor) of what a reader gets; the vehicle sums other bytes.
-
-        Raises:
-            As open.
-        """
-        handle = await self._open(path)
-        return crc32(await handle.read(0, handle.size))
 
     def forget(self) -> None:
         """Forget all snapshots, and what opened or did not."""

@@ -112,7 +112,7 @@ def test_least_recently_used_listings_go_first() -> None:
         True,
         True,
     ]
-    assert len(directories) == 3
+    assert len(directories._recent) == 3
     assert directories.entry_count == 6
 
 
@@ -134,7 +134,7 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
     assert [sweep.void for sweep in sweeps] == [True, True, False]
     assert directories.entry_count == 2
     directories.forget(b"/")
-    assert (len(directories), directories.entry_count) == (0, 0)
+    assert (len(directories._recent), directories.entry_count) == (0, 0)
 
 
 # --- our own changes
