@@ -25,7 +25,7 @@ from mavftpfs.cli import listing, watching
 from mavftpfs.cli.commands import left_by_killed_mounts_line, say
 from mavftpfs.cli.drawing import shown
 from mavftpfs.client import download, logs, names, upload
-from mavftpfs.client.connect import open_sinks, plain_nursery
+from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.progress import Progress, noting_losses
@@ -40,6 +40,7 @@ from mavftpfs.client.undelivered import (
     recovered_directory,
     recovery_directory,
 )
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.mount import daemon
 from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import (

@@ -24,7 +24,7 @@ from mavftpfs.client.status import snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.undelivered import rescue, spool_for
 from mavftpfs.client.watcher import Watcher
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.hublink import PortRequest
 from mavftpfs.link.messages import OWN_COMPONENT, Address, AutopilotVersion
 from mavftpfs.link.peers import names_of, vehicles_in
@@ -241,21 +241,6 @@ def process_name() -> str:
     path = Path(sys.argv[0] if sys.argv else "")
     name = path.parent.name if path.name == "__main__.py" else path.name
     return f"{'python' if name in ('', '-c') else name} (process {os.getpid()})"
-
-
-@asynccontextmanager
-async def plain_nursery() -> AsyncIterator[trio.Nursery]:
-    """Give a nursery whose tasks end with the body, and which does not wrap the body's errors in a group."""
-    failure: Exception | None = None
-    async with trio.open_nursery() as nursery:
-        try:
-            yield nursery
-        except Exception as error:  # raised again outside
-            failure = error
-        finally:
-            nursery.cancel_scope.cancel()
-    if failure is not None:
-        raise failure
 
 
 async def _list_root(connection: Connection, tree: Tree, deadline: float, options: Options) -> None:

@@ -18,7 +18,7 @@ from typing import NoReturn, Protocol
 import trio
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
+from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer
 from mavftpfs.client.control import NobodyThere
 from mavftpfs.client.mountfiles import MountFiles, connect
 from mavftpfs.client.mounts import (
@@ -31,6 +31,7 @@ from mavftpfs.client.mounts import (
 )
 from mavftpfs.client.several import Unnamed
 from mavftpfs.client.status import Facts
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import HEARD_SOON, Connection

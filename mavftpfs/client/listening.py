@@ -13,7 +13,7 @@ from math import inf
 import trio
 
 from mavftpfs.client.connect import connect_options
-from mavftpfs.link.base import Link, background
+from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
@@ -92,5 +92,6 @@ async def listening(
 ) -> AsyncIterator[Listener]:
     """Listen during the body. on_heard: called with each heartbeat."""
     listener = Listener(link, options, on_heard)
-    async with background(listener.run, trio.lowlevel.checkpoint):
+    async with plain_nursery() as nursery:
+        nursery.start_soon(listener.run)
         yield listener

@@ -11,8 +11,8 @@ from contextlib import asynccontextmanager, suppress
 
 import trio
 
-from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import Session
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.shared.errors import LinkError
 from mavftpfs.shared.speed import Speed
 

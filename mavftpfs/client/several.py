@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import trio
 
-from mavftpfs.client.connect import plain_nursery
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Heartbeat
 from mavftpfs.link.peers import names_of, vehicles_in
 from mavftpfs.shared.errors import UsageError

@@ -16,7 +16,7 @@ from pathlib import Path
 import trio
 
 from mavftpfs.client.compare import Verify
-from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened, plain_nursery
+from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened
 from mavftpfs.client.contact import Contact, Heard, LinkContact, MountContact
 from mavftpfs.client.download import Downloads, Outcome, Reports, named
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
@@ -27,7 +27,7 @@ from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import is_no_log
 from mavftpfs.client.several import ON_COMMAND_LINE
 from mavftpfs.client.watchpolicy import Log, Policy
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected

@@ -7,7 +7,7 @@ import signal
 import trio
 
 from mavftpfs.hub.hub import run_hub
-from mavftpfs.link.base import background
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.uri import LinkSpec, parse_source
 
 
@@ -28,6 +28,7 @@ async def _until_signalled(spec: LinkSpec) -> None:
             async for _ in signals:
                 scope.cancel()
 
-        async with background(watch, trio.lowlevel.checkpoint):
+        async with plain_nursery() as nursery:
+            nursery.start_soon(watch)
             with scope:
                 await run_hub(spec)

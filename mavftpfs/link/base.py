@@ -244,24 +244,33 @@ class PipeLink:
 
 
 @asynccontextmanager
-async def background(
-    task: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]
-) -> AsyncIterator[None]:
-    """Run `task` beside the body; when the body ends, `close` (shielded) and cancel the task.
+async def plain_nursery() -> AsyncIterator[trio.Nursery]:
+    """Give a nursery whose tasks end with the body.
 
     An Exception of the body leaves as itself, while a bare nursery would wrap it in an ExceptionGroup,
-    because callers catch LinkClosed by name.
+    because callers catch errors by name.
     """
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:
-        nursery.start_soon(task)
         try:
-            yield
+            yield nursery
         except Exception as exc:
             failure = exc
         finally:
-            with trio.CancelScope(shield=True):
-                await close()
             nursery.cancel_scope.cancel()
     if failure is not None:
         raise failure
+
+
+@asynccontextmanager
+async def background(
+    task: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]
+) -> AsyncIterator[None]:
+    """Run `task` beside the body; when the body ends, `close` (shielded) and cancel the task."""
+    async with plain_nursery() as nursery:
+        nursery.start_soon(task)
+        try:
+            yield
+        finally:
+            with trio.CancelScope(shield=True):
+                await close()

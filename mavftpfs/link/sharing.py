@@ -22,7 +22,7 @@ import trio
 
 from mavftpfs.link import ports
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import REOPENED, Link, LinkStats, Piece, Seat, background
+from mavftpfs.link.base import REOPENED, Link, LinkStats, Piece, Seat, background, plain_nursery
 from mavftpfs.link.hublink import PROTOCOL, Facts, PortRequest, hear, join, tell
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
@@ -244,25 +244,19 @@ async def open_shared(spec: LinkSpec, wanted: PortRequest) -> AsyncIterator[Link
         async with open_link(spec) as alone:
             yield alone
         return
-    link = SharedLink(spec, wanted)
-    failure: Exception | None = None
-    lasting = trio.CancelScope()
+    link, lasting = SharedLink(spec, wanted), trio.CancelScope()
 
     async def run(task_status: trio.TaskStatus[None]) -> None:
         with lasting:
             await link.run(task_status)
 
-    async with trio.open_nursery() as nursery:
+    async with plain_nursery() as nursery:
+        await nursery.start(run)
+        lasting.shield = True  # a cancelled command (Ctrl-C) still closes the vehicle's session
         try:
-            await nursery.start(run)
-            lasting.shield = True  # a cancelled command (Ctrl-C) still closes the vehicle's session
             yield link
-        except Exception as exc:  # raised again outside the nursery, which would wrap it in a group
-            failure = exc
         finally:
             lasting.cancel()
-    if failure is not None:
-        raise failure
 
 
 def own_environment() -> dict[str, str]:

@@ -19,9 +19,10 @@ from typing import Any
 import trio
 
 from mavftpfs.client import control
-from mavftpfs.client.connect import opened, plain_nursery
+from mavftpfs.client.connect import opened
 from mavftpfs.client.listening import listening
 from mavftpfs.client.mountpoint import is_dead, is_ours, timeout_note
+from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Heartbeat
 from mavftpfs.link.sharing import own_environment
 from mavftpfs.mount import places
@@ -140,15 +141,7 @@ class Supervisor(Life):
     def leave(self) -> None:
         """See Life.leave."""
         assert self._nursery is not None
-        self.enter(State.LEAVING)
-        self._nursery.start_soon(self._leave)
-
-    async def _leave(self) -> None:
-        async with self._ending:
-            if self.state is State.MOUNTED:
-                self.enter(State.LEAVING)
-            await self._end_members(lazy=True)
-        self._left.set()
+        self._nursery.start_soon(partial(self.unmount, lazy=True))
 
     def hurry(self) -> None:
         """See Life.hurry: each vehicle's mount gets a signal of its own."""

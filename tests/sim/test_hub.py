@@ -12,9 +12,8 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.client.connect import plain_nursery
 from mavftpfs.hub.hub import run_hub
-from mavftpfs.link.base import REOPENED
+from mavftpfs.link.base import REOPENED, plain_nursery
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import (
     PROTOCOL,

@@ -15,9 +15,8 @@ import pytest
 import trio
 
 from mavftpfs.cli import ports
-from mavftpfs.client.connect import plain_nursery
 from mavftpfs.link import hublink, sharing
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.hublink import PortRequest
 from mavftpfs.link.messages import Address
