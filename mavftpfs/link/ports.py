@@ -129,7 +129,7 @@ def names_in_use() -> list[str]:
     return sorted({"\0" + found for found in re.findall(rf"@({_PREFIX}\w+)", _NAMES.read_text())})
 
 
-def peer_of(sock: socket.socket) -> Peer:
+def peer_of(sock: socket.socket | trio.socket.SocketType) -> Peer:
     """Return the process at the other end of a Unix socket."""
     layout = struct.Struct("3i")
     return Peer(*layout.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size)))

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import socket
-import struct
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import trio
 
 from mavftpfs.client.control import MAX_LINE, Reply
+from mavftpfs.link.ports import peer_of
 from mavftpfs.mount.fileserver import FileServer
 from mavftpfs.shared.errors import MavftpfsError
 
@@ -39,7 +39,6 @@ MAX_CLIENTS = 8
 _NO_DESCRIPTORS = frozenset((errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM))
 _PAUSE = 0.1
 """Seconds until the next attempt to accept a connection, after no descriptor was free."""
-_CREDENTIALS = struct.Struct("3i")
 
 
 class ControlServer:
@@ -125,16 +124,14 @@ class ControlServer:
 
     async def _serve_line(self, stream: trio.SocketStream) -> tuple[bool, int]:
         """Answer a client's line. Return whether it gets files, and its process."""
-        process, uid, _ = _CREDENTIALS.unpack(
-            stream.socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        )
+        peer = peer_of(stream.socket)
         line = b""
         with trio.move_on_after(ASKING_PATIENCE):
             line = await _receive_line(stream)
-        reply, wants_files = await self._answer(line, uid)
+        reply, wants_files = await self._answer(line, peer.uid)
         with trio.move_on_after(REPLY_PATIENCE):
             await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
-        return wants_files, process
+        return wants_files, peer.pid
 
     async def _answer(self, line: bytes, uid: int) -> tuple[Reply, bool]:
         """Return the reply to a line, and whether it asks for files and gets them."""

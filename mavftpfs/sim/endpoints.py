@@ -79,19 +79,6 @@ class Endpoint:
         if self._scope is not None:
             self._scope.cancel()
 
-    def toggle_cut(self) -> bool:
-        """Cut the link, or restore it; return whether it is cut now."""
-        self.cut = not self.cut
-        return self.cut
-
-    def toggle_armed(self) -> bool:
-        """Arm or disarm the vehicle; return whether it is armed now."""
-        if self.vehicle.armed:
-            self.vehicle.disarm()
-        else:
-            self.vehicle.arm()
-        return self.vehicle.armed
-
     def _set_room(self) -> None:
         model, link, buffer = self.model, self.link, self.vehicle.profile.tx_buffer
         if model is not None:
@@ -257,11 +244,14 @@ async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, o
 
 
 def _react(number: int, endpoint: Endpoint) -> str:
+    vehicle = endpoint.vehicle
     if number == signal.SIGUSR1:
-        return "armed" if endpoint.toggle_armed() else "disarmed"
+        (vehicle.disarm if vehicle.armed else vehicle.arm)()
+        return "armed" if vehicle.armed else "disarmed"
     if number == signal.SIGUSR2:
-        return "link cut" if endpoint.toggle_cut() else "link mended"
-    endpoint.vehicle.reboot(trio.current_time())
+        endpoint.cut = not endpoint.cut
+        return "link cut" if endpoint.cut else "link mended"
+    vehicle.reboot(trio.current_time())
     return "rebooted"
 
 

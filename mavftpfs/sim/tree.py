@@ -208,7 +208,7 @@ class MemoryTree:
         if mtime is not None:
             self._find(path).mtime = mtime
 
-    def add_directory(self, path: bytes, mtime: int | None = None) -> None:
+    def add_directory(self, path: bytes) -> None:
         """Make a directory and its parents; one that exists is left alone."""
         made = b""
         for name in split_path(path):
@@ -217,8 +217,6 @@ class MemoryTree:
                 self.mkdir(made)
             except FileExistsError:
                 continue
-        if mtime is not None:
-            self._find(path).mtime = mtime
 
     def add_other(self, path: bytes) -> None:
         """Make an entry that is neither file nor directory (a fifo, say)."""
