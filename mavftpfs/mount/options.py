@@ -20,35 +20,29 @@ from mavftpfs.shared.options import TABLE, Options
 KERNEL_WORDS = frozenset({"dev", "nodev", "suid", "nosuid", "exec", "noexec", "sync", "async", "dirsync"})
 """VFS words that libfuse takes."""
 
-_NO_MEANING = {
-    *(
-        "defaults",
-        "atime",
-        "noatime",
-        "diratime",
-        "nodiratime",
-        "relatime",
-        "norelatime",
-        "strictatime",
-        "nostrictatime",
-    ),
-    *("lazytime", "nolazytime", "nodirsync"),
-}
-"""VFS words that change nothing: most are about access times, which no vehicle keeps. libfuse knows only some
-of them, and fewer with each version (3.15 refuses `atime`)."""
-
-_FOR_OTHERS = {
-    *("auto", "noauto", "user", "nouser", "users", "nousers", "owner", "noowner", "group", "nogroup"),
-    *("_netdev", "nofail"),
-}
-"""Words for mount(8) and systemd."""
-
-IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
-IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
-
-
 _ALWAYS_ON = "default_permissions"
 """No server checks permissions, so the kernel always does."""
+
+IGNORED_WORDS = frozenset(
+    (
+        *("defaults", "atime", "noatime", "diratime", "nodiratime", "relatime", "norelatime", "strictatime"),
+        *(
+            "nostrictatime",
+            "lazytime",
+            "nolazytime",
+            "nodirsync",
+            "auto",
+            "noauto",
+            "user",
+            "nouser",
+            "users",
+        ),
+        *("nousers", "owner", "noowner", "group", "nogroup", "_netdev", "nofail", _ALWAYS_ON),
+    )
+)
+"""Words for mount(8) and systemd, and VFS words that change nothing: most are about access times, which no
+vehicle keeps. libfuse knows only some of them, and fewer with each version (3.15 refuses `atime`)."""
+IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 
 def parse_options(texts: Iterable[str]) -> Options:
@@ -102,7 +96,7 @@ def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
         if not equals:
             raise UsageError(f"option {name} needs a value ({name}=...)")
         values[name] = TABLE.parsed(name, value, values)
-    elif word == _ALWAYS_ON or word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES):
+    elif word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES):
         return
     elif not take_gone(values, name, value):
         raise UsageError(_refusal(name, word))
