@@ -19,7 +19,7 @@ from math import inf
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer, Wants
-from mavftpfs.protocol.requests import MANNERS, READ_MANNER, Request
+from mavftpfs.protocol.requests import READ_POLICY, RETRY_POLICIES, Request
 from mavftpfs.shared.errors import SessionLost
 
 _MOST_PACKETS = 40_000
@@ -173,11 +173,11 @@ class BurstTransfer(ReadTransfer):
         if first is None:
             return []
         opcode = Opcode.BURST_READ_FILE
-        return [Request(self, opcode, MANNERS[opcode], self.session, first[0], self.chunks.size)]
+        return [Request(self, opcode, RETRY_POLICIES[opcode], self.session, first[0], self.chunks.size)]
 
     def on_burst_sent(self, request: Request, now: float) -> int:
         """Begin to follow the burst; return how many packets it may bring (MAVSDK: all the rest)."""
-        rto = self.port.timeout(READ_MANNER)
+        rto = self.port.timeout(READ_POLICY)
         self._burst = burst = Burst(request.seq, request.offset, self.size, request.size, now, rto)
         self.timer = burst.quiet_deadline()
         return (self.size - request.offset) // request.size + 2

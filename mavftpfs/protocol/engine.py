@@ -17,16 +17,15 @@ Nothing that comes in can raise: `receive` takes any payload at any time.
 from __future__ import annotations
 
 import random
-from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.pathgate import PathGate
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload, reply_of, split_run
-from mavftpfs.protocol.requests import Manner, Operation, Request, encode
+from mavftpfs.protocol.requests import Operation, Request, RetryPolicy, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
@@ -45,19 +44,13 @@ _NAK = int(Opcode.NAK)
 class EngineStats:
     """Plain counters since the engine was made.
 
-    requests: transmissions, also by_opcode. lost: requests that were declared lost while their operation
-    waited for an answer. spurious: how many of these were answered after all. replies: believed ones, burst
-    packets included. unknown: replies that no operation waits for (late, or doubled). unexplained: how many
-    of these exceed the transmissions of their requests.
+    requests: transmissions. lost: requests that were declared lost while their operation waited for an
+    answer. replies: believed ones, burst packets included.
     """
 
     requests: int = 0
     lost: int = 0
-    spurious: int = 0
     replies: int = 0
-    unknown: int = 0
-    unexplained: int = 0
-    by_opcode: defaultdict[int, int] = field(default_factory=lambda: defaultdict(int))
 
 
 class Engine:
@@ -67,32 +60,24 @@ class Engine:
         rng: for the first seq and the session id to ask for.
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
+
+    Attributes:
         on_unexplained: called with each reply beyond one for each transmission of its request, and with the
             seconds since the request went out (None if that is not known).
         on_late: called with each ACK to a request whose operation has ended or was cancelled, and with the
             time at which the request went out first.
-
-    Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
     """
 
-    def __init__(
-        self,
-        rng: random.Random,
-        flow: Flow,
-        *,
-        op_deadline: float = OP_DEADLINE,
-        on_unexplained: Callable[[Payload, float | None], None] = lambda reply, lateness: None,
-        on_late: Callable[[Payload, float], None] = lambda reply, sent_at: None,
-    ) -> None:
+    def __init__(self, rng: random.Random, flow: Flow, *, op_deadline: float = OP_DEADLINE) -> None:
         self.home_session = rng.randrange(1, 256)
         self.session = self.home_session
         self.flow = flow
         self.traits = Traits()
         self.stats = EngineStats()
-        self._on_unexplained = on_unexplained
-        self._tell_late = on_late
+        self.on_unexplained: Callable[[Payload, float | None], None] = lambda reply, lateness: None
+        self.on_late: Callable[[Payload, float], None] = lambda reply, sent_at: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
@@ -121,9 +106,14 @@ class Engine:
         """Return whether requests of other operations are in flight."""
         return any(request.op is not op for request in self._ledger.outstanding.values())
 
-    def timeout(self, manner: Manner) -> float:
+    def _is_owed_nothing(self, op: Operation) -> bool:
+        """Return whether the vehicle answered what went out last, and none of it is this operation's."""
+        requests = self._ledger.outstanding.values()
+        return self._heard_at >= self.flow.sent_at and all(request.op is not op for request in requests)
+
+    def timeout(self, policy: RetryPolicy) -> float:
         """Return how many seconds a first transmission waits for its answer at present."""
-        return self._timers.timeout(manner)
+        return self._timers.timeout(policy)
 
     # --- traits
 
@@ -182,10 +172,8 @@ class Engine:
             return
         request = self._ledger.find(reply.seq)
         if request is None:
-            self.stats.unknown += 1
-            if reply.req_opcode != _BURST:  # else of a burst that was given up
-                self.stats.unexplained += 1
-                self._on_unexplained(reply, self._ledger.late_by(reply.seq, now))
+            if reply.req_opcode != _BURST:  # otherwise of a burst that was cancelled
+                self.on_unexplained(reply, self._ledger.late_by(reply.seq, now))
         elif reply.req_opcode != request.opcode:
             self._on_replay(request, now)
         elif request.fits(reply, self.traits):
@@ -195,17 +183,14 @@ class Engine:
         """Take a believed reply."""
         ledger, op, was_lost = self._ledger, request.op, not request.outstanding
         ledger.on_answered(request)
-        if was_lost and op is ledger.ghost:
-            self.stats.unknown += 1
-        else:
+        if not was_lost or op is not ledger.ghost:
             if was_lost:
-                self.stats.spurious += 1
                 self.flow.on_spurious()
                 self._timers.reordering.on_needless(now)
             self._on_answers(request, 1, now)
         if op is ledger.ghost:
             if reply.opcode == Opcode.ACK:
-                self._tell_late(reply, request.first_sent)
+                self.on_late(reply, request.first_sent)
         elif reply.opcode == _NAK and self._session_changed(request, reply):
             request.stale = True
             op.on_lost(request, now)
@@ -241,13 +226,13 @@ class Engine:
         self._heard_at = now
         timed = not newest.repeated and newest.sent_at > self._burst_heard_at
         rtt = timers.sample(newest, now) if timed else None
-        size = newest.size if newest.manner.bulk else MAX_DATA
+        size = newest.size if newest.policy.bulk else MAX_DATA
         self.flow.on_replies(now, rtt, count, newest.order, ledger.order, size)
         passed = []
         for order, request in ledger.outstanding.items():
             if order > newest.order:
                 break
-            if timed and request.manner.ordered:
+            if timed and request.policy.ordered:
                 passed.append(request)
         wait = timers.passed_wait(now) if passed else 0.0
         for request in passed:
@@ -265,7 +250,7 @@ class Engine:
         waits as long as for an answer."""
         if request.outstanding and not request.stale:
             request.stale = True
-            request.timer = min(request.timer, now + self._timers.timeout(request.manner))
+            request.timer = min(request.timer, now + self._timers.timeout(request.policy))
             self._due = min(self._due, request.timer)
 
     def _session_changed(self, request: Request, reply: Payload) -> bool:
@@ -304,16 +289,13 @@ class Engine:
         self.flow.begin()
         concerned = self._ops if self.traits.paths_block_writes else ()
         self._gate.look(concerned, self._ledger.outstanding.values(), now, self.rtt)
-        starved = True
+        unused = True
         for op in self._ops.copy():
-            starved = starved and self._serve(op, now, wires)
+            unused = unused and self._serve(op, now, wires)
             if op.done:
                 self.remove(op)
-        if starved:
-            self.flow.on_starved()
-        if self.flow.limited and self._heard_at >= self.flow.sent_at:  # it is not the vehicle that is silent
-            for op in self._ops:
-                op.progress(max(op.progress_at, now))
+        if unused:
+            self.flow.on_app_limited()
         return wires
 
     def hold(self, now: float) -> None:
@@ -325,13 +307,17 @@ class Engine:
         """Send what `op` has; return False when the window is full."""
         if op.done or not op.waits(now):
             return True
-        if self._gate.keeps(op) or self._waits_for_exclusive(op):
+        if self._gate.keeps(op):
             op.progress(now)  # the vehicle owes no answer
+            return True
+        if self._waits_for_exclusive(op):
             return True
         # An urgent one may use one slot more than bulk work: a full window must not make it wait.
         urgent = op.urgent
         in_flight = self.in_flight - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
+        if room <= 0 and self.flow.limited and self._is_owed_nothing(op):
+            op.progress(now)
         left, size = room, 0
         while left > 0:
             requests = op.next_requests(left, now)
@@ -354,11 +340,10 @@ class Engine:
     def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
         """Number requests of one opcode, and return them encoded."""
         first, ledger = requests[0], self._ledger
-        op, manner = first.op, first.manner
-        self.stats.by_opcode[first.opcode] += len(requests)
+        op, policy = first.op, first.policy
         op.sent = True
         quiet = now - op.progress_at
-        timer = now + self._timers.wait(manner, quiet)
+        timer = now + self._timers.wait(policy, quiet)
         if first.follows:
             first.session = self.session
         if first.owed:
@@ -372,7 +357,7 @@ class Engine:
             ledger.jump(op.on_burst_sent(first, now))
         else:
             self._due = min(self._due, timer)
-        return encode(requests, waits=(quiet + _SLACK) / self._timers.timeout(manner))
+        return encode(requests, waits=(quiet + _SLACK) / self._timers.timeout(policy))
 
     # --- timers
 
@@ -414,9 +399,9 @@ class Engine:
         """Return when a request's timer runs out, by the round trips known now, because they may have grown
         since it went out. ArduPilot answers nothing else during a burst, so silence proves nothing then
         (servers.md 4)."""
-        manner, op, flow = request.manner, request.op, self.flow
+        policy, op, flow = request.policy, request.op, self.flow
         quiet = max(0.0, request.sent_at - op.progress_at)
-        due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(manner, quiet)
-        paused = manner.ordered and not flow.starved and self.in_flight > _FEW
+        due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(policy, quiet)
+        paused = policy.ordered and not flow.app_limited and self.in_flight > _FEW
         # A stream of other answers is no pause.
         return max(due, min(due, self._heard_at) + (flow.pause if paused else 0.0))

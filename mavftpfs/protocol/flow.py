@@ -129,7 +129,7 @@ class Round:
     Attributes:
         began: when. end: the order of the first request that was sent after that.
         answered, lost: how many requests were. size: bytes of the answered ones and their answers.
-        starved: there was room and nothing to send, so the rate of answers says little.
+        app_limited: there was room and nothing to send, so the rate of answers says little.
         least: the shortest round trip, in seconds. total: the sum of all. timed: how many there were.
     """
 
@@ -138,7 +138,7 @@ class Round:
     answered: int = 0
     lost: int = 0
     size: int = 0
-    starved: bool = False
+    app_limited: bool = False
     least: float = inf
     total: float = 0.0
     timed: int = 0
@@ -167,7 +167,7 @@ class Flow:
         loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
             server that pauses, does not count.
         alone: no other FTP client was heard lately.
-        limited: requests wait for `bwlimit=`.
+        limited: the last `room` was less because of `bwlimit=`.
         sent_at: when requests went out last.
     """
 
@@ -199,13 +199,14 @@ class Flow:
         self._rounds, self._round = 0, Round()
 
     @property
-    def starved(self) -> bool:
+    def app_limited(self) -> bool:
         """Whether there was room and nothing to send, in this round."""
-        return self._round.starved
+        return self._round.app_limited
 
     @property
     def pause(self) -> float:
-        """Seconds without an answer that prove no loss, because the server pauses; not while `starved`."""
+        """Seconds without an answer that prove no loss, because the server pauses. Not while application-
+        limited."""
         return self._pauses.length
 
     def set_queue_limit(self, limit: int | None) -> None:
@@ -222,12 +223,13 @@ class Flow:
 
     def begin(self) -> None:
         """Begin to look at all operations: `room` is called for each that has something to send."""
-        self._hurried = self.limited = False
+        self._hurried = False
         self._ready_at = inf
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
         self._lacks = -inf
+        self.limited = False
         capped = self._queues_few and not (paced and self.alone)
         window = self.cap if capped and not self._before_silence else self.window
         room = window - in_flight
@@ -267,7 +269,7 @@ class Flow:
         if not room:
             self._ready_at = min(self._ready_at, self._bucket.holds_at(self._lacks))
         self.limited = self._bucket.rate == self._bwlimit
-        self._round.starved |= self.limited
+        self._round.app_limited |= self.limited
         return room
 
     def _reserve(self) -> float:
@@ -288,10 +290,10 @@ class Flow:
         if self._bucket.level(now) < self._lacks:  # otherwise there was room for more, and nothing to send
             self._ready_at = min(self._ready_at, self._bucket.holds_at(self._lacks))
 
-    def on_starved(self) -> None:
+    def on_app_limited(self) -> None:
         """Note that there was room in the window and nothing to send: this round's rate says little."""
-        self._round.starved = True
-        self._pauses.on_starved()
+        self._round.app_limited = True
+        self._pauses.on_app_limited()
 
     def on_replies(
         self,
@@ -320,11 +322,11 @@ class Flow:
             this.timed += count
         if self._before_silence:
             self.window, self._before_silence = min(self._limit, self._before_silence), 0
-        elif self._starting and not this.starved:
+        elif self._starting and not this.app_limited:
             most = max(2 * FIRST, START * self._to_fill())
             self.window = max(self.window, min(self._limit, self.window + count, int(most)))
         over = newest >= this.end and (this.end < 0 or now >= this.began + TICK)
-        enough = this.answered >= ROUNDS or self._starting or this.starved
+        enough = this.answered >= ROUNDS or self._starting or this.app_limited
         # At the start a queue grows fast: a few answers that waited in one are enough.
         if not (over and enough) and not (
             self._starting and this.timed >= FIRST and this.waited(self._shortest)
@@ -371,13 +373,13 @@ class Flow:
         lost_too_much = congested or (not paused and this.lost > usual + UNUSUAL * sqrt(usual + 1.0))
         self._learn_loss(this, losses=not (paused or this.waited(self._shortest)))
         self._learn_trips(this, now)
-        if congested and not this.starved and this.waited(self._shortest, 2.0, waits):
+        if congested and not this.app_limited and this.waited(self._shortest, 2.0, waits):
             self._rates.clear()  # the path has the rate of this round
         rate, before = this.answered / (now - this.began), self._rate
-        if rate > before or not this.starved:
+        if rate > before or not this.app_limited:
             self._rates.append(rate)
         self._rate = max(self._rates, default=0.0)
-        if this.starved:
+        if this.app_limited:
             return
         self._cost = this.size / this.answered
         if not paused:

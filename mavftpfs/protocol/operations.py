@@ -12,7 +12,7 @@ from math import inf
 from typing import NamedTuple
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import MANNERS, WORK_FLOOR, Operation, Request, nak_of
+from mavftpfs.protocol.requests import RETRY_POLICIES, WORK_FLOOR, Operation, Request, nak_of
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
@@ -67,13 +67,13 @@ class Simple(Operation):
         self.opcode = opcode
         self.exclusive = exclusive
         self.retransmitted = False
-        manner = MANNERS[opcode]
+        policy = RETRY_POLICIES[opcode]
         if server_time is not None:
             usual = server_time * (_USUAL_PACE if opcode == Opcode.CALC_FILE_CRC32 else 1.0)
-            floor = max(manner.floor, WORK_FLOOR)
-            manner = manner._replace(floor=floor, work=server_time, usual_work=usual)
+            floor = max(policy.floor, WORK_FLOOR)
+            policy = policy._replace(floor=floor, work=server_time, usual_work=usual)
         request = Request(
-            self, opcode, manner, session or 0, offset, len(data), data, follows=session is None
+            self, opcode, policy, session or 0, offset, len(data), data, follows=session is None
         )
         self._requests = [request]
         self.reply: Payload
@@ -86,7 +86,7 @@ class Simple(Operation):
 
     def on_lost(self, request: Request, now: float) -> None:
         """Have it go out again, under the same seq where an answer may still come under that."""
-        keeps_seq = request.manner.same_seq and not request.stale
+        keeps_seq = request.policy.same_seq and not request.stale
         self._requests = [request if keeps_seq else request.anew()]
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
@@ -207,8 +207,8 @@ class ListDirectory(Operation):
         if self._asked:
             return []
         self._asked = True
-        manner, path = MANNERS[self.opcode], self._path
-        return [Request(self, self.opcode, manner, 0, self.strings, len(path), path, follows=True)]
+        policy, path = RETRY_POLICIES[self.opcode], self._path
+        return [Request(self, self.opcode, policy, 0, self.strings, len(path), path, follows=True)]
 
     def on_lost(self, request: Request, now: float) -> None:
         """Ask for the page again, unless it came."""

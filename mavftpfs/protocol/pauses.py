@@ -49,7 +49,7 @@ class Pauses:
         elif now >= self._ended_at + KNOWN:
             self.length = 0.0
 
-    def on_starved(self) -> None:
+    def on_app_limited(self) -> None:
         """Note that there is nothing to answer."""
         self._answered_at = inf
 

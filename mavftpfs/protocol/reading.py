@@ -10,7 +10,7 @@ from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import READ_MANNER, Operation, Request, Run, nak_of
+from mavftpfs.protocol.requests import READ_POLICY, Operation, Request, Run, nak_of
 from mavftpfs.shared.errors import (
     DataUnproven,
     LocalProtocolError,
@@ -183,7 +183,7 @@ class ReadTransfer(Operation):
             return []
         session, (start, stop) = self.session, row
         return [
-            Request(self, _READ, READ_MANNER, session, offset, min(chunk, stop - offset))
+            Request(self, _READ, READ_POLICY, session, offset, min(chunk, stop - offset))
             for offset in range(start, stop, chunk)
         ]
 
@@ -279,7 +279,7 @@ class ReadToEof(Operation):
             if index not in self._blocks and index not in self._out and self._plausible(index):
                 self._out.add(index)
                 offset = index * self._chunk
-                return [Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)]
+                return [Request(self, _READ, READ_POLICY, self._session, offset, self._chunk)]
         return []
 
     def on_lost(self, request: Request, now: float) -> None:

@@ -1,9 +1,9 @@
-"""One request in flight, and the manner (retry policy) of each opcode. Layer: protocol; pure.
+"""One request in flight, and the retry policy of each opcode. Layer: protocol; pure.
 
-A manner says how a request is repeated after its answer was lost. Reads, writes and listings may be executed
-twice. So their operations supply a new request with a seq of its own, and the answers can be told apart. Any
-other request goes out again under the *same* seq, because PX4 and ArduPilot recognise it by the seq and
-replay their reply, if this is still their last one (servers.md 2).
+A retry policy says how a request is repeated after its answer was lost. Reads, writes and listings may be
+executed twice. So their operations supply a new request with a seq of its own, and the answers can be told
+apart. Any other request goes out again under the *same* seq, because PX4 and ArduPilot recognise it by the
+seq and replay their reply, if this is still their last one (servers.md 2).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mavftpfs.shared.model import Traits
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
 
-class Manner(NamedTuple):
+class RetryPolicy(NamedTuple):
     """The timing and retransmission of requests with one opcode.
 
     Attributes:
@@ -46,16 +46,16 @@ class Manner(NamedTuple):
     usual_work: float = 0.0
 
 
-READ_MANNER = Manner(0.05, same_seq=False, bulk=True, ordered=True, echoes_offset=True, backoff=0.25)
-WRITE_MANNER = READ_MANNER._replace(echoes_offset=None)
-_LIST = Manner(0.25, same_seq=False, ordered=True, backoff=1.0)
-_PATH = Manner(0.1, same_seq=True)
+READ_POLICY = RetryPolicy(0.05, same_seq=False, bulk=True, ordered=True, echoes_offset=True, backoff=0.25)
+WRITE_POLICY = READ_POLICY._replace(echoes_offset=None)
+_LIST = RetryPolicy(0.25, same_seq=False, ordered=True, backoff=1.0)
+_PATH = RetryPolicy(0.1, same_seq=True)
 WORK_FLOOR = 0.3
 """The least seconds to wait for an answer where the server has work to do."""
 
-MANNERS: dict[int, Manner] = dict.fromkeys(range(256), _PATH) | {
-    Opcode.READ_FILE: READ_MANNER,
-    Opcode.WRITE_FILE: WRITE_MANNER,
+RETRY_POLICIES: dict[int, RetryPolicy] = dict.fromkeys(range(256), _PATH) | {
+    Opcode.READ_FILE: READ_POLICY,
+    Opcode.WRITE_FILE: WRITE_POLICY,
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
 }
@@ -78,7 +78,7 @@ class Request:
 
     op: Operation
     opcode: int
-    manner: Manner
+    policy: RetryPolicy
     session: int
     offset: int
     size: int
@@ -104,7 +104,7 @@ class Request:
     def anew(self) -> Request:
         """Return the same request, to go out under another seq."""
         return Request(
-            self.op, self.opcode, self.manner, self.session, self.offset, self.size, self.data, self.follows
+            self.op, self.opcode, self.policy, self.session, self.offset, self.size, self.data, self.follows
         )
 
     def fits(self, reply: Payload, traits: Traits) -> bool:
@@ -112,7 +112,7 @@ class Request:
         if traits.ack_carries_own_session and reply.session != self.session and not self.follows:
             return False
         if reply.opcode == Opcode.ACK:
-            echoed = self.manner.echoes_offset
+            echoed = self.policy.echoes_offset
             echoed = traits.write_ack_offset if echoed is None else echoed
             return reply.offset == self.offset or not echoed
         return reply.opcode == Opcode.NAK
@@ -155,7 +155,7 @@ class Port(Protocol):
     session: int
     traits: Traits
 
-    def timeout(self, manner: Manner) -> float:
+    def timeout(self, policy: RetryPolicy) -> float:
         """Return the present wait for an answer, in seconds."""
         ...
 

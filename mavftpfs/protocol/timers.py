@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from math import inf
 
-from mavftpfs.protocol.requests import Manner, Request
+from mavftpfs.protocol.requests import Request, RetryPolicy
 
 INITIAL_RTO = 1.0
 """Seconds to wait while no round trip is known. A request with a seq of its own waits half as long: after a
@@ -89,16 +89,16 @@ class Timers:
         self._last = (-inf, -inf, False)
         self._rtt = 0.0
 
-    def _estimator(self, manner: Manner) -> RttEstimator:
-        """Return what is known for this manner, or at least for the other one."""
-        own, other = (self.bulk, self.single) if manner.bulk else (self.single, self.bulk)
+    def _estimator(self, policy: RetryPolicy) -> RttEstimator:
+        """Return what is known for this policy, or at least for the other one."""
+        own, other = (self.bulk, self.single) if policy.bulk else (self.single, self.bulk)
         return own if own.known or not other.known else other
 
-    def timeout(self, manner: Manner) -> float:
+    def timeout(self, policy: RetryPolicy) -> float:
         """Return how many seconds to wait for the reply to a first transmission, work aside."""
-        estimator = self._estimator(manner)
-        if estimator.known or manner.same_seq:
-            return max(estimator.rto, manner.floor)
+        estimator = self._estimator(policy)
+        if estimator.known or policy.same_seq:
+            return max(estimator.rto, policy.floor)
         return INITIAL_RTO / 2
 
     def sample(self, request: Request, now: float) -> float:
@@ -107,24 +107,24 @@ class Timers:
         What was sent in one batch and answered in one batch is one sample: a hundred equal ones would say
         that round trips never vary.
         """
-        manner = request.manner
+        policy = request.policy
         rtt = now - request.sent_at
-        moment = (now, request.sent_at, manner.bulk)
-        if moment != self._last and manner.work <= _NO_WORK:  # else most of it was work
+        moment = (now, request.sent_at, policy.bulk)
+        if moment != self._last and policy.work <= _NO_WORK:  # else most of it was work
             self._last = moment
-            (self.bulk if manner.bulk else self.single).sample(rtt)
+            (self.bulk if policy.bulk else self.single).sample(rtt)
         self._rtt = rtt
         return rtt
 
-    def wait(self, manner: Manner, quiet: float) -> float:
+    def wait(self, policy: RetryPolicy, quiet: float) -> float:
         """Return how many seconds to wait for the reply to a request that goes out.
 
         quiet: seconds in which its operation made no progress. Under the same seq a repetition does not tell
         the round trip. If that is not known yet, it may be long.
         """
-        backoff = manner.backoff if self._estimator(manner).known else 1.0
-        wait = max(self.timeout(manner), min(quiet * backoff, LONGEST_BACK_OFF))
-        return wait + min(manner.work, max(manner.usual_work, quiet))
+        backoff = policy.backoff if self._estimator(policy).known else 1.0
+        wait = max(self.timeout(policy), min(quiet * backoff, LONGEST_BACK_OFF))
+        return wait + min(policy.work, max(policy.usual_work, quiet))
 
     def passed_wait(self, now: float) -> float:
         """Return how many seconds after its transmission a request is lost, if a later one was answered.

@@ -14,7 +14,7 @@ from typing import Protocol
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.operations import BEYOND
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import MANNERS, WRITE_MANNER, Operation, Request, Run, nak_of
+from mavftpfs.protocol.requests import RETRY_POLICIES, WRITE_POLICY, Operation, Request, Run, nak_of
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError, SessionLost
 from mavftpfs.shared.ranges import Ranges
 
@@ -102,7 +102,7 @@ class WriteTransfer(Operation):
         root: a directory to list when other requests with a path may disturb the next write (see
             `pathgate`); None: a write that is refused for that fails.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
-        on_starved: called when the source has nothing more. After a full window that shows only when all of
+        on_drained: called when the source has nothing more. After a full window that shows only when all of
             it was answered.
 
     Attributes:
@@ -125,7 +125,7 @@ class WriteTransfer(Operation):
         *,
         root: bytes | None = None,
         in_flight: int | None = None,
-        on_starved: Callable[[], None] = lambda: None,
+        on_drained: Callable[[], None] = lambda: None,
     ) -> None:
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
@@ -135,26 +135,26 @@ class WriteTransfer(Operation):
         self._listing: Request | None = None
         self._listings = 0  # of the root, since something was ACKed
         self._in_flight = in_flight
-        self._on_starved = on_starved
+        self._on_drained = on_drained
         self.paused = False
-        self._starved = False
+        self._drained = False
         self._usual: bytes | None = None  # the data of an ACK to a full chunk
 
     # --- what the owner says and sees
 
     def wake(self) -> None:
         """Note that the source has more."""
-        self._starved = False
+        self._drained = False
 
     @property
-    def starved(self) -> bool:
+    def drained(self) -> bool:
         """Whether the source had nothing when it was last asked, and all bytes that it gave were ACKed."""
-        return self._starved and self._source.ranges.out.empty
+        return self._drained and self._source.ranges.out.empty
 
     @property
     def idle(self) -> bool:
         """Whether nothing is in flight, and nothing can be sent: the source is empty, or this is paused."""
-        return self._source.ranges.out.empty and (self.paused or self._starved)
+        return self._source.ranges.out.empty and (self.paused or self._drained)
 
     # --- requests
 
@@ -167,14 +167,14 @@ class WriteTransfer(Operation):
             return []
         if self._needs_listing:
             return self._list_root()
-        if self._starved:
+        if self._drained:
             return []
         piece = self._new_piece((1 if self.chunks.trying else min(most, _ROW)) * chunk)
         if piece is None:
             return []
         session, (offset, data) = self.session, piece
         return [
-            Request(self, _WRITE, WRITE_MANNER, session, offset + at, len(part), part)
+            Request(self, _WRITE, WRITE_POLICY, session, offset + at, len(part), part)
             for at in range(0, len(data), chunk)
             for part in (data[at : at + chunk],)
         ]
@@ -189,7 +189,7 @@ class WriteTransfer(Operation):
 
     def _send_again(self, start: int, stop: int) -> None:
         self._source.ranges.on_lost(start, stop)
-        self._starved = False
+        self._drained = False
 
     def _list_root(self) -> list[Request]:
         """Return a listing of the root, once all else is answered. It sets right what paths disturb, and
@@ -198,7 +198,7 @@ class WriteTransfer(Operation):
         if self._listing is not None or self._root is None or not self._source.ranges.out.empty:
             return []
         root = self._root
-        self._listing = Request(self, _LIST, MANNERS[_LIST], 0, BEYOND, len(root), root, follows=True)
+        self._listing = Request(self, _LIST, RETRY_POLICIES[_LIST], 0, BEYOND, len(root), root, follows=True)
         return [self._listing]
 
     def on_paths(self) -> None:
@@ -213,8 +213,8 @@ class WriteTransfer(Operation):
             self.fail(error)
             return None
         if piece is None:
-            self._starved = True
-            self._on_starved()
+            self._drained = True
+            self._on_drained()
             return None
         offset, data = piece
         if not 1 <= len(data) <= limit or not 0 <= offset <= MAX_OFFSET - len(data):

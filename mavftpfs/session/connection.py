@@ -33,7 +33,6 @@ from mavftpfs.link.messages import (
 from mavftpfs.link.peers import names_of
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.payload import Payload
 from mavftpfs.session.driver import Driver, PayloadSink
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.store import Store
@@ -62,14 +61,13 @@ not heard."""
 SILENT_ON_EXIT = 2.5
 """Seconds without a heartbeat after which the vehicle is not heard: at least two heartbeats are missing."""
 
-_INFO_TRIES = 4
-_INFO_PERIOD = 2.0
+_INFO_TRIES = 5
+_INFO_PERIOD, _HURRIED = 2.0, 0.5
+"""Seconds between two requests for the same; the second where it is doubted that the vehicle is the same."""
+
 _OLD_WAY_FROM = 2
 """The try from which AUTOPILOT_VERSION is also requested in the way of older firmware."""
 
-_IDENTITY_PERIOD = 0.5
-_TIME_TRIES = 5
-_SELDOM = 5.0
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
 _TELLS_NO_ID = (
     "%d/%d does not report its unique id any more: nothing is read from it or written to it until it does"
@@ -113,6 +111,7 @@ class Connection:
         self.was_lost = False
         self.news: list[Callable[[str], None]] = []
         self._first_heartbeat, self._doubted = trio.Event(), trio.Event()
+        self._warned = False  # that another vehicle answers
         own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
         framer = Framer(
             own,
@@ -137,13 +136,7 @@ class Connection:
             patience=options.op_deadline,
         )
         flow = Flow(serial=link.is_serial, bwlimit=options.bwlimit)
-        self.engine = Engine(
-            rng,
-            flow,
-            op_deadline=options.op_deadline,
-            on_unexplained=self._on_unexplained,
-            on_late=self._on_late,
-        )
+        self.engine = Engine(rng, flow, op_deadline=options.op_deadline)
         self.driver = Driver(link, framer, self.engine, self.vehicle, clock=clock, on_payload=on_payload)
         self.scheduler = Scheduler(
             self.driver,
@@ -229,12 +222,6 @@ class Connection:
         self.engine.flow.alone = False
         self.scheduler.server.on_another_client(payload, newcomer=newcomer)
 
-    def _on_unexplained(self, reply: Payload, lateness: float | None) -> None:
-        self.scheduler.server.on_unexplained(reply, lateness)
-
-    def _on_late(self, reply: Payload, sent_at: float) -> None:
-        self.scheduler.server.on_late(reply, sent_at)
-
     def _on_armed(self, armed: bool) -> None:
         self.scheduler.on_armed_changed()
         self._tell("armed" if armed else "disarmed")
@@ -279,53 +266,47 @@ class Connection:
                 self.was_lost = True
 
     async def _ask_about_vehicle(self) -> None:
-        """Ask for the vehicle's id, boot time and card.
+        """Ask for the vehicle's id, boot time and card, a few times, since none of this is necessary.
 
-        At first it asks only a few times, since none of this is necessary. It asks for id and boot time again
-        each time that the vehicle may have restarted, or may be another one. The boot time comes first,
-        because no file is requested before the id is known, and by then a restart is known, too.
+        Each time that the vehicle may have restarted, or may be another one, ask again, and for the id until
+        it is known. Nothing is asked while the vehicle is silent.
         """
-        vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
+        driver, identity = self.driver, self.vehicle.identity
         await self._first_heartbeat.wait()
-        in_doubt = False
         while True:
-            asked, asked_at, warned = 0, -inf, False
-            while vehicle.address is not None and (wanted := self._wanted(in_doubt, asked)):
-                # The vehicle may be gone again; then, and with a stranger, there is no hurry.
-                soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
-                pause = (0.0 if soon else _SELDOM) if in_doubt else _INFO_PERIOD
-                if self.clock() - asked_at >= pause:
+            asked, asked_at, self._doubted = 0, -inf, trio.Event()
+            while not self._doubted.is_set() and (wanted := self._wanted(asked)):
+                address, now = self.vehicle.address, self.clock()
+                period = _HURRIED if identity.standing is Standing.DOUBTED else _INFO_PERIOD
+                if address is not None and identity.heard_since(asked_at) and now - asked_at >= period:
                     for message_id in wanted:
-                        driver.send(driver.framer.encode_request_message(vehicle.address, message_id))
+                        driver.send(driver.framer.encode_request_message(address, message_id))
                     if asked >= _OLD_WAY_FROM and AUTOPILOT_VERSION_ID in wanted:
-                        driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-                    asked, asked_at = asked + 1, self.clock()
-                await trio.sleep(_IDENTITY_PERIOD)
-                in_doubt = in_doubt or self._doubted.is_set()
-                expired = identity.expire(self.clock())
-                if identity.standing is Standing.STRANGER and not warned:
-                    warned = True
-                    log.warning(_TELLS_NO_ID if expired else _ANOTHER, *vehicle.address)
+                        driver.send(driver.framer.encode_request_capabilities(address))
+                    asked, asked_at = asked + 1, now
+                await trio.sleep(_HURRIED)
+                self._warn_of_stranger()
             await self._doubted.wait()
-            self._doubted = trio.Event()
-            in_doubt = True
 
-    def _wanted(self, in_doubt: bool, asked: int) -> list[int]:
-        """Return the messages to request; asked: the number of earlier requests."""
-        vehicle, wanted = self.vehicle, []
-        if in_doubt:
-            lacks_time = vehicle.lacks_boot_time(self.clock())
-            unsure = vehicle.identity.standing is not Standing.TRUSTED or (lacks_time and asked < _TIME_TRIES)
-            if unsure or not asked:
-                wanted = [SYSTEM_TIME_ID, AUTOPILOT_VERSION_ID] if lacks_time else [AUTOPILOT_VERSION_ID]
-        elif asked < _INFO_TRIES:
-            if vehicle.version is None:
-                wanted.append(AUTOPILOT_VERSION_ID)
-            if vehicle.storage is None:
-                wanted.append(STORAGE_INFORMATION_ID)
-            if not vehicle.tells_boot_time:
-                wanted.append(SYSTEM_TIME_ID)
+    def _wanted(self, asked: int) -> list[int]:
+        """Return the messages to request; asked: the number of earlier requests. The boot time comes first,
+        because no file is requested before the id is known, and by then a restart is known, too."""
+        vehicle, wanted, optional = self.vehicle, [], asked < _INFO_TRIES
+        if optional and (not vehicle.tells_boot_time or vehicle.lacks_boot_time(self.clock())):
+            wanted.append(SYSTEM_TIME_ID)
+        if vehicle.identity.standing is not Standing.TRUSTED or (optional and vehicle.version is None):
+            wanted.append(AUTOPILOT_VERSION_ID)
+        if optional and vehicle.storage is None:
+            wanted.append(STORAGE_INFORMATION_ID)
         return wanted
+
+    def _warn_of_stranger(self) -> None:
+        """Warn once each time that the vehicle counts as another one."""
+        identity, address = self.vehicle.identity, self.vehicle.address
+        expired, strange = identity.expire(self.clock()), identity.standing is Standing.STRANGER
+        if strange and not self._warned and address is not None:
+            log.warning(_TELLS_NO_ID if expired else _ANOTHER, *address)
+        self._warned = strange
 
 
 async def heard_within(first: trio.Event, timeout: float, on_wait: Callable[[], None]) -> bool:

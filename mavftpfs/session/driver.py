@@ -1,7 +1,7 @@
 """The pump between link and engine. Layer: session; the only task that reads the link.
 
 When a task starts an operation (`start`, `run`), its first request is sent before that task next awaits,
-unless a taken session requires silence (`be_silent`). Waiting tasks are woken once per batch of input, never
+unless nothing may be sent. Waiting tasks are woken once per batch of input, never
 once per packet, because a trio event and a time-out per request cost more than the rest of a chunk together.
 """
 
@@ -37,10 +37,6 @@ a retransmission; serial ports do not pause inside a frame."""
 REFILL_AT = 32
 """The number of replies after which the engine fills free room at once, because the server works
 meanwhile."""
-
-LONGEST_DRAIN = 5.0
-"""Seconds for which a silence waits for running operations to end. After that there is no silence, because no
-new operation can begin meanwhile, and a listing may be long."""
 
 BACKLOG_LIMIT = 16 * 1024
 """Unsent bytes in the link above which the engine is asked for no more, because an urgent request could not
@@ -85,9 +81,7 @@ class Driver:
         self._deadline = inf  # the next one of `pump`
         self._may_send = False
         self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
-        self._to_begin: set[Operation] = set()  # operations that start after the silence
-        self._silences = 0
-        self._changed = trio.lowlevel.ParkingLot()  # for the end of operations, and of silences
+        self._silent_until = -inf
         self._gathered: list[bytes] = []
 
     async def pump(self) -> None:
@@ -138,62 +132,39 @@ class Driver:
         """
         finished = trio.Event()
         try:
-            await self.start(operation, finished.set)
+            self.start(operation, finished.set)
             await finished.wait()
         finally:
             self.cancel(operation)
         if operation.error is not None:
             raise operation.error
 
-    async def start(
+    def start(
         self,
         operation: Operation,
         on_finished: Callable[[], None],
         on_batch: Callable[[float], None] | None = None,
     ) -> None:
-        """Begin an operation as soon as no task keeps a silence, unless the operation is cancelled first.
+        """Begin an operation.
 
         on_finished: called when the operation is done or has failed. on_batch: called until then after each
             batch of input, with the time.
         """
-        self._to_begin.add(operation)
-        try:
-            while self._silences:
-                await self._changed.park()
-            if operation not in self._to_begin:
-                return
-        finally:
-            self._to_begin.discard(operation)
         self._under_way[operation] = on_finished, on_batch
         self.engine.start(operation, self._clock())
         self.kick()
 
     def cancel(self, operation: Operation) -> None:
         """Forget an operation (harmless if it has finished)."""
-        self._to_begin.discard(operation)
         if self._under_way.pop(operation, None) is not None:
-            self._changed.unpark_all()
             self.engine.remove(operation)
             self.kick()
 
-    async def be_silent(self, seconds: float) -> bool:
-        """Let no operation begin, wait until the running ones have ended, then send nothing for `seconds`.
-
-        Returns:
-            False: an operation did not end within LONGEST_DRAIN, so there was no silence.
-        """
-        self._silences += 1
-        try:
-            with trio.move_on_after(LONGEST_DRAIN):
-                while self._under_way:
-                    await self._changed.park()
-            if self._under_way:
-                return False
-            await trio.sleep(seconds)
-            return True
-        finally:
-            self._silences -= 1
-            self._changed.unpark_all()
+    async def be_silent(self, seconds: float) -> None:
+        """Send no FTP requests for `seconds` after the answers to those in flight. Operations wait."""
+        seconds += self.engine.rtt or 0.0
+        self._silent_until = max(self._silent_until, self._clock() + seconds)
+        await trio.sleep(seconds)
 
     def kick(self) -> None:
         """Send the requests that may go out now, and call `on_finished` of operations that ended. Call this
@@ -206,7 +177,6 @@ class Driver:
                 self.vehicle.note_timeout()
             if callbacks is not None:
                 callbacks[0]()
-                self._changed.unpark_all()
         due = self.engine.next_deadline()
         deadline = inf if due is None else due
         if self.link.backlog >= BACKLOG_LIMIT:
@@ -295,6 +265,7 @@ class Driver:
         """Send the engine's requests, if the link has room."""
         target, link = self.vehicle.address, self.link
         self._may_send = link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
+        self._may_send &= now >= self._silent_until
         if target is None or not self._may_send:
             self.engine.hold(now)
             return

@@ -8,10 +8,9 @@ exist, and proves no absence.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import Enum
 
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.model import EntryKind, Listing
 
 
 class Outcome(Enum):
@@ -36,22 +35,15 @@ class After(Enum):
     DIRECTORY = "an empty directory"
 
 
-@dataclass(frozen=True, slots=True)
-class Names:
-    """The entries of a listing. complete: it came to its end, so all other names are absent."""
-
-    entries: dict[bytes, DirEntry]
-    complete: bool
-
-    def judge(self, name: bytes, after: After) -> Outcome:
-        """Return this listing's evidence about one name of a change."""
-        entry = self.entries.get(name)
-        if entry is None and not self.complete:
-            return Outcome.UNKNOWN
-        if (entry is None) != (after is After.ABSENT):
-            return Outcome.DID_NOT
-        wrong = after is After.DIRECTORY and entry is not None and entry.kind is not EntryKind.DIRECTORY
-        return Outcome.CONFLICT if wrong else Outcome.HAPPENED
+def judge(listing: Listing, name: bytes, after: After) -> Outcome:
+    """Return a listing's evidence about one name of a change."""
+    entry = next((entry for entry in listing.entries if entry.name == name), None)
+    if entry is None and not listing.complete:
+        return Outcome.UNKNOWN
+    if (entry is None) != (after is After.ABSENT):
+        return Outcome.DID_NOT
+    wrong = after is After.DIRECTORY and entry is not None and entry.kind is not EntryKind.DIRECTORY
+    return Outcome.CONFLICT if wrong else Outcome.HAPPENED
 
 
 def together(evidence: Iterable[Outcome]) -> Outcome:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import trio
 
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.reading import ReadTransfer, Wants
 from mavftpfs.session.scheduler import Future, Scheduler, SessionUser, Turn
-from mavftpfs.session.serversession import REOPENS, OpenSession
+from mavftpfs.session.serversession import OpenSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 
@@ -42,7 +44,6 @@ class FileStream(SessionUser):
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # bytes of that transfer
-        self._lost = 0  # number of lost sessions without progress
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
             self.opened.end()
@@ -59,6 +60,8 @@ class FileStream(SessionUser):
         if self._removed:
             self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
+        if self._wants.idle:
+            self.failing_since, self.retry_at = None, -inf
         if self._transfer is not None:  # which knows what is in flight
             self._transfer.want(start, stop, demand)
         else:
@@ -107,8 +110,7 @@ class FileStream(SessionUser):
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in the reads that wait, and drop their ranges."""
         self.drop()
-        self._lost = 0  # so that the next read has as many turns
-        self.waiting_since = None
+        self.waiting_since = self.failing_since = None
         if not self.opened.ended:
             self.opened.end(error)
         elif not self.closed:
@@ -120,8 +122,13 @@ class FileStream(SessionUser):
         """Take turns whenever ranges are pending, until the stream is closed."""
         server = self._server
         while not self.closed:
-            if self.idle:
-                await self._changed.park()
+            pause = inf if self.idle else self.retry_at - server.clock()
+            if pause > 0.0:
+                with trio.move_on_after(pause):
+                    await self._changed.park()
+                continue
+            if (failure := self._scheduler.failure(self)) is not None:
+                self._fail(failure)
                 continue
             try:
                 async with self._scheduler.turn(self) as turn:
@@ -129,10 +136,7 @@ class FileStream(SessionUser):
                     await self._read(turn)
             except SessionLost as error:  # the next turn continues at the same offset (promise 5)
                 # The turn is over, but nothing was awaited since, so nobody else has opened a file yet.
-                server.lose(error)
-                self._lost += 1
-                if self._lost > REOPENS:
-                    self._fail(error)
+                self._scheduler.lose(self, error)
             except MavftpfsError as error:
                 self._fail(error)
             if not self._wants.demand.todo.empty or not self.opened.ended:
@@ -177,7 +181,7 @@ class FileStream(SessionUser):
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = engine.in_flight > 0
         try:
-            await driver.start(transfer, server.wake, self._on_batch)
+            driver.start(transfer, server.wake, self._on_batch)
             while not (transfer.done or transfer.idle or self.closed or server.session is None):
                 if turn.is_over() or (turn.contended and not transfer.demanded):
                     break
@@ -205,7 +209,7 @@ class FileStream(SessionUser):
             return
         count = transfer.received_bytes - self._received
         if count:
-            self._received, self._lost = transfer.received_bytes, 0
+            self._received, self.failing_since = transfer.received_bytes, None
             if not self.closed:
                 self._sink.on_batch(count)
         if transfer.idle or transfer.done:

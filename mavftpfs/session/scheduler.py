@@ -33,6 +33,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     RequestTimeout,
     SessionBusy,
+    SessionLost,
     SessionTaken,
 )
 from mavftpfs.shared.model import renamed
@@ -59,7 +60,12 @@ ArduPilot gives the session away after 3 s, so a session that is still open here
 MAYBE_OPEN_CLOSE = 5.0
 """Seconds after the last turn, or the last try, after which the janitor closes the files in `maybe_open`."""
 
+LONGEST_BARREN = 20.0
+"""Seconds without progress after which a turn does not end before it brought something. That costs an
+interactive user a round trip, so it must be seldom."""
+
 _KEPT = "the vehicle's only session is kept by another transfer"
+_UNANSWERED = "the vehicle did not answer while a file was to be opened"
 _OTHERS = "another client of the vehicle may have a file open, and opening one could end its transfer"
 
 
@@ -96,12 +102,18 @@ class SessionUser:
         waiting_since: when it began to need a turn for more than readahead; None if it needs none. The user
             sets it; `Scheduler.turn` clears it at its end.
         writing: its turns are refused while nothing may be written.
+        failing_since: when its first turn without progress began; None after a progress, which is bytes that
+        were read or ACKed. The user clears it. retry_at: the user waits for no turn before.
+        loss: how its session was lost since then.
     """
 
     def __init__(self, path: bytes, waiting_since: float | None = None, *, writing: bool = False) -> None:
         self.path = path
         self.waiting_since = waiting_since
         self.writing = writing
+        self.failing_since: float | None = None
+        self.retry_at = -inf
+        self.loss: MavftpfsError | None = None
         self._used = 0.0
         self._until = 0.0
 
@@ -164,17 +176,26 @@ class Turn:
 
     async def open(self, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
         """Close the open file and open the user's. While another client has a file open, other users may have
-        the turn. Raises what ServerSession.open and Scheduler.turn do."""
+        the turn.
+
+        Raises:
+            RequestTimeout: no answer for `op_deadline`, in which the closing of other files and the wait for
+                the turn count. Everything that ServerSession.open and Scheduler.turn raise.
+        """
         scheduler = self._scheduler
         while True:
             assert scheduler.holder is self
+            left = scheduler.deadline(self.user) - scheduler.clock()
             try:
-                session = await scheduler.server.open(self.user.path, opcode)
-                break
+                with trio.move_on_after(max(0.0, left)):
+                    session = await scheduler.server.open(self.user.path, opcode)
+                    self.began = session.opened_at
+                    return session
             except SessionTaken:
                 await scheduler.wait_again(self)
-        self.began = session.opened_at
-        return session
+            else:
+                scheduler.server.vehicle.note_timeout()
+                raise RequestTimeout(_UNANSWERED)
 
     @property
     def contended(self) -> bool:
@@ -190,15 +211,20 @@ class Turn:
     def is_over(self) -> bool:
         """Return whether another user is next now, or the path is about to change.
 
-        A turn that lasted long (ten round trips, 0.5 to 2.5 s) ends for any user with a lower score; a
-        shorter one only for an interactive user. In its first half second, the time that a user waited before
-        its turn still lowers its score. Otherwise the next small file would end a copy's turn at once.
+        A user whose turns brought nothing for LONGEST_BARREN keeps its turn until it brought something, or
+        STALL seconds passed, because on a long way nothing would ever arrive. A turn that lasted long (ten
+        round trips, 0.5 to 2.5 s) ends for any user with a lower score; a shorter one only for an interactive
+        user. In its first half second, the time that a user waited before its turn still lowers its score.
+        Otherwise the next small file would end a copy's turn at once.
         """
         scheduler, user = self._scheduler, self.user
         now, rtt = scheduler.clock(), scheduler.server.engine.rtt
         if scheduler.is_excluded(user.path):
             return True
         lasted = now - self.began
+        barren = user.failing_since is not None and now - user.failing_since >= LONGEST_BARREN
+        if barren and lasted < scheduler.server.longest_silence:
+            return False
         used, rivals = user.used(self.began) + lasted, scheduler.waiting(now)
         score = min(used, MOST_USE)
         if lasted < LEAST_TURN:
@@ -212,13 +238,17 @@ class Turn:
 
 @dataclass(eq=False)
 class _Excluded:
-    """Paths that are about to change. below: all paths below the first, too."""
+    """Paths that are about to change. below: all paths below the first, too. b"" may be any path."""
 
     paths: tuple[bytes, ...]
     below: bool
 
     def covers(self, path: bytes) -> bool:
-        return path in self.paths or (self.below and path.startswith(self.paths[0].rstrip(b"/") + b"/"))
+        return (
+            not path
+            or path in self.paths
+            or (self.below and path.startswith(self.paths[0].rstrip(b"/") + b"/"))
+        )
 
 
 class Scheduler:
@@ -300,6 +330,8 @@ class Scheduler:
             turn = Turn(self, user)
             self._set_holder(turn)
             self.server.vehicle.require(self.clock(), writing=user.writing)
+            if user.failing_since is None:
+                user.failing_since = turn.granted_at
             yield turn
         finally:
             if turn is not None and self.holder is turn:
@@ -326,24 +358,43 @@ class Scheduler:
                 if (refusal := self._queue[user]) is not None:
                     raise refusal
                 now, others_until = self.clock(), self.others_until
-                if now >= self._deadline(user):
+                if now >= self.deadline(user):
                     raise SessionBusy(_OTHERS) if now < others_until else RequestTimeout(_KEPT)
                 user.on_queued()
-                until = min(self._deadline(user), now + self._op_deadline / 4)  # for the next `on_queued`
+                until = min(self.deadline(user), now + self._op_deadline / 4)  # for the next `on_queued`
                 await self.server.sleep((min(until, others_until) if others_until > now else until) - now)
         finally:
             del self._queue[user]
             self.server.wake()
 
-    def _deadline(self, user: SessionUser) -> float:
-        """Return when a waiting user gets an error: `op_deadline` after the vehicle last answered in a turn,
-        or after another client last closed a file; never if no caller waits."""
-        since = user.awaited_since
-        if since is None:
+    def deadline(self, user: SessionUser) -> float:
+        """Return when a user that waits for its turn, or for its file to be opened, gets an error:
+        `op_deadline` after the vehicle last answered in a turn, or after another client last had a file open;
+        never if no caller waits."""
+        if user.awaited_since is None:
             return inf
+        since = max(user.awaited_since, self._moved)
         if self.clock() < self.others_until:
-            return self.server.busy_at(max(since, self._moved))
-        return max(since, self._moved) + self._longest_wait
+            return self.server.busy_at(since)
+        return max(since, self.server.others.file_open_until) + self._longest_wait
+
+    def failure(self, user: SessionUser) -> MavftpfsError | None:
+        """Return the error if a user made no progress for `op_deadline`, and let it begin anew."""
+        if user.failing_since is None or self.clock() - user.failing_since < self._op_deadline:
+            return None
+        loss, user.loss, user.failing_since = user.loss, None, None
+        return loss or RequestTimeout(f"no progress for {self._op_deadline:g} s")
+
+    def lose(self, user: SessionUser, lost: SessionLost) -> None:
+        """Leave the session that its user found lost. The pause until the user's next try is as long as its
+        tries have failed, so each one doubles that time."""
+        self.server.lose(lost)
+        now, cause = self.clock(), lost.__cause__
+        user.loss = cause if isinstance(cause, MavftpfsError) else lost
+        if user.failing_since is None:
+            user.failing_since = now
+        failing = now - user.failing_since
+        user.retry_at = now + min(failing, max(0.0, self._op_deadline - failing))
 
     @property
     def _moved(self) -> float:

@@ -56,9 +56,6 @@ STALL = 2.0
 """Seconds without a reply, while a file is read or written, after which the file is opened anew, because the
 server may have closed its session."""
 
-REOPENS = 5
-"""How often a reader or an upload may lose the session without progress before it fails."""
-
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
 
@@ -119,7 +116,7 @@ class ServerSession:
         session: the open file; None if none is open, or if it was moved to `maybe_open`. transfer: the
         operation that reads or writes it now.
         maybe_open: (session id, path) of each file that this connection may have open: its open or its
-        Terminate is not answered (yet), or `distrust` moved it here.
+        Terminate is not answered (yet), or `distrust` moved it here. The path is b"" if that is not known.
         file_since: when the last open went out; from its ACK on, when that came. Requests that went out
         before concern an earlier file.
         epoch: the time of the last `distrust` of reads, always later than the one before. Bytes that were
@@ -141,6 +138,7 @@ class ServerSession:
     ) -> None:
         self.driver = driver
         self.engine = driver.engine
+        self.engine.on_unexplained, self.engine.on_late = self.on_unexplained, self.on_late
         self.vehicle = driver.vehicle
         self.clock = clock
         self.op_deadline = op_deadline
@@ -198,11 +196,17 @@ class ServerSession:
         the answer or the request, and the server executed the request twice.
 
         lateness: seconds since its request went out, None if that is not known. If the answer is the ACK of
-        another open than the present file's, reads are distrusted, because MAVSDK then has that file open in
-        place of the present one.
+        another open than the present file's, that file may be open now. Then reads are distrusted, because
+        MAVSDK has that file open in place of the present one.
         """
         self.quarantine.saw(lateness, self.clock())
-        self.distrust("an answer came that no request explains", reads=self._is_older_open(reply))
+        opened = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
+        another = opened and (self.session is None or self.session.seq != reply.seq)
+        why = "an answer came that no request explains"
+        self.distrust(why, reads=another and self.session is not None)
+        if another:
+            self.maybe_open.add((reply.session, b""))
+            self.wake()
 
     def on_late(self, reply: Payload, sent_at: float) -> None:
         """Take an ACK that no operation waits for, because another transmission was answered or the operation
@@ -219,11 +223,6 @@ class ServerSession:
                 self.on_unexplained(reply, self.clock() - sent_at)
         elif reply.req_opcode == Opcode.WRITE_FILE:
             self.distrust("a WriteFile came after its file was closed", reads=False)
-
-    def _is_older_open(self, reply: Payload) -> bool:
-        """Return whether a reply ACKs an open other than that of the present file."""
-        opened = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
-        return opened and self.session is not None and self.session.seq != reply.seq
 
     def leave(self) -> None:
         """Stop using the open file: cancel its transfer, and move it to `maybe_open`, so that it is closed
@@ -369,8 +368,8 @@ class ServerSession:
         if self.clock() < self.others.file_open_until:
             raise SessionTaken(_IN_USE) from nak
         for seconds in tried.silences:
-            if await self.driver.be_silent(seconds):
-                return
+            await self.driver.be_silent(seconds)
+            return
         if not tried.opens or tried.reset or not alone:
             raise SessionBusy(_IN_USE) from nak
         tried.reset = True
@@ -394,12 +393,12 @@ class ServerSession:
 
     # --- closing
 
-    async def close(self, limit: float | None = None) -> bool:
+    async def close(self, limit: float = inf) -> bool:
         """Terminate the session; return False if the server had closed it by itself before.
 
         If the server answers a repeated Terminate with "no such session", the first transmission closed it.
         Exception: after 8 s the server may have closed the session because it was idle. limit: seconds to
-        wait for the answer; None: op_deadline.
+        wait for the answer, inf for op_deadline.
 
         Raises:
             FtpNak: the server could not close the file. RequestTimeout: no answer; the file is in
@@ -411,19 +410,16 @@ class ServerSession:
         self._leave()
         asked_at = self.clock()
         try:
-            with trio.fail_after(self.op_deadline if limit is None else limit):
+            with trio.move_on_after(limit):
                 await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session.id))
-        except trio.TooSlowError:
-            if limit is None:  # a shorter one is no proof that the vehicle is lost
-                self.vehicle.note_timeout()
-            raise RequestTimeout("no answer to TerminateSession") from None
+                self._forget(session.id)
+                return True
         except FtpNak as nak:
             self._forget(session.id)
             if nak.code not in _NOT_OPEN:
                 raise
             return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
-        self._forget(session.id)
-        return True
+        raise RequestTimeout("no answer to TerminateSession")
 
     async def close_quietly(self) -> None:
         """Close the open file; a failure leaves it in `maybe_open`."""
@@ -456,12 +452,17 @@ class ServerSession:
         if self.session is not session:
             raise _lost()
 
+    @property
+    def longest_silence(self) -> float:
+        """How many seconds a transfer waits for any answer: STALL, or four round trips. Where these are not
+        known, they may be long."""
+        return max(STALL, 4.0 * (self.engine.rtt or STALL))
+
     def is_stalled(self, transfer: Operation) -> bool:
-        """Return whether a transfer waits for answers, and the server sent none of any kind for STALL seconds
-        or four round trips."""
+        """Return whether a transfer waits for answers, and the server sent none of any kind for long."""
         # Requests of the transfer that wait for `bwlimit=` are no silence.
         heard_at = max(self.driver.last_reply_at, transfer.progress_at)
-        return not transfer.idle and self.clock() - heard_at > max(STALL, 4.0 * (self.engine.rtt or 0.0))
+        return not transfer.idle and self.clock() - heard_at > self.longest_silence
 
     # --- requests beside the session
 

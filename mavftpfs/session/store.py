@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from math import inf
 
@@ -22,7 +23,7 @@ from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.protocol.writing import Pieces, WriteTransfer
-from mavftpfs.session.happened import After, Names, Outcome, together
+from mavftpfs.session.happened import After, Outcome, judge, together
 from mavftpfs.session.quarantine import MOST
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler, SessionUser
@@ -83,15 +84,6 @@ SWEEPS = 3
 
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
 """Refusals if a name does not exist (any more); the errno may be a stale one (docs/servers.md 12)."""
-
-_THERE = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_EXISTS))
-_SECOND = {
-    Opcode.REMOVE_FILE: _MISSING,
-    Opcode.REMOVE_DIRECTORY: _MISSING,
-    Opcode.RENAME: _MISSING,
-    Opcode.CREATE_DIRECTORY: _THERE,
-}
-"""Refusals of a request that was executed before, by opcode."""
 
 
 class Store:
@@ -287,10 +279,10 @@ class Store:
     async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
         server, driver = self._server, self._server.driver
         chunks = ChunkSize(min(self._scheduler.read_chunks.size, self._scheduler.write_chunks.size))
-        transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1, on_starved=server.wake)
+        transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1, on_drained=server.wake)
         try:
-            await driver.start(transfer, server.wake)
-            while not transfer.done and not transfer.starved:
+            driver.start(transfer, server.wake)
+            while not transfer.done and not transfer.drained:
                 server.require_open(session)
                 self._vehicle.require(self._clock(), writing=True)
                 driver.kick()
@@ -389,7 +381,7 @@ class Store:
             async with self._scheduler.excluded(*paths, below=below):
                 for path in () if at_once else paths:
                     await self.wait_out(path)
-                # closing a file may have taken a while
+                # the waits may have taken a while
                 self._vehicle.require(self._clock(), writing=not in_flight)
                 with self.finishing(until=until):
                     yield
@@ -417,88 +409,71 @@ class Store:
             finally:
                 self._under_way -= 1
                 now = self._clock()
-                for (
-                    path,
-                    then,
-                ) in after.items():  # a late RENAME finds nothing that it could give the new name
+                for path, then in after.items():
+                    # a late RENAME finds nothing that it could give the new name
                     counts = repeated and then is not After.PRESENT
                     self._quarantine.on_changed(path, now, now - began if counts else 0.0)
-            if isinstance(error, RequestTimeout):
-                outcome = await self._after_silence(after)
-                if outcome is Outcome.HAPPENED:
-                    return
-                if outcome is Outcome.DID_NOT:
-                    raise error
-                raise OutcomeUnknown(str(error)) from error
-            twice = last or self._may_be_second(error)
+            silent = isinstance(error, RequestTimeout)
+            twice = last or not isinstance(error, FtpNak) or self._may_be_second(error)
             # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
-            if not twice and error.code != NakCode.FILE_EXISTS:
+            if isinstance(error, FtpNak) and not twice and error.code != NakCode.FILE_EXISTS:
                 raise error
-            outcome = await self._after_refusal(error, after)
+            outcome = await self._look(after, error)
             if outcome is Outcome.HAPPENED and twice:
                 return
-            if outcome is not Outcome.DID_NOT or last:
+            if outcome is Outcome.UNKNOWN or (silent and outcome is Outcome.CONFLICT):
+                raise OutcomeUnknown(f"{error}; whether it was done is not known") from error
+            if outcome is not Outcome.DID_NOT or last or silent:
                 raise error
 
-    def _may_be_second(self, nak: FtpNak) -> bool:
+    def _may_be_second(self, error: FtpNak) -> bool:
         """Return whether a refusal may answer the second execution of a request.
 
-        A refused rename is looked at in any case, because the caller would take its refusal for proof that
-        the server renames no files.
+        A rename that is refused because a name is missing is looked at in any case, because the caller would
+        take its refusal for proof that the server renames no files.
         """
-        if nak.retransmitted:
-            return True
-        opcode = Opcode(nak.opcode)
-        looked_at = self._server.in_doubt() or opcode == Opcode.RENAME
-        return looked_at and nak.code in _SECOND.get(opcode, ())
+        missing = error.opcode == Opcode.RENAME and error.code in _MISSING
+        return error.retransmitted or missing or self._server.in_doubt()
 
-    async def _after_refusal(self, nak: FtpNak, after: Mapping[bytes, After]) -> Outcome:
-        try:
-            outcome = await self._look(after)
-        except FtpNak:
-            raise nak from None  # there is not even a parent to list
-        except MavftpfsError as error:
-            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from error
-        if outcome is Outcome.UNKNOWN:
-            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from nak
-        return outcome
-
-    async def _after_silence(self, after: Mapping[bytes, After]) -> Outcome:
-        with trio.move_on_after(VERIFY_LIMIT), suppress(MavftpfsError):
-            return await self._look(after)
+    async def _look(self, after: Mapping[bytes, After], error: FtpNak | RequestTimeout) -> Outcome:
+        """List the directories of these names; return the verdict on a change that failed with an error."""
+        with trio.move_on_after(VERIFY_LIMIT if isinstance(error, RequestTimeout) else inf):
+            try:
+                return await self._verdict(after)
+            except FtpNak:  # there is not even a parent to list
+                return Outcome.DID_NOT if isinstance(error, FtpNak) else Outcome.UNKNOWN
+            except MavftpfsError:
+                pass
         return Outcome.UNKNOWN
 
-    async def _look(self, after: Mapping[bytes, After]) -> Outcome:
-        """List the directories of these names; return the verdict on the change."""
-        listed = {}
+    async def _verdict(self, after: Mapping[bytes, After]) -> Outcome:
+        listed: dict[bytes, Listing] = {}
         for parent in {split(path)[0]: None for path in after}:
             listed[parent] = await self._names(parent)
-        evidence = [listed[split(path)[0]].judge(split(path)[1], then) for path, then in after.items()]
-        verdict = together(evidence)
+        verdict = together(
+            judge(listed[split(path)[0]], split(path)[1], then) for path, then in after.items()
+        )
         for path, then in after.items():  # a directory with entries is somebody else's
             made = then is After.DIRECTORY and verdict is Outcome.HAPPENED
             if made and (await self.list_directory(path)).entries:
                 return Outcome.CONFLICT
         return verdict
 
-    async def _names(self, directory: bytes) -> Names:
-        """Return what a fresh listing shows.
+    async def _names(self, directory: bytes) -> Listing:
+        """Return a fresh listing.
 
         The directory is listed again if this store changed names meanwhile, because a sweep goes on by a
         count of names, and misses those that moved up in place of a removed one. After SWEEPS listings,
         return all names that any of them showed.
         """
         seen: dict[bytes, DirEntry] = {}
-        complete = False
         for _ in range(SWEEPS):
             before = self._sent
             listing = await self.list_directory(directory)
-            complete = listing.complete
-            fresh = {entry.name: entry for entry in listing.entries}
             if self._sent == before and not self._under_way:
-                return Names(fresh, complete)
-            seen |= fresh
-        return Names(seen, complete)
+                return listing
+            seen |= {entry.name: entry for entry in listing.entries}
+        return replace(listing, entries=tuple(seen.values()))
 
 
 def _asking_times(

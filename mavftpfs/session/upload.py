@@ -21,14 +21,14 @@ import trio
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import WriteTransfer, is_path_refusal
 from mavftpfs.session.scheduler import Future, Scheduler, SessionUser, Turn
-from mavftpfs.session.serversession import REOPENS, TERMINATE_LIMIT, OpenSession
+from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession
+from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
     LocalProtocolError,
     MavftpfsError,
     ProtocolError,
-    RequestTimeout,
     SessionLost,
 )
 from mavftpfs.shared.model import is_on_nuttx, split, wire_path
@@ -37,7 +37,7 @@ from mavftpfs.shared.sending import SendBuffer
 RETRY_AFTER = 5.0
 """Seconds after a failure of the link before it is tried again in the background."""
 
-STARVE = 0.5
+DRAINED_SECONDS = 0.5
 """Seconds for which an upload keeps the session with nothing to send, because PX4 frees buffers after 2 s,
 and a log that a program appends to each second must not keep the session for ever."""
 
@@ -54,7 +54,7 @@ _OFTEN = 0.25
 class Stop(Enum):
     """Why an upload lets go of the session."""
 
-    STARVED = "starved"
+    DRAINED = "drained"
     """The source has nothing to send, and all sent bytes are ACKed."""
     YIELD = "yield"
     """The upload resumes in a later turn."""
@@ -85,11 +85,9 @@ class Upload(SessionUser):
         self._waits_for_finish = False  # until then nothing is sent: refused, or all would go again
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
-        self._retry_at = 0.0  # not to be touched before
         self._changed = trio.lowlevel.ParkingLot()
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
-        self._losses = 0  # of the session, without progress
-        self._furthest = 0  # in the file, when the session was lost the last time
+        self._furthest = 0  # one past the highest byte that was ever ACKed
         self._cannot_resume = False  # its file was not opened again, or was empty then, or no size was told
 
     # --- the owner's side
@@ -106,7 +104,7 @@ class Upload(SessionUser):
         if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._waits_for_finish, self._losses, self._retry_at = False, 0, 0.0
+        self._waits_for_finish, self.failing_since, self.retry_at = False, None, -inf
         finisher = Future()
         if not self.awaited:
             self._awaited_since = self._clock()
@@ -147,7 +145,7 @@ class Upload(SessionUser):
         """Raise Armed in the callers at once if the upload waits for a turn. In a turn, `_watch` notices that
         the vehicle is armed. The upload resumes when the vehicle disarms."""
         if self._vehicle.may_write:
-            self._retry_at = 0.0
+            self.retry_at = -inf
         else:
             self._scheduler.refuse(self, Armed("the vehicle was armed"))
         self._changed.unpark_all()
@@ -177,6 +175,8 @@ class Upload(SessionUser):
         elif not self._has_work():
             self._complete(list(self._finishers))
         else:
+            if (failure := self._scheduler.failure(self)) is not None:
+                raise failure
             self.waiting_since = self._clock()
             async with self._scheduler.turn(self) as turn:
                 await self._use(turn)
@@ -187,7 +187,7 @@ class Upload(SessionUser):
         wanted = self.awaited or (not self._waits_for_finish and self._has_work())
         if not wanted or not self._vehicle.may_write:
             return inf
-        return self._retry_at - self._clock()
+        return self.retry_at - self._clock()
 
     def _has_work(self) -> bool:
         """Whether there is something to send or to close. An empty file, too, has to be created once."""
@@ -200,7 +200,7 @@ class Upload(SessionUser):
         for finisher in self._finishers:
             finisher.end(error)
         self._waits_for_finish = isinstance(error, REFUSALS)
-        self._retry_at = self._clock() + RETRY_AFTER
+        self.retry_at = self._clock() + RETRY_AFTER
 
     async def _use(self, turn: Turn) -> None:
         """Use a turn: open, write, close."""
@@ -210,29 +210,23 @@ class Upload(SessionUser):
             # All that was given by now is in the file that is closed next; what comes later is not.
             finishers = list(self._finishers)
             await self._close(session, stop)
-            if stop is Stop.STARVED:
+            if stop is Stop.DRAINED:
                 self._complete(finishers)
         except MavftpfsError as error:
             self._on_failure(error)
 
     def _on_failure(self, error: MavftpfsError) -> None:
-        """Have all bytes since the last checkpoint sent again, because a turn failed. A lost session is an
-        error only after REOPENS losses without progress.
+        """Have all bytes since the last checkpoint sent again, because a turn failed. A lost session is no
+        error, because the upload tries again.
 
         Raises:
-            MavftpfsError: what it failed with.
+            MavftpfsError: what it failed with; Armed if the vehicle is armed.
         """
+        self._source.roll_back()
         if not isinstance(error, SessionLost):
             self._server.leave()
-            self._source.roll_back()
-            raise error
-        self._server.lose(error)
-        if self._source.reached > self._furthest:
-            self._furthest, self._losses = self._source.reached, 0
-        self._source.roll_back()
-        self._losses += 1
-        if self._losses > REOPENS:
-            raise error.__cause__ if isinstance(error.__cause__, MavftpfsError) else error
+            raise error if self._vehicle.may_write else Armed(readonly.ARMED)
+        self._scheduler.lose(self, error)
 
     @property
     def _keeps_content(self) -> bool:
@@ -252,7 +246,7 @@ class Upload(SessionUser):
         next `finish`."""
         for finisher in finishers:
             finisher.end()
-        self._losses = 0
+        self.failing_since = None
         self._waits_for_finish = self._source.has_checkpoint and not self._may_interrupt
 
     # --- opening
@@ -321,11 +315,11 @@ class Upload(SessionUser):
             self._scheduler.write_chunks,
             root=storage_root(self.path),
             in_flight=queue // 2 if queue and turn.interactive_waits else None,
-            on_starved=server.wake,
+            on_drained=server.wake,
         )
         self._transfer = server.transfer = transfer
         try:
-            await self._driver.start(transfer, server.wake, self._on_batch)
+            self._driver.start(transfer, server.wake, self._on_batch)
             stop = await self._watch(turn, session, transfer)
         finally:
             self._end_transfer()
@@ -339,8 +333,11 @@ class Upload(SessionUser):
         return stop
 
     def _on_batch(self, now: float) -> None:
-        """Wake the turn's task when a batch of replies left the transfer nothing to do."""
+        """Note progress, and wake the turn's task when a batch of replies left the transfer nothing to do.
+        Bytes that were ACKed before the session was lost are no progress."""
         transfer = self._transfer
+        if self._source.reached > self._furthest:
+            self._furthest, self.failing_since = self._source.reached, None
         if transfer is not None and (transfer.idle or transfer.done):
             self._server.wake()
 
@@ -350,13 +347,15 @@ class Upload(SessionUser):
         fed_at = clock()
         while not transfer.done:
             server.require_open(session)
-            if not transfer.starved:
+            if not transfer.drained:
                 fed_at = clock()
             stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
             # After a silence the session may be gone (servers.md 14.9), which the answer to Terminate shows.
             # If closing costs the whole file, the upload closes it only if another client was heard.
             closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
+            if stalled and self.failing_since is not None:
+                raise SessionLost("no answer for a while during a write", by_server=False)
             if stalled and stop is None:
                 stop = Stop.YIELD
             transfer.paused = stop is not None
@@ -367,15 +366,15 @@ class Upload(SessionUser):
         return None
 
     def _reason_to_stop(
-        self, turn: Turn, session: OpenSession, transfer: WriteTransfer, starved_for: float
+        self, turn: Turn, session: OpenSession, transfer: WriteTransfer, drained_for: float
     ) -> Stop | None:
-        """Return why the upload should stop now, or None. starved_for: seconds with nothing to send."""
+        """Return why the upload should stop now, or None. drained_for: seconds with nothing to send."""
         if not self._vehicle.may_write:
             return Stop.ARMED
         if self._scheduler.is_excluded(self.path):
             return Stop.YIELD
-        if transfer.starved and (self.awaited or starved_for >= STARVE):
-            return Stop.STARVED
+        if transfer.drained and (self.awaited or drained_for >= DRAINED_SECONDS):
+            return Stop.DRAINED
         if turn.contended:
             over = self._may_interrupt and turn.is_over()
         else:
@@ -399,11 +398,7 @@ class Upload(SessionUser):
         session. But a restart makes ACKs suspect, so the file is compared; and `_reopen` compares its size.
         """
         self._server.require_open(session)
-        try:
-            ours = await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
-        except RequestTimeout as error:
-            raise SessionLost(str(error)) from error
-        if not ours:
+        if not await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else inf):
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         self._source.check_point()
 

@@ -53,9 +53,8 @@ class Answering:
             if answer == "taken":  # another client has it, before the caller goes on
                 self.server.leave()
 
-    async def be_silent(self, seconds: float) -> bool:
+    async def be_silent(self, seconds: float) -> None:
         await trio.sleep(seconds)
-        return True
 
 
 @given(st.lists(st.tuples(ACTS, st.lists(ANSWERS, max_size=6)), max_size=12))

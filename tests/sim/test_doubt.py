@@ -121,7 +121,6 @@ async def test_neither_a_clean_link_nor_our_own_repetitions_raise_it(profile: st
         await put(connection, path(profile, "new"), content(20_000))
         await connection.store.remove(path(profile, "new"))
         assert connection.engine.stats.lost or not loss
-        assert connection.engine.stats.unexplained == 0
         assert loss or not connection.store.in_doubt()
 
 

@@ -52,8 +52,7 @@ async def test_little_of_a_large_file_is_asked_for_twice_over_a_bad_link(
     data, options = content(300_000), ConnectOptions(read_mode=mode)
     async with rig(profile, {b"/big": data}, link=BAD, options=options) as here:
         assert await read_file(here.connection, here.root + b"/big") == data
-        sent = here.connection.engine.stats.by_opcode
-        asked = sent[Opcode.READ_FILE] + sent[Opcode.BURST_READ_FILE]
+        asked = here.count(Opcode.READ_FILE, Opcode.BURST_READ_FILE)
         assert asked <= 1.5 * (-(-len(data) // MAX_DATA)) / (1 - BAD.loss) ** 2
     assert here.server.open_sessions == 0
 
@@ -85,8 +84,7 @@ async def test_a_clamp_may_come_and_go_while_a_file_is_read(profile: str, mode: 
     async with here.connected(ConnectOptions(read_mode=mode)) as connection, trio.open_nursery() as nursery:
         nursery.start_soon(clamp)
         assert await read_file(connection, here.root + b"/big") == data
-        sent = connection.engine.stats.by_opcode
-        assert sent[Opcode.READ_FILE] <= 3.5 * len(data) / MAX_DATA
+        assert here.count(Opcode.READ_FILE) <= 3.5 * len(data) / MAX_DATA
 
 
 async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
@@ -94,7 +92,7 @@ async def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
     data = content(1_000_000)
     async with rig("px4-nuttx", {b"/big": data}, link=LinkSettings(delay=0.001)) as here:
         assert await read_file(here.connection, here.root + b"/big") == data
-        assert here.connection.engine.stats.by_opcode[Opcode.READ_FILE] <= 1.25 * (-(-len(data) // MAX_DATA))
+        assert here.count(Opcode.READ_FILE) <= 1.25 * (-(-len(data) // MAX_DATA))
 
 
 @EACH
@@ -134,7 +132,7 @@ async def test_a_long_listing_with_times_is_not_taken_for_silence() -> None:
         assert len(listing.entries) == 200
         assert all(entry.mtime is not None for entry in listing.entries)
         assert connection.engine.traits.lists_times is True
-        assert Opcode.LIST_DIRECTORY not in connection.engine.stats.by_opcode
+        assert not here.count(Opcode.LIST_DIRECTORY)
 
 
 @pytest.mark.holds("rule 14.39")
@@ -160,7 +158,7 @@ async def test_a_whole_read_beside_another_client_is_not_believed(profile: str) 
         began = trio.current_time()
         assert await connection.store.read_whole(b"/f", 100_000) == data
         assert trio.current_time() - began > 12.0 + LEFT_OPEN
-        assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
+        assert here.count(Opcode.OPEN_FILE_RO) == 2
 
 
 @pytest.mark.holds("rule 14.12")
@@ -216,7 +214,7 @@ async def test_a_whole_read_survives_a_lost_session(profile: str) -> None:
 
         nursery.start_soon(close_it)
         assert await connection.store.read_whole(b"/f", 100_000) == data
-        assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
+        assert here.count(Opcode.OPEN_FILE_RO) == 2
 
 
 @pytest.mark.parametrize(("pause", "doubted"), [(2.0, True), (11.0, False)])
@@ -264,7 +262,7 @@ async def test_bursts_through_the_caches(profile: str) -> None:
     files = {b"/f": content(300_000, 3), b"/g": content(239 * 500, 4)}
     for path, data in files.items():
         here.card.add(path, data)
-    async with here.connected(ConnectOptions(read_mode="burst")) as connection:
+    async with here.connected(ConnectOptions(read_mode="burst")):
         tree = here.mount(root=b"/", cache_size=1 << 20)
         opened = {path: await tree.open(path) for path in files}
 
@@ -279,9 +277,8 @@ async def test_bursts_through_the_caches(profile: str) -> None:
             nursery.start_soon(read_all, b"/g", 0)
         for file in opened.values():
             await file.release()
-        stats = connection.engine.stats
-        assert stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
-        assert stats.by_opcode[Opcode.READ_FILE] < 300_000 / 239 / 2
+        assert here.count(Opcode.BURST_READ_FILE) >= 5
+        assert here.count(Opcode.READ_FILE) < 300_000 / 239 / 2
     assert here.server.open_sessions == 0
 
 
@@ -302,5 +299,5 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(profile: 
             assert len(listing.entries) == 21
             await trio.sleep(0.7)
         assert await sink.wait_for(0, len(data)) == data
-        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 4
+        assert here.count(Opcode.BURST_READ_FILE) >= 4
         reader.close()

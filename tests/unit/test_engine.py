@@ -102,7 +102,6 @@ def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
         engine.receive(packet(burst, index, bytes(239)), now)
         engine.on_deadline(now)
         assert sent(engine, now) == []
-    assert engine.stats.unknown == 19_999
     engine.receive(ack(request), 4.0)
     assert op.done
 
@@ -240,7 +239,6 @@ def test_reads_go_out_again_under_new_seqs_and_old_answers_still_count() -> None
     assert (second.offset, second.size) == (first.offset, first.size)
     engine.receive(chunk(first, b"a" * 100), 1.1)
     assert bytes(sink.data) == b"a" * 100
-    assert engine.stats.spurious == 1
     engine.receive(chunk(second, b"b" * 100), 1.2)
     assert bytes(sink.data) == b"a" * 100
     assert transfer.idle
@@ -261,7 +259,6 @@ def test_later_answers_prove_a_loss_a_moment_after_a_round_trip() -> None:
     assert again[0].offset == out[0].offset
     assert again[0].seq != out[0].seq
     assert engine.stats.lost == 1
-    assert engine.stats.by_opcode[Opcode.READ_FILE] == engine.stats.requests
     assert not sink.have.covers(0, 1)
 
 
@@ -284,7 +281,9 @@ def test_what_was_lost_often_does_not_wait_for_its_timer() -> None:
 @pytest.mark.holds("fault duplicate")
 @pytest.mark.parametrize("late", [0.115, 0.3])
 def test_a_late_answer_to_a_lost_request_counts_and_the_next_ones_are_waited_for(late: float) -> None:
+    unexplained: list[Payload] = []
     engine = make(limit=2)
+    engine.on_unexplained = lambda reply, lateness: unexplained.append(reply)
     transfer, sink = reading(engine, 478)
     first, second = sent(engine, 0.0)
     engine.receive(chunk(second, b"b" * 478), 0.1)
@@ -294,10 +293,9 @@ def test_a_late_answer_to_a_lost_request_counts_and_the_next_ones_are_waited_for
     engine.receive(chunk(first, b"a" * 478), late)
     assert sink.have.covers(0, 478)
     assert transfer.idle
-    assert engine.stats.spurious == 1
     assert engine._timers.reordering.share(late) == 0.25
     engine.receive(chunk(again, b"c" * 478), late)
-    assert (engine.stats.spurious, engine.stats.unexplained) == (1, 0)
+    assert not unexplained
 
 
 def test_slow_progress_is_progress() -> None:

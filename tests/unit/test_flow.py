@@ -76,11 +76,11 @@ def test_a_start_that_overflows_a_buffer_ends() -> None:
     assert path.window <= wide
 
 
-def test_a_starved_round_proves_nothing() -> None:
+def test_an_application_limited_round_proves_nothing() -> None:
     path = Path(rate=1000.0, base=0.1, rounds=20)
     before = path.window
     for _ in range(30):
-        path.flow.on_starved()
+        path.flow.on_app_limited()
         path.flow.on_replies(path.now + 1.0, 0.1, 1, path.order, path.order + 1)
         path.order += 1
         path.now += 1.0

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.session.happened import After, Names, Outcome, together
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.session.happened import After, Outcome, judge, together
+from mavftpfs.shared.model import DirEntry, EntryKind, Listing
 
 HAPPENED, DID_NOT, CONFLICT, UNKNOWN = Outcome
 
 
-def listing(*names: bytes, complete: bool = True) -> Names:
+def listing(*names: bytes, complete: bool = True) -> Listing:
     """Return a listing; names that begin with D are directories."""
     kinds = {name: EntryKind.DIRECTORY if name.startswith(b"D") else EntryKind.FILE for name in names}
-    return Names({name: DirEntry(name, kind) for name, kind in kinds.items()}, complete)
+    return Listing(tuple(DirEntry(name, kind) for name, kind in kinds.items()), 0.0, complete)
 
 
 @pytest.mark.parametrize(
@@ -33,5 +33,5 @@ def listing(*names: bytes, complete: bool = True) -> Names:
         (listing(b"b", complete=False), {b"a": After.ABSENT, b"b": After.PRESENT}, UNKNOWN),
     ],
 )
-def test_verdicts(shown: Names, after: dict[bytes, After], verdict: Outcome) -> None:
-    assert together(shown.judge(name, then) for name, then in after.items()) is verdict
+def test_verdicts(shown: Listing, after: dict[bytes, After], verdict: Outcome) -> None:
+    assert together(judge(shown, name, then) for name, then in after.items()) is verdict

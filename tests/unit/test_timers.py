@@ -8,29 +8,29 @@ import pytest
 
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.protocol.requests import MANNERS, READ_MANNER, Manner, Request
+from mavftpfs.protocol.requests import READ_POLICY, RETRY_POLICIES, Request, RetryPolicy
 from mavftpfs.protocol.timers import EIGHTH, FADE, LONGEST_BACK_OFF, MOST_LATE, RttEstimator, Timers
 
-LIST, OPEN = MANNERS[Opcode.LIST_DIRECTORY], MANNERS[Opcode.OPEN_FILE_RO]
+LIST, OPEN = RETRY_POLICIES[Opcode.LIST_DIRECTORY], RETRY_POLICIES[Opcode.OPEN_FILE_RO]
 
 
-def request(manner: Manner, sent_at: float = 100.0) -> Request:
-    request = Request(Simple(Opcode.NONE), Opcode.NONE, manner, 0, 0, 0)
+def request(policy: RetryPolicy, sent_at: float = 100.0) -> Request:
+    request = Request(Simple(Opcode.NONE), Opcode.NONE, policy, 0, 0, 0)
     request.sent_at = sent_at
     return request
 
 
-def learned(manner: Manner, rtt: float) -> Timers:
+def learned(policy: RetryPolicy, rtt: float) -> Timers:
     timers = Timers()
-    timers.sample(request(manner), 100.0 + rtt)
+    timers.sample(request(policy), 100.0 + rtt)
     return timers
 
 
-def waits(timers: Timers, manner: Manner, count: int) -> list[float]:
+def waits(timers: Timers, policy: RetryPolicy, count: int) -> list[float]:
     """Return how long each transmission waits of a request that nothing answers."""
     times = [0.0]
     for _ in range(count):
-        times.append(times[-1] + timers.wait(manner, times[-1]))
+        times.append(times[-1] + timers.wait(policy, times[-1]))
     return [after - before for before, after in pairwise(times)]
 
 
@@ -42,14 +42,14 @@ def test_nor_are_listings_piled_up_where_nothing_is_known() -> None:
 def test_an_open_waits_as_long_as_listings_took_and_not_a_second(rtt: float, wait: float) -> None:
     timers = learned(LIST, rtt)
     assert timers.timeout(OPEN) == pytest.approx(wait)
-    assert timers.timeout(READ_MANNER) == pytest.approx(3 * rtt)
+    assert timers.timeout(READ_POLICY) == pytest.approx(3 * rtt)
 
 
 def test_chunks_and_single_requests_have_round_trips_of_their_own() -> None:
     timers = learned(OPEN, 0.5)
-    timers.sample(request(READ_MANNER), 100.03)
+    timers.sample(request(READ_POLICY), 100.03)
     assert timers.timeout(OPEN) == pytest.approx(1.5)
-    assert timers.timeout(READ_MANNER) == pytest.approx(0.09)
+    assert timers.timeout(READ_POLICY) == pytest.approx(0.09)
 
 
 @pytest.mark.holds("rule 14.38")
@@ -60,20 +60,20 @@ def test_variation_widens() -> None:
     assert timer.rto > 0.5
 
 
-@pytest.mark.parametrize("manner", [READ_MANNER, OPEN, LIST])
-def test_waits_grow_with_the_time_without_an_answer_up_to_a_cap(manner: Manner) -> None:
-    grown = waits(learned(manner, 0.1), manner, 40)
+@pytest.mark.parametrize("policy", [READ_POLICY, OPEN, LIST])
+def test_waits_grow_with_the_time_without_an_answer_up_to_a_cap(policy: RetryPolicy) -> None:
+    grown = waits(learned(policy, 0.1), policy, 40)
     assert grown[:2] == pytest.approx([0.3, 0.3])
     assert grown == sorted(grown)
     assert grown[-1] == LONGEST_BACK_OFF
 
 
 def test_what_went_and_came_together_is_one_sample() -> None:
-    one, three = learned(READ_MANNER, 0.2), learned(READ_MANNER, 0.2)
+    one, three = learned(READ_POLICY, 0.2), learned(READ_POLICY, 0.2)
     for _ in range(2):
-        three.sample(request(READ_MANNER), 100.2)
+        three.sample(request(READ_POLICY), 100.2)
     assert three.bulk.rto == one.bulk.rto
-    three.sample(request(READ_MANNER), 100.3)
+    three.sample(request(READ_POLICY), 100.3)
     assert three.bulk.rto != one.bulk.rto
 
 
@@ -82,7 +82,7 @@ def test_what_went_and_came_together_is_one_sample() -> None:
 
 @pytest.mark.holds("fault duplicate")
 def test_what_comes_late_and_not_at_all_widens_the_patience_which_fades() -> None:
-    timers = learned(READ_MANNER, 0.1)
+    timers = learned(READ_POLICY, 0.1)
     assert timers.passed_wait(100.0) == pytest.approx(0.1125)
     timers.reordering.on_needless(100.0)
     assert timers.passed_wait(100.0) == pytest.approx(0.125)
@@ -98,9 +98,9 @@ def test_what_comes_late_and_not_at_all_widens_the_patience_which_fades() -> Non
 CRC = Opcode.CALC_FILE_CRC32
 
 
-def work(server_time: float, opcode: Opcode = CRC) -> Manner:
+def work(server_time: float, opcode: Opcode = CRC) -> RetryPolicy:
     (one,) = Simple(opcode, b"/f", server_time=server_time).next_requests(1, 0.0)
-    return one.manner
+    return one.policy
 
 
 @pytest.mark.holds("rule 14.38")

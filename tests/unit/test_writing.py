@@ -51,7 +51,7 @@ def test_chunks_go_out_ascending_and_full() -> None:
     for one in requests:
         engine.receive(ack(one), 0.1)
     assert sent(engine, 0.1) == []
-    assert transfer.starved
+    assert transfer.drained
     assert transfer.idle
     assert not transfer.done
     assert source.acked.covers(0, len(CONTENT))
@@ -65,7 +65,7 @@ def test_a_short_write_sends_the_rest() -> None:
     [first] = sent(engine, 0.0)
     engine.receive(ack(first, count(100)), 0.1)
     assert source.acked.total == 100
-    assert not transfer.starved
+    assert not transfer.drained
     [rest] = sent(engine, 0.1)
     assert (rest.offset, rest.data) == (100, CONTENT[100:239])
     engine.receive(ack(rest, count(139)), 0.2)
