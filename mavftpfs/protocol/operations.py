@@ -222,7 +222,7 @@ class ListDirectory(Operation):
         if reply.opcode == Opcode.NAK:
             nak = nak_of(request, reply)
             # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
-            if self._beyond or nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages):
+            if nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self.strings):
                 self.progress(now)
                 self._on_eof()
             else:

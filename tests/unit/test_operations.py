@@ -269,6 +269,17 @@ def test_an_old_name_or_none_behind_the_end_proves_nothing(again: bytes) -> None
     assert lister.op.end == 1
 
 
+@pytest.mark.holds("rule 14.29")
+@pytest.mark.parametrize("code", [(NakCode.INVALID_SESSION,), (NakCode.FAIL_ERRNO, 5)])
+def test_another_refusal_behind_the_end_proves_no_end(code: tuple[int, ...]) -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.EOF)
+    lister.end(*code)
+    assert isinstance(lister.op.error, FtpNak)
+    assert lister.op.end is None
+
+
 def test_behind_a_known_end_nothing_is_asked_for() -> None:
     lister = Lister(known_end=1)
     lister.page(b"Fa\t1\0")
