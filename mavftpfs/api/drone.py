@@ -90,7 +90,7 @@ class _Connected:
             UsageError: several vehicles are on the link, and `target_system` does not name one.
         """
         if not self.is_meant:
-            await self.session.require_one_vehicle(IN_PYTHON)
+            await self.session.require_changeable(IN_PYTHON)
             self.is_meant = True
 
     async def close_files(self) -> None:

@@ -356,8 +356,8 @@ def _get_parser(name: str) -> Parser:
         "--to",
         metavar="LOCAL",
         default=".",
-        help="local directory (made if it ends in /, or for several files), new name of one file, or - for "
-        "stdout (default: .)",
+        help="local directory (made if it ends in /, or for several files), or new name of one file "
+        "(default: .)",
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="download directories, too")
     _add_patterns(parser, "PATH")

@@ -22,7 +22,7 @@ from mavftpfs.cli.drawing import shown
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session, Target
 from mavftpfs.client.parameters import Change, ChangePlan, Difference
-from mavftpfs.client.progress import Progress
+from mavftpfs.client.progress import Progress, followed
 from mavftpfs.parameters.text import Line
 from mavftpfs.parameters.values import Kind, Parameter, text_of
 from mavftpfs.shared.errors import ExitCode, InvalidText, MavftpfsError, UsageError
@@ -280,7 +280,8 @@ class _Setting:
             return
         try:
             with shown(self.bar):
-                await client.set_values(session, changes, self.bar)
+                async with followed(session, self.bar):
+                    await client.set_values(session, changes, self.bar)
         except MavftpfsError as error:
             for line in await client.last_error(session):
                 if not line.endswith(str(error)):

@@ -28,7 +28,7 @@ from mavftpfs.client import download, logs, names, upload
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
-from mavftpfs.client.progress import Progress, noting_losses
+from mavftpfs.client.progress import Progress, followed
 from mavftpfs.client.recover import Left, put_back
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
@@ -120,7 +120,7 @@ async def one_vehicle(target: Target, *, writing: bool) -> AsyncIterator[Session
     """
     async with target.session(writing=writing) as session:
         if writing:
-            await session.require_one_vehicle(ON_COMMAND_LINE)
+            await session.require_changeable(ON_COMMAND_LINE)
             yield session
             return
         async with session.noting_others(say, ON_COMMAND_LINE):
@@ -215,11 +215,7 @@ def _print_outcome(args: Args, outcome: download.Outcome) -> None:
 def get(args: Args) -> int:
     """Download files."""
     if args.to == STDOUT:
-        if args.recursive:
-            raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
-        if args.include or args.exclude:
-            raise UsageError("--to - writes all that PATH names; leave out --include and --exclude")
-        return cat(args)
+        raise UsageError("--to - is not a name here; to write files to stdout, use: mavftpfs cat")
     wanted, component = _paths_of(args)
     selection = Selection(include=tuple(args.include), exclude=tuple(args.exclude))
     outcome = download.Outcome()
@@ -292,7 +288,7 @@ def _download(
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify)
-        async with noting_losses(session, bar):
+        async with followed(session, bar):
             await function(download.Downloads(fetcher, outcome, _Printed()))
 
     with _on_interrupt(lambda: _here(outcome)), shown(bar):
@@ -388,7 +384,7 @@ def _put(args: Args, locals_: Sequence[Path]) -> int:
             verified = f"verified by {proof}" if proof else "verified"
             print(f"{_name(session.on_vehicle(remote))}: {readable_size(size)}, {verified}", flush=True)
 
-        async with noting_losses(session, bar):
+        async with followed(session, bar):
             await upload.put_paths(session, batches, path, bar, tell, into=into)
 
     def stopped() -> str:
@@ -482,7 +478,7 @@ def recover(args: Args) -> int:
         print(f"{_name(copy.path or b'')} {how}; the copy here is removed", flush=True)
 
     async def work(session: Session) -> Left:
-        async with noting_losses(session, bar):
+        async with followed(session, bar):
             return await put_back(session, wanted, bar, tell)
 
     with shown(bar):

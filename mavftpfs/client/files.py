@@ -35,7 +35,7 @@ from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import HEARD_SOON, Connection
-from mavftpfs.shared import errors
+from mavftpfs.shared import errors, readonly
 from mavftpfs.shared.errors import NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
 from mavftpfs.shared.options import Options
@@ -213,7 +213,8 @@ class Session:
     status: returns the facts of `status --json` about vehicle, link and transfers. root: the vehicle's
     directory that is `/` in `files`. mountpoint: of the mount that serves the files, None for a connection of
     this program's own. patience: seconds to wait for a lost vehicle. unnamed: the vehicles on the link; None
-    if SOURCE or the options name one.
+    if SOURCE or the options name one. read_only: the user's options forbid changes of a mount that allows
+    them.
     """
 
     files: Files
@@ -222,13 +223,16 @@ class Session:
     mountpoint: str | None = None
     patience: float = 0.0
     unnamed: Unnamed | None = None
+    read_only: bool = False
 
-    async def require_one_vehicle(self, option: str) -> None:
-        """Check, before a change, that the user can mean only this vehicle.
+    async def require_changeable(self, option: str) -> None:
+        """Check, before a change, that the user allows changes, and can mean only this vehicle.
 
         Raises:
-            UsageError: several vehicles are on the link, and the user named none.
+            ReadOnly. UsageError: several vehicles are on the link, and the user named none.
         """
+        if self.read_only:
+            raise errors.ReadOnly(readonly.NOTHING_BY_OPTION)
         if self.unnamed is not None:
             await self.unnamed.require_one(option)
 
@@ -254,17 +258,13 @@ class Session:
             return True
         return False
 
-    async def acknowledged(self, path: bytes) -> int | None:
-        """Return the number of bytes that the vehicle has of a file in flight; None for another file. Raises:
-        as `lost`."""
-        name = self.on_vehicle(path).decode(errors="replace")
-        transfers = (await self.status())["transfers"]
-        sent = {facts["path"]: facts["done"] for facts in transfers if facts["direction"] == "write"}
-        return sent.get(name)
-
     def on_vehicle(self, path: bytes) -> bytes:
         """Return the path of a file on the vehicle."""
         return self.root.rstrip(b"/") + path if path != b"/" else self.root
+
+    def text_of(self, path: bytes) -> str:
+        """Return the path of a file on the vehicle as in `status --json`."""
+        return self.on_vehicle(path).decode(errors="replace")
 
     async def size_now(self, path: bytes) -> int:
         """Ask the vehicle for a file's size, even if one is known."""
@@ -353,9 +353,16 @@ async def _session_on(
 ) -> AsyncIterator[Session]:
     """Give the files below `root` of a vehicle to the body, by the mount with this status."""
     dial = partial(connect, status, mountpoint)
-    files = MountFiles(dial, mountpoint, os.fsencode(status["root"]), root, read_only=options.read_only)
+    files = MountFiles(dial, mountpoint, os.fsencode(status["root"]), root)
     try:
-        yield Session(files, files.status, root, mountpoint, options.connect_timeout)
+        yield Session(
+            files,
+            files.status,
+            root,
+            mountpoint,
+            options.connect_timeout,
+            read_only=options.read_only,
+        )
     finally:
         files.close()
 

@@ -14,8 +14,7 @@ from mavftpfs.client import wire
 from mavftpfs.client.control import MAX_LINE, Refused, granted
 from mavftpfs.client.mounts import Status
 from mavftpfs.client.wire import Facts, Message
-from mavftpfs.shared import readonly
-from mavftpfs.shared.errors import LinkClosed, NotFound, ReadOnly, RemoteProtocolError
+from mavftpfs.shared.errors import LinkClosed, NotFound, RemoteProtocolError
 from mavftpfs.shared.model import ROOT, normalise
 from mavftpfs.shared.readable import name_text
 
@@ -130,15 +129,11 @@ class MountFiles:
     """Implements client.files.Files. Paths are below `root`, a directory of the vehicle; `mounted` is the
     directory at the mount's root."""
 
-    def __init__(
-        self, dial: Dial, mountpoint: str, mounted: bytes, root: bytes, *, read_only: bool = False
-    ) -> None:
-        """read_only: refuse changes, even if the mount allows them."""
+    def __init__(self, dial: Dial, mountpoint: str, mounted: bytes, root: bytes) -> None:
         self._dial = dial
         self._mountpoint = mountpoint
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
-        self._read_only = read_only
         self._idle: list[Connection] = []
         self._of_files: set[Connection] = set()
 
@@ -168,33 +163,26 @@ class MountFiles:
         self, path: bytes, *, write: bool = False, truncate: bool = False, append: bool = False
     ) -> MountFile:
         """See Files."""
-        if write or truncate:
-            self._require_writable(path)
         return await self._open("open", path, {"write": write, "truncate": truncate, "append": append})
 
     async def create(self, path: bytes, *, exclusive: bool) -> MountFile:
         """See Files."""
-        self._require_writable(path)
         return await self._open("create", path, {"exclusive": exclusive})
 
     async def mkdir(self, path: bytes) -> None:
         """See Files."""
-        self._require_writable(path)
         await self._ask("mkdir", path)
 
     async def rmdir(self, path: bytes) -> None:
         """See Files."""
-        self._require_writable(path)
         await self._ask("rmdir", path)
 
     async def unlink(self, path: bytes) -> None:
         """See Files."""
-        self._require_writable(path)
         await self._ask("unlink", path)
 
     async def rename(self, old: bytes, new: bytes) -> None:
         """See Files."""
-        self._require_writable(old)
         await self._ask("rename", old, {"new": wire.text(self._place(new))})
 
     async def refresh(self) -> None:
@@ -233,10 +221,6 @@ class MountFiles:
                 f"{self._mountpoint}"
             )
         return remote[len(self._mounted) :] or ROOT
-
-    def _require_writable(self, path: bytes) -> None:
-        if self._read_only:
-            raise ReadOnly(readonly.by_option(normalise(self._root + b"/" + path)))
 
 
 class MountFile:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from mavftpfs.client.files import Session, Target, reading, written
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.upload import watched
 from mavftpfs.parameters.own import is_own
 from mavftpfs.parameters.packed import pack_upload, unpack
 from mavftpfs.parameters.saving import make_plan
@@ -250,8 +249,9 @@ async def set_values(session: Session, changes: Sequence[Change], progress: Prog
     size = sum(map(len, pack_upload([change.after for change in changes])))
     progress.plan(1, size)
     progress.begin(f"setting {len(changes)} parameter(s)", size)
+    progress.sending = session.text_of(DIRECTORY + ALL)
     try:
-        async with watched(session, DIRECTORY + ALL, progress), written(file):
+        async with written(file):
             await file.write(0, text.encode())
     except NotDelivered as exc:
         cause = exc.__cause__

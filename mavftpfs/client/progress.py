@@ -12,14 +12,16 @@ from contextlib import asynccontextmanager, suppress
 import trio
 
 from mavftpfs.client.files import Session
+from mavftpfs.client.status import Facts
 from mavftpfs.link.base import plain_nursery
 from mavftpfs.shared.errors import LinkError
 from mavftpfs.shared.speed import Speed
 
 
 class Progress:
-    """Counts, and shows nothing by itself. All sizes in bytes. lost: the vehicle is lost. untouched: the path
-    of the present file still has its old content on the vehicle."""
+    """Counts, and shows nothing by itself. All sizes in bytes. lost: the vehicle is lost. sending: the path
+    on the vehicle of a file that is being uploaded, otherwise "". untouched: the path of the present file
+    still has its old content on the vehicle."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -28,7 +30,7 @@ class Progress:
         self.total = self._ended = 0
         self.name = ""
         self.size = self.here = 0
-        self.state = ""
+        self.state = self.sending = ""
         self.lost = False
         self.untouched = True
 
@@ -39,7 +41,7 @@ class Progress:
 
     def begin(self, name: str, size: int, here: int = 0) -> None:
         """Begin a file, or begin it again; `here` bytes of it need not move."""
-        self.name, self.size, self.here, self.state = name, size, here, ""
+        self.name, self.size, self.here, self.state, self.sending = name, size, here, "", ""
         self.untouched = True
 
     def at(self, here: int) -> None:
@@ -47,6 +49,15 @@ class Progress:
         self._speed.on_bytes(max(0, here - self.here), self._clock())
         self.here = here
         self.size = max(self.size, here)
+
+    def look(self, facts: Facts) -> None:
+        """Take the facts of `status --json`."""
+        self.lost = facts["link"]["state"] in ("lost", "replaced")
+        for transfer in facts["transfers"]:
+            if transfer["direction"] == "write" and transfer["path"] == self.sending:
+                self.at(min(transfer["done"], self.size))
+                if transfer["done"] >= self.size:
+                    self.check()
 
     def check(self) -> None:
         """Note that all bytes moved, and that the vehicle computes the checksum."""
@@ -57,7 +68,7 @@ class Progress:
         self._ended += planned
         self.files_done += 1
         self.size = self.here = 0
-        self.name = self.state = ""
+        self.name = self.state = self.sending = ""
 
     @property
     def done(self) -> int:
@@ -75,18 +86,19 @@ class Progress:
         return (self.total - self.done) / self.rate if self.rate else None
 
 
-LOOK_PERIOD = 0.5
-"""Seconds between two checks whether the vehicle is heard."""
+LOOK_PERIOD = 0.25
+"""Seconds between two looks at the vehicle and the upload."""
 
 
 @asynccontextmanager
-async def noting_losses(session: Session, progress: Progress) -> AsyncIterator[None]:
-    """Report to progress during the body whether the vehicle is lost."""
+async def followed(session: Session, progress: Progress) -> AsyncIterator[None]:
+    """Report to progress during the body whether the vehicle is lost, and what it acknowledged of an
+    upload."""
 
     async def watch() -> None:
         while True:
             with suppress(LinkError):  # if the mount is gone, the body gets the error
-                progress.lost = await session.lost()
+                progress.look(await session.status())
             await trio.sleep(LOOK_PERIOD)
 
     async with plain_nursery() as nursery:

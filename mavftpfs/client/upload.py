@@ -7,12 +7,10 @@ counts the bytes that the vehicle has acknowledged.
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
-
-import trio
 
 from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory, require_directory
@@ -32,9 +30,6 @@ from mavftpfs.shared.readable import name_text, readable
 
 Tell = Callable[[bytes, int, str], None]
 """Called with the path of an uploaded file, its size, and how it was verified."""
-
-ASK_PERIOD = 0.25
-"""Seconds between two updates of the acknowledged bytes."""
 
 
 def collect(local: Path, *, recursive: bool) -> list[Path]:
@@ -168,8 +163,9 @@ def _undelivered(session: Session, remote: bytes, error: MavftpfsError, progress
 async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> tuple[int, str]:
     file = await emptied(session.files, remote)
     progress.untouched = False
+    progress.sending = session.text_of(remote)
     try:
-        async with watched(session, remote, progress), written(file) as writing:
+        async with written(file) as writing:
             size = await _copy(source, file)
     finally:
         progress.untouched = writing.there is False
@@ -181,23 +177,3 @@ async def _copy(source: BinaryIO, file: File) -> int:
     while data := source.read(READ_SIZE):
         offset += await file.write(offset, data)
     return offset
-
-
-@asynccontextmanager
-async def watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
-    """Report to progress the bytes that the vehicle acknowledges while the body sends a file."""
-
-    async def watch() -> None:
-        while True:
-            await trio.sleep(ASK_PERIOD)
-            acknowledged = None
-            with suppress(LinkError):  # if the mount is gone, the body gets the error
-                acknowledged = await session.acknowledged(path)
-            if acknowledged is not None:
-                progress.at(min(acknowledged, progress.size))
-                if acknowledged >= progress.size:
-                    progress.check()
-
-    async with plain_nursery() as nursery:
-        nursery.start_soon(watch)
-        yield

@@ -30,12 +30,11 @@ Parser = Callable[[str], Any]
 class Type(NamedTuple):
     """Type of an option's values. written: returns a value in the spelling that `parse` accepts.
 
-    words: the only texts that are values, if there are few. is_file: values are paths on this computer.
+    is_file: values are paths on this computer.
     """
 
     parse: Parser
     written: Callable[[Any], str] = str
-    words: tuple[str, ...] = ()
     is_file: bool = False
 
 
@@ -113,7 +112,7 @@ def choice(*words: str) -> Type:
             raise ValueError(f"must be one of {', '.join(words)}")
         return text
 
-    return Type(parse, words=words)
+    return Type(parse)
 
 
 def _not_empty(text: str) -> str:

@@ -112,7 +112,7 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("install", "--root", "/x"), "--root"),
         (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
         (("sync", SOURCE, "/tmp", "--newest", "0"), "not a number"),
-        (("get", SOURCE, "/a*", "--to", "-", "--include", "*.ulg"), "leave out --include"),
+        (("get", SOURCE, "/a", "--to", "-"), "mavftpfs cat"),
         (("sim", "/proc/none/a b"), "mkdir -p '/proc/none/a b/fs/microsd/log'"),
         (("sim", "/proc/none/a", "--profile", "ardupilot"), "mkdir -p /proc/none/a/APM/LOGS"),
         (("sync", SOURCE, "/tmp", "--since", "soon"), "not a date"),

@@ -70,25 +70,22 @@ def by_fish(script: Path, folder: Path, line: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("line", "offered", "absent"),
+    ("line", "offered"),
     [
-        ("mavftpfs sy", ["sync"], []),
-        ("mavftpfs no", ["note"], []),
-        ("mavftpfs mn", ["mnt"], []),
-        (f"mavftpfs sync {SOURCE} lo", ["logs one"], []),
-        (f"mavftpfs sync {SOURCE} --verify ", ["auto", "all", "none"], []),
-        (f"mavftpfs put {SOURCE} no", ["note"], []),
-        (f"mavftpfs {SOURCE} mn", ["mnt"], []),
-        ("mavftpfs mount -o ro,when", ["ro,when_armed="], ["read_mode="]),
-        ("mavftpfs umount mn", ["mnt"], []),
+        ("mavftpfs sy", ["sync"]),
+        ("mavftpfs no", ["note"]),
+        ("mavftpfs mn", ["mnt"]),
+        (f"mavftpfs sync {SOURCE} lo", ["logs one"]),
+        (f"mavftpfs sync {SOURCE} --verify ", ["auto", "all", "none"]),
+        (f"mavftpfs put {SOURCE} no", ["note"]),
+        (f"mavftpfs {SOURCE} mn", ["mnt"]),
+        ("mavftpfs umount mn", ["mnt"]),
     ],
 )
-def test_what_tab_offers(ask: Ask, line: str, offered: list[str], absent: list[str]) -> None:
+def test_what_tab_offers(ask: Ask, line: str, offered: list[str]) -> None:
     answer = ask(line)
     for text in offered:
         assert text in answer, answer
-    for text in absent:
-        assert text not in answer, answer
 
 
 @pytest.mark.parametrize("shell", SHELLS)
