@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavftpfs.cache.attributes import Stat
@@ -18,7 +18,6 @@ from mavftpfs.client.fetch import (
     Wanted,
     known_time,
     local_disk,
-    part_of,
 )
 from mavftpfs.client.files import Found, walk
 from mavftpfs.client.names import fixed_part, matching, matching_files
@@ -136,7 +135,7 @@ class Downloads:
         if selection.by_name and not found and not self.outcome.failed:
             raise NotFound("--include and --exclude leave no file to fetch")
         _require_apart(found)
-        await self.fetch_all(apart(found))
+        await self.fetch_all(found)
 
     async def _refreshed_for(self, path: bytes) -> bool:
         """Have a mount list again if it does not know a path, because the file may be newer than its last
@@ -281,10 +280,4 @@ def named(name: str, error: MavftpfsError) -> str:
 def wanted_file(remote: bytes, local: Path, name: bytes, stat: Stat, *, keep_old: bool = False) -> Wanted:
     """Return the Wanted for a listed file; name: its path for people."""
     mtime = known_time(stat.mtime)
-    return Wanted(remote, name_text(name), stat.size, mtime, local, part_of(local), keep_old)
-
-
-def apart(wanted: Sequence[Wanted]) -> list[Wanted]:
-    """Return the files of a run without those whose .part has the name of another file."""
-    finals = {one.local for one in wanted}
-    return [replace(one, part=part_of(one.local, finals)) for one in wanted]
+    return Wanted(remote, name_text(name), stat.size, mtime, local, keep_old)

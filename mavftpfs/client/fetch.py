@@ -11,7 +11,7 @@ import fcntl
 import os
 import shutil
 import stat
-from collections.abc import Awaitable, Callable, Collection, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,9 +94,8 @@ class NotProvenYet(MavftpfsError):
 class Wanted:
     """A file to download. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
-    part: the local file for the bytes until all have arrived. keep_old: a local file of that name may be the
-    beginning of this one; otherwise it is renamed to NAME.~1~. growing: the vehicle still writes the file, so
-    its present bytes stay a .part.
+    keep_old: a local file of that name may be the beginning of this one; otherwise it is renamed to
+    NAME.~1~. growing: the vehicle still writes the file, so its present bytes stay a .part.
     """
 
     remote: bytes
@@ -104,9 +103,13 @@ class Wanted:
     size: int
     mtime: int | None
     local: Path
-    part: Path
     keep_old: bool = False
     growing: bool = False
+
+    @property
+    def part(self) -> Path:
+        """The local file for the bytes until all have arrived."""
+        return self.local.with_name(self.local.name + PART_SUFFIX)
 
     @property
     def here(self) -> bool:
@@ -158,12 +161,6 @@ class Fetched:
     def kept_words(self) -> str:
         """The words about the other file, if there was one."""
         return "" if self.kept is None else f"; another one of that name is kept as {self.kept.name}"
-
-
-def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
-    """Return the name of the .part of a file. finals: the final names of all files of the run."""
-    part = local.with_name(local.name + PART_SUFFIX)
-    return part if part not in finals else local.with_name(f"{local.name}.mavftpfs{PART_SUFFIX}")
 
 
 @contextmanager
@@ -298,6 +295,11 @@ class Fetcher:
     async def _fetch(self, wanted: Wanted) -> Fetched:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
+        if wanted.local.name.endswith(PART_SUFFIX):
+            raise UsageError(
+                f"{wanted.local} would be taken for an unfinished download; get it alone, with another name: "
+                f"--to NAME"
+            )
         verified = await self._compare_here(wanted) if wanted.here else None
         if verified is not None:
             return Fetched(wanted, wanted.size, wanted.size, verified, was_here=True)

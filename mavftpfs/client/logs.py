@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mavftpfs.client.compare import Verify, compare, wants_checksum
-from mavftpfs.client.download import Downloads, apart, wanted_file
+from mavftpfs.client.download import Downloads, wanted_file
 from mavftpfs.client.fetch import Fetched, Wanted, local_disk
 from mavftpfs.client.files import Found, Session, Unlisted, walk
 from mavftpfs.client.manifest import NAME, Downloaded, Manifest
@@ -163,7 +163,7 @@ async def _listed(downloads: Downloads, request: SyncRequest) -> list[Wanted]:
         downloads.reports.says(f"--include and --exclude leave no log to fetch ({len(logs)} in all)")
     for path, error in unlisted:
         downloads.fail(path, error)
-    return apart(selection.of_logs(taken))
+    return selection.of_logs(taken)
 
 
 async def find_logs(session: Session) -> tuple[bytes, Found, Unlisted]:

@@ -19,7 +19,6 @@ from mavftpfs.client.fetch import (
     Part,
     Wanted,
     known_time,
-    part_of,
 )
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.logs import SyncRequest, check, sync
@@ -89,7 +88,7 @@ def names_in(folder: Path) -> list[str]:
 def wanted(tree: FakeTree, path: bytes, local: Path) -> Wanted:
     found = tree.stat_now(path)
     mtime = known_time(found.mtime)
-    return Wanted(path, path.decode(errors="replace"), found.size, mtime, local, part_of(local))
+    return Wanted(path, path.decode(errors="replace"), found.size, mtime, local)
 
 
 async def get(tree: FakeTree, path: bytes, local: Path, verify: Verify = "auto") -> Fetched:
@@ -227,38 +226,37 @@ async def test_a_part_that_just_got_its_name_is_not_written_again(
 ) -> None:
     """Another program finishes the file between our open and our lock."""
     local, lock = tmp_path / "big", fcntl.flock
-    part_of(local).write_bytes(BIG)
+    local.with_name("big.part").write_bytes(BIG)
 
     def finish_and_lock(fd: int, how: int) -> None:
-        part_of(local).replace(local)
+        local.with_name("big.part").replace(local)
         lock(fd, how)
 
     monkeypatch.setattr(fcntl, "flock", finish_and_lock)
     with pytest.raises(UsageError, match="another program"):
-        Part(part_of(local), local)
+        Part(local.with_name("big.part"), local)
     assert local.read_bytes() == BIG
 
 
 async def test_neither_a_link_nor_a_pipe_is_taken_for_a_part(tmp_path: Path) -> None:
     (tmp_path / "victim").write_bytes(b"mine")
-    part_of(tmp_path / "big").symlink_to(tmp_path / "victim")
-    os.mkfifo(part_of(tmp_path / "pipe"))
+    (tmp_path / "big.part").symlink_to(tmp_path / "victim")
+    os.mkfifo(tmp_path / "pipe.part")
     for name in ("big", "pipe"):
         with pytest.raises(UsageError):
             await get(SpoiltTree({b"/big": BIG}), b"/big", tmp_path / name)
     assert (tmp_path / "victim").read_bytes() == b"mine"
 
 
-async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> None:
+async def test_a_name_that_ends_in_part_is_not_taken_from_the_vehicle(tmp_path: Path) -> None:
+    """Otherwise it would be resumed as the unfinished download of another file."""
     tree = SpoiltTree({b"/d/a": b"1", b"/d/a.part": b"22"})
-    tree.failing["read"] = RequestTimeout("no answer")
-    with pytest.raises(RequestTimeout):
-        await get(tree, b"/d/a", tmp_path / "a")
-    tree.failing.clear()
-    for _ in range(2):
-        await get_all(tree, b"/d", to=tmp_path)
-        assert names_in(tmp_path / "d") == ["a", "a.part"]
-        assert (tmp_path / "d/a.part").read_bytes() == b"22"
+    outcome, said = await get_all(tree, b"/d", to=tmp_path)
+    assert names_in(tmp_path / "d") == ["a"]
+    assert list(outcome.failed) == [b"/d/a.part"]
+    assert "would be taken for an unfinished download" in said[0]
+    await get_all(tree, b"/d/a.part", to=tmp_path / "b")
+    assert (tmp_path / "b").read_bytes() == b"22"
 
 
 # -- get ------------------------------------------------------------------------------------------

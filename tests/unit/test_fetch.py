@@ -34,7 +34,7 @@ MAY, JUNE = 1_714_566_896, 1_717_245_296
 def test_what_is_here_of_a_file_of_100_bytes(
     tmp_path: Path, here: int | None, part: int | None, begun: int | None
 ) -> None:
-    wanted = Wanted(b"/a", "a", 100, None, tmp_path / "a", tmp_path / "a.part", keep_old=True)
+    wanted = Wanted(b"/a", "a", 100, None, tmp_path / "a", keep_old=True)
     for path, size in ((wanted.local, here), (wanted.part, part)):
         if size is not None:
             path.write_bytes(bytes(size))
@@ -48,7 +48,7 @@ def test_only_files_up_to_some_size_are_proven_by_default() -> None:
 
 
 def log(below: str, mtime: int | None = None) -> Wanted:
-    return Wanted(b"/log/" + below.encode(), below, 1, mtime, Path(below), Path(below))
+    return Wanted(b"/log/" + below.encode(), below, 1, mtime, Path(below))
 
 
 @pytest.mark.parametrize(
