@@ -15,7 +15,6 @@ from typing import BinaryIO
 from mavftpfs.client.files import READ_SIZE, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory, require_directory
 from mavftpfs.client.progress import Progress
-from mavftpfs.link.base import plain_nursery
 from mavftpfs.shared.errors import (
     LinkError,
     MavftpfsError,

@@ -2,26 +2,41 @@
 
 client.wire has the protocol. A connection has at most one open file and one request at a time, so a client
 that stops reading costs at most a block of memory, and disturbs no other.
+
+The requests change the mount's tree without the kernel. So the mount notifies the kernel: of names at once,
+because the kernel believes for a while that a name is absent; of pages and attributes, because the kernel
+keeps those of the old content. The mount notifies after the change, when no lock is held, and an answer waits
+for that TELLING_TIME at most, because the kernel itself waits for look-ups and reads in progress. Programs
+that watch by inotify receive nothing.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import trio
 
+from mavftpfs.cache.localfiles import stays_local
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
 from mavftpfs.client import wire
-from mavftpfs.client.files import WITHDRAWAL_TIME, File, Files
+from mavftpfs.client.files import WITHDRAWAL_TIME
 from mavftpfs.client.wire import Message
-from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, RemoteProtocolError
+from mavftpfs.mount.invalidator import Invalidator
+from mavftpfs.mount.operations import Operations
+from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, NotSupported, RemoteProtocolError
 from mavftpfs.shared.model import normalise
+from mavftpfs.shared.readable import name_text
 
 log = logging.getLogger("mavftpfs.control")
 
 MAX_CONNECTIONS = 128
 """The most connections at once; each open file of a program is one."""
+TELLING_TIME = 1.0
+"""Seconds for the kernel to drop its caches, before the answer to a change."""
 _CANCELLED = wire.told_error(MavftpfsError("cancelled by the next request"))
 _PIECE = 256 * 1024
 """Bytes to receive at once."""
@@ -29,12 +44,20 @@ _PIECE = 256 * 1024
 Call = Callable[[Message], Awaitable[Message]]
 
 
-class FileServer:
-    """Answers the requests of all connections. status: returns the facts of `status --json`."""
+class Served(NamedTuple):
+    """The parts of a mount that the requests use. status: returns the facts of `status --json`."""
 
-    def __init__(self, files: Files, status: Callable[[], Mapping[str, Any]]) -> None:
-        self._files = files
-        self._status = status
+    tree: Tree
+    operations: Operations
+    kernel: Invalidator
+    status: Callable[[], Mapping[str, Any]]
+
+
+class FileServer:
+    """Answers the requests of all connections."""
+
+    def __init__(self, mount: Served) -> None:
+        self._mount = mount
         self._serving: dict[trio.CancelScope, _Connection] = {}
         self._ended = trio.Event()
         self._closed = False
@@ -56,7 +79,7 @@ class FileServer:
         """Answer a client until it leaves. process: its number."""
         if self._closed:  # since it was granted
             return
-        connection = _Connection(stream, process, self._files, self._status)
+        connection = _Connection(stream, process, self._mount)
         with trio.CancelScope() as scope:
             self._serving[scope] = connection
             try:
@@ -84,28 +107,22 @@ class FileServer:
 class _Connection:
     """One client. file: its open file. process: its number. ending: bounds the time of `end`."""
 
-    def __init__(
-        self,
-        stream: trio.SocketStream,
-        process: int,
-        files: Files,
-        status: Callable[[], Mapping[str, Any]],
-    ) -> None:
+    def __init__(self, stream: trio.SocketStream, process: int, mount: Served) -> None:
         self.process = process
-        self.file: File | None = None
+        self.file: OpenFile | None = None
         self.ending = trio.CancelScope(shield=True)
+        self._path = b""
         self._writes = False
         self._stream = stream
-        self._files = files
-        self._status = status
+        self._mount = mount
+        self._tree, self._kernel = mount.tree, mount.kernel
         self._requests = wire.requests()
         self._calls: dict[str, Call] = {
             **{"stat": self._stat, "list": self._list, "crc32": self._crc32, "status": self._tell_status},
-            **{name: _of_path(getattr(files, name)) for name in ("mkdir", "rmdir", "unlink")},
-            **{"rename": self._rename, "refresh": self._refresh},
-            **{"open": self._open, "create": self._create, "read": self._read, "write": self._write},
-            **{"resize": self._resize, "fsync": self._fsync, "release": self._release},
-            **{"take back": self._take_back},
+            **{"mkdir": self._mkdir, "rmdir": self._remove, "unlink": self._remove, "rename": self._rename},
+            **{"refresh": self._refresh, "open": self._open, "create": self._create, "read": self._read},
+            **{"write": self._write, "resize": self._resize, "fsync": self._fsync},
+            **{"release": self._release, "take back": self._take_back},
         }
 
     async def run(self) -> None:
@@ -122,6 +139,7 @@ class _Connection:
             try:
                 if file is not None:
                     await (file.take_back() if self._writes else file.release())
+                    await self._tell_file(file)
             except MavftpfsError as error:
                 log.info("a file of process %d, which is gone: %s", self.process, error)
             except Exception:
@@ -186,39 +204,73 @@ class _Connection:
     # -- calls by path
 
     async def _stat(self, request: Message) -> Message:
-        return Message({"stat": wire.told_stat(await self._files.stat(_path(request)))})
+        return Message({"stat": wire.told_stat(await self._tree.stat(_path(request)))})
 
     async def _list(self, request: Message) -> Message:
-        return Message({}, wire.told_entries(await self._files.list(_path(request))))
+        return Message({}, wire.told_entries(await self._tree.list(_path(request))))
 
     async def _crc32(self, request: Message) -> Message:
-        return Message({"crc32": await self._files.crc32(_path(request))})
+        return Message({"crc32": await self._tree.crc32(_path(request))})
 
     async def _tell_status(self, _: Message) -> Message:
-        return Message({"status": dict(self._status())})
+        return Message({"status": dict(self._mount.status())})
+
+    async def _mkdir(self, request: Message) -> Message:
+        path = _path(request)
+        await self._tree.mkdir(path)
+        await _told(self._kernel.forget_name, path)
+        return Message({})
+
+    async def _remove(self, request: Message) -> Message:
+        path = _path(request)
+        remove = self._tree.rmdir if request.facts["call"] == "rmdir" else self._tree.unlink
+        await remove(path)
+        self._mount.operations.note_gone(path)
+        await _told(self._kernel.forget_name, path)
+        return Message({})
 
     async def _rename(self, request: Message) -> Message:
-        await self._files.rename(_path(request), _path(request, "new"))
+        old, new = _path(request), _path(request, "new")
+        if stays_local(old) != stays_local(new):
+            _require_on_card(new)
+        await self._tree.rename(old, new)
+        self._mount.operations.note_renamed(old, new)
+        await _told(self._kernel.forget_name, old, new)
         return Message({})
 
     async def _refresh(self, _: Message) -> Message:
-        await self._files.refresh()
+        """Drop the tree's caches; the kernel asks again within two seconds."""
+        await self._tree.refresh()
         return Message({})
 
     # -- calls of the open file
 
     async def _open(self, request: Message) -> Message:
-        how = {name: bool(request.facts.get(name)) for name in ("write", "truncate", "append")}
-        self._require_none_open()
-        self._writes = how["write"] or how["truncate"]
-        self.file = await self._files.open(_path(request), **how)
+        """The kernel drops its pages first, because the tree treats every opener as a reader."""
+        path = self._begin(request)
+        write, truncate, append = (bool(request.facts.get(name)) for name in ("write", "truncate", "append"))
+        self._writes = write or truncate
+        if self._writes:
+            _require_on_card(path)
+        await _told(self._kernel.forget_pages, path)
+        self.file = await self._tree.open(path, write=write, truncate=truncate, append=append)
+        if truncate:
+            self._kernel.on_changed(path)
         return Message({})
 
     async def _create(self, request: Message) -> Message:
-        self._require_none_open()
+        path = self._begin(request)
         self._writes = True
-        self.file = await self._files.create(_path(request), exclusive=bool(request.facts.get("exclusive")))
+        _require_on_card(path)
+        self.file = await self._tree.create(path, exclusive=bool(request.facts.get("exclusive")))
+        await _told(self._kernel.forget_name, path)
         return Message({})
+
+    def _begin(self, request: Message) -> bytes:
+        if self.file is not None:
+            raise LocalProtocolError("a connection has only one open file")
+        self._path = _path(request)
+        return self._path
 
     async def _read(self, request: Message) -> Message:
         offset, size = _number(request, "at"), _number(request, "size")
@@ -226,48 +278,75 @@ class _Connection:
         return Message({}, bytes(await self._open_file().read(offset, min(size, wire.BLOCK))))
 
     async def _write(self, request: Message) -> Message:
-        await self._open_file().write(_number(request, "at"), request.data)
+        file = self._open_file()
+        with self._changing(file):
+            await file.write(_number(request, "at"), request.data)
         return Message({})
 
     async def _resize(self, request: Message) -> Message:
-        await self._open_file().truncate(_number(request, "size"))
+        file = self._open_file()
+        with self._changing(file):
+            await file.truncate(_number(request, "size"))
         return Message({})
 
     async def _fsync(self, _: Message) -> Message:
         file = self._open_file()
-        await file.fsync()
+        with self._changing(file):
+            await file.fsync()
+        await self._tell_file(file)
         return Message({"verified": file.verified})
 
     async def _release(self, _: Message) -> Message:
         file, self.file = self._open_file(), None
-        await file.release()
+        with self._changing(file):
+            await file.release()
+        await self._tell_file(file)
         return Message({"verified": file.verified})
 
     async def _take_back(self, _: Message) -> Message:
         file, there = self._open_file(), None
         with trio.move_on_after(WITHDRAWAL_TIME, shield=True):  # else it would be delivered after all
             there = await file.take_back()
+            await self._tell_file(file)
         self.file = None
         return Message({"there": there})
 
-    def _require_none_open(self) -> None:
-        if self.file is not None:
-            raise LocalProtocolError("a connection has only one open file")
-
-    def _open_file(self) -> File:
+    def _open_file(self) -> OpenFile:
         if self.file is None:
             raise LocalProtocolError("no file is open in this connection")
         return self.file
 
+    @contextmanager
+    def _changing(self, file: OpenFile) -> Iterator[None]:
+        """Have the kernel drop its pages of a file that the body changes."""
+        try:
+            yield
+        finally:
+            if file.writable:
+                self._kernel.on_changed(self._path)
 
-def _of_path(call: Callable[[bytes], Awaitable[None]]) -> Call:
-    """Return a handler that calls a function with the request's path and returns nothing."""
+    async def _tell_file(self, file: OpenFile) -> None:
+        """Return when programs that open a changed file, or look at it, see its present state."""
+        if file.writable:
+            await _told(self._kernel.forget_file, self._path)
 
-    async def answer(request: Message) -> Message:
-        await call(_path(request))
-        return Message({})
 
-    return answer
+async def _told(tell: Callable[..., Awaitable[None]], *paths: bytes) -> None:
+    with trio.move_on_after(TELLING_TIME, shield=True):  # what was opened meanwhile is not lost by a cancel
+        await tell(*paths)
+
+
+def _require_on_card(path: bytes) -> None:
+    """Check that a name is not one of those that a mount keeps in memory.
+
+    Raises:
+        NotSupported.
+    """
+    if stays_local(path):
+        raise NotSupported(
+            f"{name_text(path)} would stay in the mount's memory, as editors' swap files do, and never reach "
+            "the card; choose another name, or unmount first"
+        )
 
 
 def _path(request: Message, name: str = "path") -> bytes:

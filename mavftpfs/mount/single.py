@@ -21,14 +21,13 @@ from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
 from mavftpfs.client.undelivered import recovered_directory
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.drain import drain_or_keep
-from mavftpfs.mount.fileserver import FileServer
+from mavftpfs.mount.fileserver import FileServer, Served
 from mavftpfs.mount.handles import InodeTable
 from mavftpfs.mount.invalidator import Invalidator
 from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
 from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import fuse_words
-from mavftpfs.mount.toldfiles import ToldFiles
 from mavftpfs.shared.errors import ExitCode, MountFailed
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
@@ -78,7 +77,7 @@ class SingleMount(Life):
                 told=self.identity,
             )
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
-            self._files = FileServer(ToldFiles(vehicle.tree, operations, invalidator), self.facts)
+            self._files = FileServer(Served(vehicle.tree, operations, invalidator, self.facts))
             words = fuse_words(self.request.options, self.request.source)
             if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
                 unmount(self.request.mountpoint, lazy=True)

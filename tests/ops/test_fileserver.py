@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import struct
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from functools import partial
@@ -14,6 +15,7 @@ from typing import cast
 import pytest
 import trio
 
+from mavftpfs.cache.tree import Tree
 from mavftpfs.client import wire
 from mavftpfs.client.control import Reply
 from mavftpfs.client.files import Files, written
@@ -21,7 +23,10 @@ from mavftpfs.client.mountfiles import MountFile, MountFiles, connect
 from mavftpfs.client.mounts import require_usable
 from mavftpfs.mount import fileserver
 from mavftpfs.mount.controlserver import ControlServer
-from mavftpfs.mount.fileserver import FileServer
+from mavftpfs.mount.fileserver import TELLING_TIME, FileServer, Served
+from mavftpfs.mount.handles import InodeTable, Presentation
+from mavftpfs.mount.invalidator import Invalidator
+from mavftpfs.mount.operations import Operations
 from mavftpfs.shared.errors import (
     FtpNak,
     LinkClosed,
@@ -29,13 +34,40 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NotDelivered,
     NotFound,
+    NotSupported,
     ReadOnly,
 )
 from mavftpfs.shared.model import EntryKind
 from tests.ops.faketree import FakeTree
 
+LOOK = Presentation(1000, 1000, 0o644, 0o755, op_deadline=30.0)
 DATA = bytes(range(256)) * 4096
 PATIENCE = 60.0
+
+
+class Kernel(Invalidator):
+    """Notes what it is told among the calls of the tree. gate: holds it up."""
+
+    def __init__(self, tree: FakeTree) -> None:
+        self.inodes = InodeTable()
+        self.gate = threading.Event()
+        self.gate.set()
+        self._tree = tree
+        super().__init__(self.inodes, self._pages, self._name)
+
+    def _pages(self, ino: int, attr_only: bool) -> None:
+        self.gate.wait(60)
+        self._tree.calls.append(("pages", b"%d" % ino))
+
+    def _name(self, parent: int, name: bytes) -> None:
+        self.gate.wait(60)
+        self._tree.calls.append(("name", name))
+
+    def told(self) -> list[str]:
+        """Return the kinds of calls until now, and forget them."""
+        kinds = [kind for kind, _ in self._tree.calls]
+        self._tree.calls.clear()
+        return kinds
 
 
 class Mount:
@@ -44,7 +76,10 @@ class Mount:
     def __init__(self, path: Path, tree: FakeTree) -> None:
         self.path = path
         self.tree = tree
-        self.files = FileServer(cast(Files, tree), lambda: {"link": {"state": "fine"}})
+        self.kernel = Kernel(tree)
+        operations = Operations(cast(Tree, tree), LOOK, inodes=self.kernel.inodes)
+        served = Served(cast(Tree, tree), operations, self.kernel, lambda: {"link": {"state": "fine"}})
+        self.files = FileServer(served)
         self.server = ControlServer(path, {"files": self._grant, "echo": self._echo}, files=self.files)
 
     async def _grant(self, request: Reply) -> Reply:
@@ -89,11 +124,13 @@ async def serving(tmp_path: Path, tree: FakeTree | None = None) -> AsyncIterator
     mount = Mount(tmp_path / "s", tree or FakeTree({b"/f": DATA}))
     async with trio.open_nursery() as nursery:
         await nursery.start(mount.server.run)
+        nursery.start_soon(mount.kernel.run)
         yield mount
         mount.server.close()
         with trio.fail_after(PATIENCE):
             await mount.files.close()
             await mount.server.closed.wait()
+        nursery.cancel_scope.cancel()
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -368,6 +405,87 @@ async def test_an_error_of_the_close_says_what_the_vehicle_has(tmp_path: Path) -
         assert caught.value.there is False
         assert isinstance(caught.value.__cause__, NotFound)
         files.close()
+
+
+# -- what the kernel is told ----------------------------------------------------------------------
+
+
+@asynccontextmanager
+async def knowing(tmp_path: Path, *paths: bytes) -> AsyncIterator[tuple[Mount, MountFiles]]:
+    """Give a mount whose kernel knows files."""
+    async with serving(tmp_path, FakeTree({b"/f": b"old"}, {b"/d"})) as mount:
+        for path in paths:
+            mount.kernel.inodes.lookup(path)
+        files = mount.client()
+        yield mount, files
+        files.close()
+
+
+@pytest.mark.holds("promise 1")
+async def test_pages_are_dropped_before_a_file_is_opened(tmp_path: Path) -> None:
+    """To the tree whoever opens a file has its pages, and so the kernel would keep those of an older file."""
+    async with knowing(tmp_path, b"/f") as (mount, files):
+        await files.open(b"/f")
+        assert mount.kernel.told() == ["pages", "open"]
+
+
+async def test_names_are_told_after_the_change_and_before_the_answer(tmp_path: Path) -> None:
+    async with knowing(tmp_path, b"/", b"/f") as (mount, files):
+        await files.mkdir(b"/e")
+        assert mount.kernel.told() == ["mkdir", "name"]
+        await files.rmdir(b"/e")
+        assert mount.kernel.told() == ["rmdir", "name"]
+        await (await files.create(b"/n", exclusive=True)).release()
+        assert "name" in mount.kernel.told()
+        await files.rename(b"/n", b"/m")
+        assert mount.kernel.told() == ["rename", "name", "name"]
+        await files.unlink(b"/m")
+        assert mount.kernel.told() == ["unlink", "name"]
+
+
+async def test_a_write_drops_pages_and_the_end_waits_for_that(tmp_path: Path) -> None:
+    async with knowing(tmp_path, b"/f") as (mount, files):
+        file = await files.open(b"/f", write=True)
+        mount.kernel.told()
+        await file.write(0, b"new")
+        await until(lambda: "pages" in mount.kernel.told())
+        mount.tree.calls.clear()
+        await file.fsync()
+        calls = mount.kernel.told()
+        assert calls[0] == "fsync"
+        assert {"pages", "name"} <= set(calls)
+
+
+async def test_a_kernel_that_waits_holds_no_answer_up_for_long(tmp_path: Path) -> None:
+    async with knowing(tmp_path, b"/", b"/f") as (mount, files):
+        mount.kernel.gate.clear()
+        try:
+            began = trio.current_time()
+            await files.mkdir(b"/e")
+            assert TELLING_TIME <= trio.current_time() - began < TELLING_TIME + 5
+        finally:
+            mount.kernel.gate.set()
+
+
+async def test_what_is_gone_loses_its_number(tmp_path: Path) -> None:
+    async with knowing(tmp_path, b"/f") as (mount, files):
+        await files.rename(b"/f", b"/g")
+        assert mount.kernel.inodes.known(b"/g") is not None
+        await files.unlink(b"/g")
+        assert mount.kernel.inodes.known(b"/g") is None
+
+
+async def test_a_refused_change_is_no_change(tmp_path: Path) -> None:
+    async with knowing(tmp_path, b"/", b"/f") as (mount, files):
+        mount.tree.error = ReadOnly("armed")
+        with pytest.raises(ReadOnly):
+            await files.unlink(b"/f")
+        assert mount.kernel.inodes.known(b"/f") is not None
+        mount.tree.error = None
+        for change in (files.create(b"/.x.swp", exclusive=True), files.rename(b"/f", b"/.f.swp")):
+            with pytest.raises(NotSupported, match="never reach the card"):
+                await change
+        assert mount.tree.files == {b"/f": b"old"}
 
 
 # -- versions -------------------------------------------------------------------------------------
