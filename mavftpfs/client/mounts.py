@@ -1,15 +1,12 @@
 """The mounts that are up, and the status of each. Layer: client.
 
-The extended attribute of a mount's root names its control socket. Users that may not read the attribute
-(root, for users' mounts) look for the socket by the name of the mountpoint. Then the mount answers over its
-socket. If a mount does not answer, or does not serve this user, only its attribute is known, with `state` and
-`problem`.
+The kernel's table of sockets shows the control socket of a mount, whose name is a hash of the mountpoint. The
+mount answers over its socket. If a mount does not answer, or does not serve this user, its status has only
+`mountpoint`, `source`, `state` (dead, mute, foreign) and `problem`.
 """
 
 from __future__ import annotations
 
-import errno
-import json
 import os
 import threading
 from collections.abc import Iterator, Mapping
@@ -23,10 +20,10 @@ from mavftpfs.client import control, wire
 from mavftpfs.client.control import ControlError, NobodyThere, Refused
 from mavftpfs.client.mountpoint import (
     OUR_TYPE,
-    XATTR_STATUS,
     Mounted,
     canonical,
     enclosing_mount,
+    is_dead,
     mounts,
     vehicles_below,
 )
@@ -67,18 +64,19 @@ def all_statuses() -> list[Status]:
 
 
 def _of_mounts(patience: float) -> Iterator[Status]:
-    """Yield the status of each mount in the kernel's table that this user may see."""
+    """Yield the status of each mount in the kernel's table that this user may ask."""
     for path, mount in mounts().items():
         if mount.type == OUR_TYPE and mount.root == "/":  # otherwise a bind mount of a part
-            with suppress(NobodyThere):
-                yield _status_of(path, mount, patience)
+            status = _status_of(path, mount, patience)
+            if status.get("state") != "foreign":
+                yield status
 
 
 def status_of(mountpoint: str, patience: float = PATIENCE) -> Status:
-    """Return the status of one mount; without an answer, `state` (dead, mute) and `problem` in words.
+    """Return the status of one mount; without an answer, `state` and `problem` in words.
 
     Raises:
-        NobodyThere: no vehicle is mounted there, or this user may not ask.
+        NobodyThere: no vehicle is mounted there.
     """
     mount = mounts().get(mountpoint)
     if mount is not None and mount.type == OUR_TYPE:
@@ -93,57 +91,42 @@ def socket_of(mountpoint: str) -> Path:
     """Return the control socket of a mount, which may have stopped answering.
 
     Raises:
-        NobodyThere: there is no socket, or this user may not see it.
+        NobodyThere: there is no socket. Refused: the mount is another user's.
     """
     mount = mounts().get(mountpoint)
     if mount is None or mount.type != OUR_TYPE:
         return control.find_socket(mountpoint)
-    answer = _questions.ask(mountpoint, mount, PATIENCE)
-    told = json.loads(answer) if isinstance(answer, bytes) else {}
-    return _socket(told, mountpoint, mount)
-
-
-def _socket(told: Facts, mountpoint: str, mount: Mounted) -> Path:
-    """Return a mount's socket: the one that its attribute names, or the one with its mountpoint's name.
-
-    Raises:
-        NobodyThere: there is none.
-    """
-    if told.get("socket"):
-        return Path(told["socket"])
     for path in dict.fromkeys((mountpoint, *mount.others)):
         with suppress(NobodyThere):
             return control.find_socket(path, mount.uid)
+    if os.getuid() not in (0, mount.uid):
+        raise Refused(control.FOREIGN)
     raise _nobody(mountpoint)
 
 
 def _status_of(path: str, mount: Mounted, patience: float) -> Status:
-    """Return a mount's own status. Raises: as status_of."""
-    answer = _questions.ask(path, mount, patience)
+    """Return a mount's own status; without an answer, `state` and `problem`."""
     told: Facts = {"mountpoint": path, "source": mount.source}
-    if isinstance(answer, bytes):
-        told = json.loads(answer)
-    elif answer == errno.ENOTCONN:
-        return _unasked(told, "dead", f"DEAD: its program is gone; run: mavftpfs umount {path}")
-    elif answer not in (errno.EACCES, errno.EPERM):
-        return _unasked(told, "mute", f"its program does not answer: {os.strerror(answer)}")
     try:
-        status = _ask(_socket(told, path, mount), patience)
+        return _ask(socket_of(path), patience)
     except Refused as exc:
-        if not isinstance(answer, bytes):
-            raise _nobody(path) from None
         return _unasked(told, "foreign", str(exc))
     except NobodyThere:
-        if "link" in told:  # a mount of version 0.2 tells everything by its attribute
-            return told
-        if not isinstance(answer, bytes):  # this user may not see it
-            raise _nobody(path) from None
-        return _unasked(told, "mute", f"its socket {told.get('socket')} cannot be reached from here")
+        if _is_dead(path):
+            return _unasked(told, "dead", f"DEAD: its program is gone; run: mavftpfs umount {path}")
+        return _unasked(told, "mute", "its socket cannot be reached from here")
     except ControlError as exc:
         return _unasked(told, "mute", f"its program does not answer: {exc}")
-    if told.get("id") not in (None, status.get("id")):  # the same place in another mount namespace
-        return _unasked(told, "mute", "its socket cannot be reached from here")
-    return status
+
+
+def _is_dead(path: str) -> bool:
+    """Return whether a mount has lost its process; False if it does not answer, as one that was stopped."""
+    answer = Future[bool]()
+    threading.Thread(target=lambda: answer.set_result(is_dead(path)), daemon=True).start()
+    try:
+        return answer.result(STATUS_PATIENCE)
+    except TimeoutError:
+        return False
 
 
 def _nobody(mountpoint: str) -> NobodyThere:
@@ -162,41 +145,6 @@ def _ask(socket: Path, patience: float) -> Status:
     theirs = status.get("version", "unknown")
     problem = f"its program is of version {theirs}, this one of {__version__}: unmount it, and mount it again"
     return _unasked(status, "mute", problem)
-
-
-class _Questions:
-    """Reads the attribute of mounts, each in a thread, because a mount that was stopped never answers.
-    Further questions about the same mount use the same thread."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._open: dict[str, Future[bytes | int]] = {}
-
-    def ask(self, path: str, mount: Mounted, patience: float) -> bytes | int:
-        """Return the attribute, or the errno; ETIMEDOUT after so many seconds."""
-        with self._lock:
-            answer = self._open.get(mount.number)
-            if answer is None:
-                answer = Future()
-                threading.Thread(target=self._read, args=(path, mount, answer), daemon=True).start()
-                self._open[mount.number] = answer
-        try:
-            return answer.result(patience)
-        except TimeoutError:
-            return errno.ETIMEDOUT
-
-    def _read(self, path: str, mount: Mounted, answer: Future[bytes | int]) -> None:
-        found: bytes | int
-        try:
-            found = os.getxattr(path, XATTR_STATUS)
-        except OSError as exc:
-            found = exc.errno or errno.EIO
-        with self._lock:
-            del self._open[mount.number]
-        answer.set_result(found)
-
-
-_questions = _Questions()
 
 
 def require_usable(status: Status, mountpoint: str) -> None:

@@ -140,7 +140,10 @@ def test_another_user_is_told_in_a_line(
         assert why in refused.stderr
     shown = mount.run(*CAT, mount.path / "README.txt", cwd=Path("/")).stdout
     assert shown == (small_tree / "README.txt").read_text()
-    assert str(mount.path) in by_nobody(mount, "status").stdout
+    assert str(mount.path) not in by_nobody(mount, "status").stdout
+    assert (
+        "belongs to another user" in by_nobody(mount, "status", mount.path, code=ExitCode.MOUNT_FAILED).stdout
+    )
     refused = by_nobody(mount, "ls", mount.source, code=ExitCode.NO_VEHICLE)
     assert "of another user has this port" in refused.stderr
 
