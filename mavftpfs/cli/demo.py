@@ -17,11 +17,10 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from rich.console import Console
 from rich.panel import Panel
@@ -59,49 +58,76 @@ class DemoFailed(Exception):
     """The tour cannot go on; the text is one line for a person."""
 
 
-@dataclass
-class Tour:
-    """State that the steps share. `proofs`: one entry for each comparison."""
+class Step(NamedTuple):
+    """A command of the tour. words: as a user would type them. why: the explanation before it, or "".
 
-    console: Console
-    folder: Path
-    proofs: list[bool] = field(default_factory=list)
+    is_right: returns whether the command's output proves that the bytes are right.
+    """
 
-    @property
-    def card(self) -> Path:
-        """The content of the vehicle's memory card."""
-        return self.folder / "card"
+    why: str
+    words: tuple[str, ...]
+    is_right: Callable[[str], bool] | None = None
 
-    @property
-    def drone(self) -> Path:
-        """The directory where the vehicle is mounted."""
-        return self.folder / "drone"
 
-    def say(self, text: str) -> None:
-        """Explain."""
-        self.console.print(f"\n{text}")
+def steps(source: str) -> list[Step]:
+    """Return the commands of the tour; source: of the simulated drone."""
+    return [
+        Step(
+            "The drone is switched on. Now we mount it, over UDP, as a telemetry radio would hand it to us:",
+            ("mavftpfs", source, "drone"),
+        ),
+        Step("It looks like any other directory:", ("ls", "-l", f"drone/{Path(LOG).parent}")),
+        Step("Reading a file needs nothing special either:", ("cat", f"drone/{SCRIPT}"), SCRIPT_TEXT.__eq__),
+        Step(
+            "Copying a flight log over the bad radio. Lost packets are requested again while the rest flows:",
+            ("cp", f"drone/{LOG}", "flight.ulg"),
+        ),
+        Step(
+            "",
+            ("md5sum", f"card/{LOG}", "flight.ulg"),
+            lambda sums: len({line.split()[0] for line in sums.splitlines()}) == 1,
+        ),
+        Step(
+            "How the drone, the radio and all transfers are doing, at any time:",
+            ("mavftpfs", "status", "drone"),
+        ),
+        Step(
+            "Changing a file is as simple. When the program has closed it, the whole new file is on the "
+            "drone's card and was compared with what was written:",
+            ("sed", "-i", "s/{}/{}/".format(*EDIT), f"drone/{SCRIPT}"),
+        ),
+        Step("", ("cat", f"card/{SCRIPT}"), SCRIPT_TEXT.replace(*EDIT).__eq__),
+        Step(
+            "And the whole drone compared with its card (silence means: no difference):",
+            ("diff", "-r", "card", "drone"),
+            "".__eq__,
+        ),
+        Step("Done. Unmounting:", ("mavftpfs", "umount", "drone")),
+    ]
 
-    def command(self, *words: str) -> str:
-        """Show and run a command in the temporary directory, and show and return its output."""
-        self.console.print(f"[bold green]$[/] [bold]{' '.join(words)}[/]", highlight=False)
-        program, *rest = words
-        argv = [*PROGRAM, *rest] if program == "mavftpfs" else words
-        with running(argv, self.folder) as child:
-            try:
-                output, _ = child.communicate(timeout=STEP_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                raise DemoFailed(f"{words[0]} did not end within {STEP_TIMEOUT:.0f} s") from None
-        text = output.decode(errors="replace")
-        if text.strip():
-            self.console.print(text.rstrip(), highlight=False, markup=False)
-        if child.returncode:
-            raise DemoFailed(f"{words[0]} ended with {child.returncode}")
-        return text
 
-    def verdict(self, same: bool) -> None:
-        """Record a comparison, and print its result."""
-        self.proofs.append(same)
-        self.console.print("[bold green]Right, byte for byte.[/]" if same else "[bold red]It differs.[/]")
+def take(step: Step, console: Console, folder: Path) -> bool:
+    """Show and run a command in the temporary directory, and show its output. Return whether the bytes that
+    it compares are right."""
+    if step.why:
+        console.print(f"\n{step.why}")
+    console.print(f"[bold green]$[/] [bold]{' '.join(step.words)}[/]", highlight=False)
+    program, *rest = step.words
+    with running([*PROGRAM, *rest] if program == "mavftpfs" else step.words, folder) as child:
+        try:
+            output, _ = child.communicate(timeout=STEP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            raise DemoFailed(f"{program} did not end within {STEP_TIMEOUT:.0f} s") from None
+    text = output.decode(errors="replace")
+    if text.strip():
+        console.print(text.rstrip(), highlight=False, markup=False)
+    if child.returncode:
+        raise DemoFailed(f"{program} ended with {child.returncode}")
+    if step.is_right is None:
+        return True
+    right = step.is_right(text)
+    console.print("[bold green]Right, byte for byte.[/]" if right else "[bold red]It differs.[/]")
+    return right
 
 
 @contextmanager
@@ -166,9 +192,9 @@ def fill_card(card: Path) -> None:
         os.utime(path, (1795170735, 1795170735))
 
 
-def introduce(tour: Tour) -> None:
+def introduce(console: Console) -> None:
     """Introduce the tour."""
-    tour.console.print(
+    console.print(
         Panel(
             "A drone keeps its flight logs, scripts and settings on a memory card. Over the air the only way "
             "to them is a request-and-answer protocol (MAVLink FTP): 239 bytes at a time, over whatever "
@@ -182,16 +208,6 @@ def introduce(tour: Tour) -> None:
     )
 
 
-def mount(tour: Tour, stack: ExitStack) -> None:
-    """Start the vehicle and mount it."""
-    port = free_port()
-    link = f"udpout:{HOST}:{port}"
-    stack.enter_context(vehicle([str(tour.card), "--profile", PROFILE, "--link", link, *RADIO], tour.folder))
-    stack.callback(release, tour.drone)
-    tour.say("The drone is switched on. Now we mount it, over UDP, as a telemetry radio would hand it to us:")
-    tour.command("mavftpfs", f"udpin:{HOST}:{port}", "drone")
-
-
 def release(path: Path) -> None:
     """End a mount that was not unmounted, and discard pending changes, because the drone is only
     simulated."""
@@ -202,56 +218,13 @@ def release(path: Path) -> None:
     subprocess.run(["fusermount3", "-uz", path], capture_output=True, check=False)
 
 
-def look_around(tour: Tour) -> None:
-    """Run ls and cat."""
-    tour.say("It looks like any other directory:")
-    tour.command("ls", "-l", f"drone/{Path(LOG).parent}")
-    tour.say("Reading a file needs nothing special either:")
-    text = tour.command("cat", f"drone/{SCRIPT}")
-    tour.proofs.append(text == SCRIPT_TEXT)
-
-
-def copy_log(tour: Tour) -> None:
-    """Copy a log, then compare checksums."""
-    tour.say(
-        "Copying a flight log over the bad radio. Lost packets are requested again while the rest flows:"
-    )
-    tour.command("cp", f"drone/{LOG}", "flight.ulg")
-    sums = tour.command("md5sum", f"card/{LOG}", "flight.ulg")
-    tour.verdict(len({line.split()[0] for line in sums.splitlines()}) == 1)
-
-
-def edit_script(tour: Tour) -> None:
-    """Change a file on the drone with an ordinary program, and look at the card."""
-    tour.say(
-        "Changing a file is as simple. When the program has closed it, the whole new file is on the drone's "
-        "card and was compared with what was written:"
-    )
-    old, new = EDIT
-    tour.command("sed", "-i", f"s/{old}/{new}/", f"drone/{SCRIPT}")
-    tour.verdict(tour.command("cat", f"card/{SCRIPT}") == SCRIPT_TEXT.replace(old, new))
-
-
-def show_status(tour: Tour) -> None:
-    """Show the mount's report about the drone and the radio."""
-    tour.say("How the drone, the radio and all transfers are doing, at any time:")
-    tour.command("mavftpfs", "status", "drone")
-
-
-def compare_all(tour: Tour) -> None:
-    """Compare the whole mount with the card, by diff."""
-    tour.say("And the whole drone compared with its card (silence means: no difference):")
-    tour.proofs.append(tour.command("diff", "-r", "card", "drone") == "")
-
-
-def conclude(tour: Tour) -> int:
+def conclude(console: Console, good: bool) -> int:
     """Print the verdict and the way to a real vehicle; return the exit code."""
-    good = len(tour.proofs) == 4 and all(tour.proofs)
     program = "mavftpfs" if shutil.which("mavftpfs") else os.path.relpath(sys.argv[0])
     verdict = (
         "[bold green]Every byte was right.[/]" if good else "[bold red]Something differed: this is a bug.[/]"
     )
-    tour.console.print(
+    console.print(
         Panel(
             f"{verdict} The drone is unmounted and everything is cleaned up.\n\n"
             "With a real one:\n"
@@ -266,21 +239,19 @@ def conclude(tour: Tour) -> int:
     return 0 if good else 1
 
 
-def take_tour(tour: Tour, stack: ExitStack) -> None:
-    """Take all steps; `stack` ends everything that was started."""
-    tour.card.mkdir()
-    tour.drone.mkdir()
-    fill_card(tour.card)
-    introduce(tour)
-    mount(tour, stack)
+def take_tour(console: Console, folder: Path, stack: ExitStack) -> bool:
+    """Take all steps; return whether all bytes were right. `stack` ends everything that was started."""
+    card, drone, port = folder / "card", folder / "drone", free_port()
+    card.mkdir()
+    drone.mkdir()
+    fill_card(card)
+    introduce(console)
+    link = f"udpout:{HOST}:{port}"
+    stack.enter_context(vehicle([str(card), "--profile", PROFILE, "--link", link, *RADIO], folder))
+    stack.callback(release, drone)
     try:
-        look_around(tour)
-        copy_log(tour)
-        show_status(tour)
-        edit_script(tour)
-        compare_all(tour)
-        tour.say("Done. Unmounting:")
-        tour.command("mavftpfs", "umount", "drone")
+        verdicts = [take(step, console, folder) for step in steps(f"udpin:{HOST}:{port}")]
+        return all(verdicts)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must not stop the cleaning up
 
@@ -291,15 +262,15 @@ def demo(args: argparse.Namespace) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     # The kernel's table and the mount's socket name the place by its real path.
-    tour = Tour(console, Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")).resolve())
+    folder = Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")).resolve()
     try:
         with ExitStack() as stack:
-            stack.callback(shutil.rmtree, tour.folder, ignore_errors=True)
-            take_tour(tour, stack)
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            good = take_tour(console, folder, stack)
     except (DemoFailed, control.ControlError) as error:
         console.print(f"[red]mavftpfs demo: {error}[/]", highlight=False)
         return 1
     except KeyboardInterrupt:
         console.print("\nStopped; everything is cleaned up.")
         return 130
-    return conclude(tour)
+    return conclude(console, good)
