@@ -308,8 +308,8 @@ def status(args: argparse.Namespace) -> int:
         report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
         return ExitCode.OK
     if args.watch:
-        report.watch_status(fetch, verbose=args.verbose)
+        report.watch_status(fetch)
     found = fetch()
-    print(*report.all_lines(found, verbose=args.verbose), sep="\n")
+    print(*report.all_lines(found), sep="\n")
     unanswered = args.mountpoint is not None and found[0].get("problem")
     return ExitCode.MOUNT_FAILED if unanswered else ExitCode.OK

@@ -460,7 +460,6 @@ def _status_parser(name: str) -> Parser:
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--watch", action="store_true", help="repeat each second")
-    parser.add_argument("-v", "--verbose", action="store_true", help="show everything that the mount reports")
     return parser
 
 

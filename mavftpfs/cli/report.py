@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 from mavftpfs.client.mounts import Status
 from mavftpfs.client.status import is_read_only, second_vehicle
@@ -18,28 +17,23 @@ from mavftpfs.shared.readable import count_files, printable, readable_size, read
 WATCH_PERIOD = 1.0
 NOTHING = "no vehicle is mounted"
 
-_IN_THE_LINES = {"mountpoint", "problem", "transfers"}
-
 
 # -- what is said -----------------------------------------------------------------------------------
 
 
-def status_lines(status: Status, *, verbose: bool = False) -> list[str]:
-    """Return a mount's lines: one for a pilot, transfers, pending changes; verbose: the rest, too."""
+def status_lines(status: Status) -> list[str]:
+    """Return a mount's lines: one for a pilot, transfers, pending changes."""
     lines = [f"{status.get('mountpoint', '?')}: {_headline(status)}"]
     if not status.get("problem"):
-        lines += _member_lines(status) if "members" in status else _vehicle_lines(status, verbose=verbose)
+        lines += _member_lines(status) if "members" in status else _vehicle_lines(status)
     return list(map(printable, lines))
 
 
-def _vehicle_lines(status: Status, *, verbose: bool) -> Iterator[str]:
+def _vehicle_lines(status: Status) -> Iterator[str]:
     if status["link"].get("second"):
         yield f"  {second_vehicle(status)}"
     yield from map(_transfer_line, status["transfers"])
     yield from _held_lines(status)
-    if verbose:
-        rest = {key: value for key, value in status.items() if key not in _IN_THE_LINES}
-        yield from _rows(rest, "  ")
 
 
 def _member_lines(status: Status) -> Iterator[str]:
@@ -47,26 +41,6 @@ def _member_lines(status: Status) -> Iterator[str]:
     for member in status["members"]:
         if member["state"] != "mounted":
             yield f"  vehicle {member['name']}: {member['problem'] or member['state']}"
-
-
-def _rows(facts: Mapping[str, Any], before: str) -> Iterator[str]:
-    """Yield nested facts as in `--json`, one line for each that is set."""
-    for key, value in facts.items():
-        name = before + key.replace("_", " ")
-        if isinstance(value, Mapping):
-            yield from _rows(value, f"{name}: ")
-        elif value not in (None, "", [], ()):
-            yield f"{name}: {_fact(value)}"
-
-
-def _fact(value: object) -> str:
-    """Return a value as people write it: yes and no, and only the significant digits."""
-    match value:
-        case bool():
-            return "yes" if value else "no"
-        case float():
-            return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-    return str(value)
 
 
 def _headline(status: Status) -> str:
@@ -173,19 +147,19 @@ def delivery_line(status: Status) -> str:
 # -- printing ---------------------------------------------------------------------------------------
 
 
-def all_lines(statuses: Sequence[Status], *, verbose: bool) -> list[str]:
+def all_lines(statuses: Sequence[Status]) -> list[str]:
     """Return the lines of all mounts."""
-    return [line for status in statuses for line in status_lines(status, verbose=verbose)] or [NOTHING]
+    return [line for status in statuses for line in status_lines(status)] or [NOTHING]
 
 
-def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
+def watch_status(fetch: Callable[[], Sequence[Status]]) -> None:
     """Show the status again each second until interrupted; on a terminal in place of the last one."""
     if sys.stdout.isatty():
         from mavftpfs.cli import drawing
 
-        drawing.watch(lambda: all_lines(fetch(), verbose=verbose), WATCH_PERIOD)
+        drawing.watch(lambda: all_lines(fetch()), WATCH_PERIOD)
     while True:
-        print(*all_lines(fetch(), verbose=verbose), "", sep="\n", flush=True)
+        print(*all_lines(fetch()), "", sep="\n", flush=True)
         time.sleep(WATCH_PERIOD)
 
 

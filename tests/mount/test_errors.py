@@ -58,9 +58,9 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
 def test_a_scan_names_both_mounts_of_a_vehicle(field: Field, small_tree: Path) -> None:
     source = field.sim(small_tree).source
     first, second = field.mount(source), field.mount(source)
-    _, row = mavftpfs("scan", source)[0].splitlines()
-    assert row.startswith("1/1\t")
-    assert all(str(mount.path) in row for mount in (first, second))
+    _, row, ftp = mavftpfs("scan", source)[0].splitlines()
+    assert row.startswith("1/1 ")
+    assert all(str(mount.path) in ftp for mount in (first, second))
 
 
 LIMITED = """

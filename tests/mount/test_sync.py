@@ -406,10 +406,10 @@ def test_scan_of_a_camera_and_a_ground_station_ends_in_its_time() -> None:
     port = free_udp_port()
     with Beating(port, (Address(1, 100), 30, MAV_AUTOPILOT_INVALID), STATION):
         out, _ = run("scan", "-o", "connect_timeout=3000", f"udpin:{HOST}:{port}")
-    camera, station = (line.split("\t") for line in out.splitlines()[1:])
-    assert camera[:4] == ["1/100", "camera", "-", "-"]
-    assert camera[4].startswith("no answer")
-    assert station == ["255/190", "ground station", "-", "-", "not asked (a ground station)"]
+    camera, answer, station, reason = (" ".join(line.split()) for line in out.splitlines()[1:])
+    assert (camera, station) == ("1/100 camera", "255/190 ground station")
+    assert answer.startswith("FTP: no answer")
+    assert reason == "FTP: not asked (a ground station)"
 
 
 def test_scan_beside_a_mount_shows_who_else_is_there(field: Field) -> None:
@@ -421,10 +421,12 @@ def test_scan_beside_a_mount_shows_who_else_is_there(field: Field) -> None:
             "the mount hears the ground station", lambda: len(mount.status()["connection"]["heard"]) > 1
         )
         for source in (vehicle.source, mount.path):
-            own, station = (line.split("\t") for line in run("scan", source)[0].splitlines()[1:])
-            assert own[0] == "1/1"
-            assert own[4] == f"mounted on {mount.path}"
-            assert station[:2] == ["255/190", "ground station"]
+            _, own, place, station, _ = (
+                " ".join(line.split()) for line in run("scan", source)[0].splitlines()
+            )
+            assert own.startswith("1/1 ")
+            assert place == f"FTP: mounted on {mount.path}"
+            assert station == "255/190 ground station"
 
 
 @pytest.mark.parametrize("command", ["scan", "sync", "mount"])

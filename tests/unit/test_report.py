@@ -163,16 +163,6 @@ def test_nobody_is_told_of_half_a_second() -> None:
     assert "1.0 s left" in delivery_line(status(None, {**cache, "bytes_undelivered": 1}))
 
 
-def test_the_rest_is_in_round_numbers_and_in_words() -> None:
-    facts = {"rtt": 0.0412345678, "other_ftp_client": True, "received_bytes": 123456789}
-    shown = status_lines(status(facts), verbose=True)
-    assert "  link: rtt: 0.0412" in shown
-    assert "  link: rate: 5100" in shown
-    assert "  link: other ftp client: yes" in shown
-    assert "  vehicle: armed: no" in shown
-    assert "  link: received bytes: 123456789" in shown
-
-
 def test_sizes_times_and_names() -> None:
     sizes = [readable_size(n) for n in (0, 999, 999.7, 1000, 999_949, 999_999, 5e9)]
     assert sizes == ["0 B", "999 B", "1.0 kB", "1.0 kB", "999.9 kB", "1.0 MB", "5.0 GB"]
