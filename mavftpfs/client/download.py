@@ -13,7 +13,7 @@ from mavftpfs.client.compare import Comparison, Match
 from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
-    LocalDiskFull,
+    LocalTrouble,
     Take,
     Wanted,
     known_time,
@@ -200,7 +200,7 @@ class Downloads:
         """Download files, and continue after one that fails. note: called for each downloaded file.
 
         Raises:
-            LinkError, LocalDiskFull, and RequestTimeout for MAX_TIMEOUTS successive files, because the others
+            LinkError, LocalTrouble, and RequestTimeout for MAX_TIMEOUTS successive files, because the others
             would fail, too. Also the errors of Reports.begins.
         """
         progress, timeouts = self.fetcher.progress, 0
@@ -233,7 +233,7 @@ class Downloads:
         """Report a failure; or raise the error, if it ends the run, because the other files would fail,
         too."""
         self.outcome.failed[path] = error
-        if ends or isinstance(error, LinkError | LocalDiskFull):
+        if ends or isinstance(error, LinkError | LocalTrouble):
             raise error
         self.reports.failed(name or name_text(path), error)
 

@@ -70,8 +70,8 @@ def next_read_size(size: int, took: float) -> int:
 PART_SUFFIX = ".part"
 
 
-class LocalDiskFull(UsageError):
-    """The local disk is full."""
+class LocalTrouble(UsageError):
+    """The local disk is full, or gone."""
 
 
 class StillGrowing(MavftpfsError):
@@ -170,7 +170,7 @@ def local_disk(place: Path) -> Iterator[None]:
         yield
     except OSError as exc:
         full = exc.errno in (errno.ENOSPC, errno.EDQUOT)
-        raise (LocalDiskFull if full else UsageError)(f"{place}: {exc.strerror}") from exc
+        raise (LocalTrouble if full else UsageError)(f"{place}: {exc.strerror}") from exc
 
 
 class Part:

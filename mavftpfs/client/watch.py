@@ -7,7 +7,6 @@ the connection, which closes the server's session.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 from math import inf
@@ -19,7 +18,7 @@ from mavftpfs.client.compare import Verify
 from mavftpfs.client.connect import NO_SINKS, Sinks, connect_options, opened
 from mavftpfs.client.contact import Contact, Heard, LinkContact, MountContact
 from mavftpfs.client.download import Downloads, Outcome, Reports, named
-from mavftpfs.client.fetch import Fetched, Fetcher, LocalDiskFull, StillGrowing, Wanted, local_disk
+from mavftpfs.client.fetch import Fetched, Fetcher, LocalTrouble, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
 from mavftpfs.client.logs import SyncRequest, path_of, sync
 from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
@@ -31,7 +30,7 @@ from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.session.connection import connected
-from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout, UsageError
+from mavftpfs.shared.errors import LinkClosed, LinkError, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_size
 
@@ -41,15 +40,9 @@ REOPEN = 5.0
 """Seconds until the watch tries again to open a link."""
 SILENCE = 3600.0
 """Seconds after which the watch prints a line although nothing happened."""
-SPARE = 1 << 20
-"""Bytes that must stay free on the local disk."""
 
 HandOn = Callable[[Path], Awaitable[str]]
 """Runs a command for a downloaded log; returns why the command failed, or ""."""
-
-
-class LocalTrouble(UsageError):
-    """The local directory does not exist, or has no room."""
 
 
 class Watch:
@@ -248,7 +241,7 @@ class Complaints:
 
 
 class Keeping:
-    """The local directory of a watch: its manifest, its room, and the command that is run for each log.
+    """The local directory of a watch: its manifest, and the command that is run for each log.
 
     Raises:
         UsageError: the directory cannot be used.
@@ -267,18 +260,14 @@ class Keeping:
             if log.proven and not log.handed_on:
                 self._to_hand_on.send_nowait(log)
 
-    def require_room(self, needed: int) -> None:
-        """Check that the directory is there, and has room for so many bytes.
+    def require_there(self) -> None:
+        """Check that the directory is there.
 
         Raises:
-            LocalTrouble: the directory is missing, or full.
+            LocalTrouble: it is missing.
         """
         if not self.manifest.is_there():
-            raise LocalTrouble(f"{self.local} does not exist; waiting for it")
-        free = free_space(self.local)
-        if free - SPARE < needed:
-            wants = f"{readable_size(needed + SPARE)} are needed, {readable_size(free)} are free"
-            raise LocalTrouble(f"{self.local} is full: {wants}; waiting for room")
+            raise LocalTrouble(f"{self.local} does not exist")
 
     def look(self) -> None:
         """Read the manifest again, because another disk may be mounted there now.
@@ -305,7 +294,7 @@ class Keeping:
         if self._hand_on is None:
             return
         async for log in self._handed_over:
-            if is_file(self.local / log.file):  # a user may have moved it away
+            if (self.local / log.file).is_file():  # a user may have moved it away
                 await self._hand_on_one(log, self._hand_on)
 
     async def _hand_on_one(self, log: Downloaded, hand_on: HandOn) -> None:
@@ -341,14 +330,14 @@ class VehicleSync(Reports):
         """Sync, and report the result to the policy; if the contact breaks, the sync stays due."""
         self.policy.begin()
         try:
-            self.keeping.require_room(0)
+            self.keeping.require_there()
             self.keeping.look()
             async with contact.session() as session:
                 await self._sync(session, await contact.identity() or f"system-{self.system}")
         except LinkClosed as exc:
             self.broken = exc
-        except (LocalTrouble, LocalDiskFull) as exc:
-            self.complaints.tell("local", str(exc))
+        except LocalTrouble as exc:
+            self.complaints.tell("local", f"{exc}; waiting for the disk")
             self.policy.local_trouble(trio.current_time())
         except NotFound as exc:  # before the first flight there is no directory of logs
             self._complain("logs", str(exc))
@@ -422,16 +411,16 @@ class VehicleSync(Reports):
 
     def begins(self, wanted: Wanted) -> None:
         """See Reports; check the local directory first."""
-        self.keeping.require_room(0 if wanted.here else wanted.size - wanted.begun)
-        self.complaints.over("local")
+        self.keeping.require_there()
         if not wanted.here:
             begun = f", from {readable_size(wanted.begun)} on" if wanted.begun else ""
-            self._tell(f"{wanted.name} begins, {readable_size(wanted.size)}{begun}")
+            self._complain("begins", f"{wanted.name} begins, {readable_size(wanted.size)}{begun}")
 
     def arrived(self, fetched: Fetched) -> None:
         """See Reports."""
         name, verified = fetched.wanted.name, fetched.verified
-        self.complaints.over(f"{self.system} {name}")
+        for about in (f"{self.system} {name}", f"{self.system} begins", "local"):
+            self.complaints.over(about)
         if fetched.proven:
             self.policy.arrived()
             self._tell(f"{name} is here, verified by {verified.how}{fetched.kept_words}")
@@ -453,17 +442,3 @@ class VehicleSync(Reports):
 
     def _tell(self, line: str) -> None:
         self.say(f"vehicle {self.system}: {line}")
-
-
-def is_file(path: Path) -> bool:
-    """Return whether the path is a file."""
-    return path.is_file()
-
-
-def free_space(directory: Path) -> float:
-    """Return the free bytes of a local disk, infinite if unknown."""
-    try:
-        facts = os.statvfs(directory)
-    except OSError:
-        return inf
-    return facts.f_bavail * facts.f_frsize

@@ -428,12 +428,12 @@ def stick(place: Path, size: str) -> Iterator[None]:
 async def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
     with stick(tmp_path / "stick", "2m"):
         day = Day(tmp_path / "stick")
-        (tmp_path / "stick" / "other").write_bytes(bytes(1_000_000))
+        (tmp_path / "stick" / "other").write_bytes(bytes(1_800_000))
         day.put("1.ulg", content(400_000))
         async with day.watched():
-            await day.until("waiting for room")
+            await day.until("No space left on device; waiting for the disk")
             await trio.sleep(600.0)
-            assert day.saying("waiting for room") == 1
+            assert day.saying("waiting for the disk") == 1
             (tmp_path / "stick" / "other").unlink()
             await day.until("is here, verified")
         assert day.logs() == {"1.ulg": content(400_000)}
@@ -453,7 +453,7 @@ async def test_a_disk_that_is_pulled_in_mid_transfer(tmp_path: Path) -> None:
                 await day.until("begins")
                 await trio.sleep(3.0)
                 run("umount", "-l", place)
-                await day.until("does not exist; waiting for it")
+                await day.until("does not exist; waiting for the disk")
                 await trio.sleep(600.0)
                 assert list(place.iterdir()) == []
                 run("mount", "--bind", disk, place)
