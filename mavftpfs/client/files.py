@@ -213,8 +213,7 @@ class Session:
     status: returns the facts of `status --json` about vehicle, link and transfers. root: the vehicle's
     directory that is `/` in `files`. mountpoint: of the mount that serves the files, None for a connection of
     this program's own. patience: seconds to wait for a lost vehicle. unnamed: the vehicles on the link; None
-    if SOURCE or the options name one. read_only: the user's options forbid changes of a mount that allows
-    them.
+    if SOURCE or the options name one. read_only: the user's options forbid changes.
     """
 
     files: Files
@@ -481,7 +480,9 @@ def session_of(vehicle: Attached, options: Options) -> Session:
     async def status() -> Facts:
         return vehicle.status()
 
-    return Session(vehicle.tree, status, options.root, None, options.connect_timeout)
+    return Session(
+        vehicle.tree, status, options.root, None, options.connect_timeout, read_only=options.read_only
+    )
 
 
 @asynccontextmanager
