@@ -118,16 +118,16 @@ def _print_payload(now: float, direction: str, wire: bytes) -> None:
 
 
 @asynccontextmanager
-async def opened(spec: LinkSpec, options: Options, *, beats: bool = False) -> AsyncIterator[Link]:
+async def opened(spec: LinkSpec, options: Options, *, shared: bool = False) -> AsyncIterator[Link]:
     """Open a link for the length of the body, alone or with other mavftpfs programs.
 
-    beats: receive only heartbeats; then the link is shared from the beginning.
+    shared: share the link from the beginning.
 
     Raises:
         LinkClosed: as open_shared. UsageError: an endpoint of forward= is SOURCE itself.
     """
     own = Address(options.source_system, OWN_COMPONENT)
-    wanted = PortRequest(own, options.forward, process_name(), beats)
+    wanted = PortRequest(own, options.forward, process_name(), shared)
     for place in options.forward:
         if leads_back(parse_source(place), spec):
             raise UsageError(

@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs.hub.inlet import Inlet
 from mavftpfs.hub.outbox import LinePace, Outbox, Waiting
-from mavftpfs.hub.routing import ALL, BEATS, Kind, Router
+from mavftpfs.hub.routing import Kind, Router
 from mavftpfs.hub.senders import PORT, Place
 from mavftpfs.link.addresses import NetAddress, readable_address
 from mavftpfs.link.base import Link
@@ -186,7 +186,7 @@ class Hub:
             tell(sock, {"refused": str(exc)})
             return None
         tell(sock, {"own": client.own, "number": client.number})
-        self.router.add(client.side, Kind.CLIENT, focus=BEATS if hello.get("beats") else ALL)
+        self.router.add(client.side, Kind.CLIENT)
         log.info("%s joined as %d/%d", client.link.description, *client.own)
         return client
 

@@ -8,7 +8,8 @@ mavftpfs programs. Only a frame that `senders` believes goes anywhere.
 - A client's frames go to the address that it names, if a sender was heard there. Otherwise they follow the
   same rule, but go to the port alone.
 - A client's vehicle is the target that its frames named last. A client receives all frames of its vehicle,
-  FTP with its vehicle, and the heartbeats of other vehicles. `_concerns` decides.
+  FTP with its vehicle, and the heartbeats of other vehicles. Until it names a vehicle, it receives only
+  heartbeats. `_concerns` decides.
 """
 
 from __future__ import annotations
@@ -23,11 +24,6 @@ from mavftpfs.link.fastframe import FTP_MESSAGE_ID
 from mavftpfs.link.frames import EVERYBODY, HEARTBEAT_ID, Frame, armed_by
 from mavftpfs.link.messages import Address
 
-ALL = 0
-"""The focus of a client that has not named a vehicle."""
-BEATS = -1
-"""The focus of a client that wants only heartbeats."""
-
 _MOST_PLANS = 4096
 
 
@@ -41,11 +37,12 @@ class Kind(Enum):
 
 @dataclass(slots=True)
 class _Side:
-    """fixed: every frame for this side goes to one address. focus: the system that concerns a client."""
+    """fixed: every frame for this side goes to one address. focus: a client's vehicle, None before it names
+    one."""
 
     kind: Kind
     fixed: bool
-    focus: int = ALL
+    focus: int | None = None
 
 
 class Router:
@@ -64,9 +61,9 @@ class Router:
 
     # -- sides
 
-    def add(self, side: int, kind: Kind, *, fixed: bool = True, focus: int = ALL) -> None:
-        """Add a side. fixed: its frames have one way out, for every address. focus: ALL, or BEATS."""
-        self._sides[side] = _Side(kind, fixed, focus)
+    def add(self, side: int, kind: Kind, *, fixed: bool = True) -> None:
+        """Add a side. fixed: its frames have one way out, for every address."""
+        self._sides[side] = _Side(kind, fixed)
         self._plans.clear()
 
     def remove(self, side: int) -> None:
@@ -104,7 +101,7 @@ class Router:
 
     def _note_focus(self, frame: Frame, place: Place) -> None:
         side, system = self._sides[place.side], frame.target.system
-        if side.kind is Kind.CLIENT and side.focus not in (BEATS, system) and system:
+        if side.kind is Kind.CLIENT and system not in (EVERYBODY.system, side.focus):
             side.focus = system
             self._plans.clear()
 
@@ -153,12 +150,8 @@ def _is_for_all_clients(beat: Frame, origin: Kind) -> bool:
     return origin is Kind.PORT or (origin is Kind.ENDPOINT and armed_by(beat) is None)
 
 
-def _concerns(focus: int, frame: Frame, origin: Kind) -> bool:
+def _concerns(focus: int | None, frame: Frame, origin: Kind) -> bool:
     """Return whether a client with that focus receives a frame."""
-    if focus == BEATS:
-        return False
-    of_vehicle = origin is Kind.PORT and focus in (ALL, frame.source.system)
-    with_vehicle = frame.id == FTP_MESSAGE_ID and (
-        focus == ALL or frame.target.system in (EVERYBODY.system, focus)
-    )
-    return of_vehicle or with_vehicle
+    of_vehicle = origin is Kind.PORT and frame.source.system == focus
+    with_vehicle = frame.id == FTP_MESSAGE_ID and frame.target.system in (EVERYBODY.system, focus)
+    return focus is not None and (of_vehicle or with_vehicle)

@@ -114,17 +114,17 @@ def set_buffers(sock: socket.socket) -> None:
 @dataclass(frozen=True, slots=True)
 class PortRequest:
     """A program's request for a port: the address that it prefers, the endpoints for `forward=`, its name for
-    people. beats: the program wants only heartbeats."""
+    people. shared: use a hub, even if no other program uses the port."""
 
     own: Address
     forward: tuple[str, ...] = ()
     name: str = ""
-    beats: bool = False
+    shared: bool = False
 
     @property
     def needs_hub(self) -> bool:
-        """Whether only a hub can do that, even if no other program uses the port."""
-        return self.beats or bool(self.forward)
+        """Whether only a hub can do that."""
+        return self.shared or bool(self.forward)
 
 
 class HubLink(PipeLink):
@@ -187,7 +187,6 @@ async def join(sock: socket.socket, spec: LinkSpec, wanted: PortRequest, seat: S
         "number": None if seat is None else seat.number,
         "forward": wanted.forward,
         "name": wanted.name,
-        "beats": wanted.beats,
     }
     try:
         set_buffers(sock)

@@ -64,7 +64,7 @@ class Supervisor(Life):
         self._nursery = nursery
         options = self.request.options
         async with (
-            opened(self.request.spec, options, beats=True) as link,
+            opened(self.request.spec, options, shared=True) as link,
             listening(link, options, self._on_heard),
         ):
             self.enter(State.MOUNTED)

@@ -6,7 +6,7 @@ import pytest
 from fastcrc import crc16
 
 from mavftpfs.hub.outbox import LINE_TIME, LinePace, Outbox, Waiting
-from mavftpfs.hub.routing import BEATS, Kind, Router
+from mavftpfs.hub.routing import Kind, Router
 from mavftpfs.hub.senders import MEMORY, MOST_SENDERS, PORT, Place
 from mavftpfs.link.addresses import PATIENCE, NetAddress
 from mavftpfs.link.fastframe import FTP_PAYLOAD_SIZE
@@ -172,11 +172,12 @@ def test_a_client_whose_vehicle_was_not_heard_yet_speaks_to_all(net: Net) -> Non
     assert net.send(hello(CLIENT), MOUNT) == {TO_ONE, TO_TWO}
 
 
-def test_a_client_that_wants_only_heartbeats_is_told_those_of_all(net: Net) -> None:
+def test_a_client_that_names_no_vehicle_is_told_only_the_heartbeats_of_all(net: Net) -> None:
     net.router.remove(OTHER)
-    net.router.add(OTHER, Kind.CLIENT, focus=BEATS)
-    net.send(ftp(Address(254, 192), ONE), OTHER)
+    net.router.add(OTHER, Kind.CLIENT)
+    net.send(hello(Address(254, 192)), OTHER)
     assert OTHER not in net.sides(ftp(ONE, EVERYBODY), PORT, AT_ONE)
+    assert OTHER not in net.sides(attitude(ONE), PORT, AT_ONE)
     assert OTHER in net.sides(beat(ONE), PORT, AT_ONE)
 
 
