@@ -22,7 +22,7 @@ import trio
 
 from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import Operation
+from mavftpfs.protocol.requests import Operation, Request
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import (
     LEFT_OPEN,
@@ -208,19 +208,24 @@ class ServerSession:
             self.maybe_open.add((reply.session, b""))
             self.wake()
 
-    def on_late(self, reply: Payload, sent_at: float) -> None:
+    def on_late(self, reply: Payload, request: Request) -> None:
         """Take an ACK that no operation waits for, because another transmission was answered or the operation
         was cancelled.
 
-        sent_at: when the request went out first. A late open may have replaced the present file by an earlier
-        one, or left that open. A late WriteFile may have put its bytes into a later file. Other requests need
-        nothing here, because the names that they change are in quarantine.
+        A late open may have replaced the present file by an earlier one, or left that open. A late WriteFile
+        may have put its bytes into a later file. A late RENAME or REMOVE may have taken a later file away if
+        it came after the quarantine of its name.
         """
-        if sent_at >= self.file_since:
+        late = self.clock() - request.first_sent
+        if reply.req_opcode in (Opcode.RENAME, Opcode.REMOVE_FILE):
+            name, _, _ = request.data.partition(b"\0")
+            if not self.quarantine.left(name, self.clock()):
+                self.on_unexplained(reply, late)
+        elif request.first_sent >= self.file_since:
             return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
-        if reply.req_opcode in OPENING:
+        elif reply.req_opcode in OPENING:
             if self.session is None or self.session.seq != reply.seq:
-                self.on_unexplained(reply, self.clock() - sent_at)
+                self.on_unexplained(reply, late)
         elif reply.req_opcode == Opcode.WRITE_FILE:
             self.distrust("a WriteFile came after its file was closed", reads=False)
 

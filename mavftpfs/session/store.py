@@ -52,7 +52,8 @@ from mavftpfs.shared.model import (
 from mavftpfs.shared.sending import SendBuffer
 
 TIME_PROBE_LIMIT = 2.5
-"""Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
+"""Seconds of silence, or four round trips, after which ListDirectory is tried in place of
+ListDirectoryWithTime."""
 
 TIME_SILENCES = 2
 """Silences, each followed by an answered ListDirectory, after which opcode 16 counts as unknown: a single one
@@ -133,7 +134,8 @@ class Store:
         tried: list[ListDirectory] = []
         refused = False
         if traits.lists_times is not False:
-            with trio.move_on_after(inf if traits.lists_times else TIME_PROBE_LIMIT) as scope:
+            probe = max(TIME_PROBE_LIMIT, 4.0 * (self._server.engine.rtt or 0.0))
+            with trio.move_on_after(inf if traits.lists_times else probe) as scope:
                 try:
                     operation = await self._server.ask(
                         partial(_asking_times, wire, known_end, traits, scope, tried)

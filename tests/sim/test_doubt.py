@@ -782,3 +782,32 @@ async def test_doubt_costs_a_new_file_one_comparison(profile: str) -> None:
 
     comparison = 0.02 + READY
     assert await forty(0.02) <= await forty(0.0) + 40 * comparison + 0.3
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("opcode", [Opcode.RENAME, Opcode.REMOVE_FILE])
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "ardupilot5", "mavsdk"])
+async def test_a_change_of_names_that_comes_after_its_quarantine_is_a_reason_for_doubt(
+    profile: str, opcode: Opcode
+) -> None:
+    here = Rig(profile, {b"/d/y": content(4000)}, LinkSettings(delay=0.02))
+    async with here.connected() as connection:
+        store, y = connection.store, path(profile, "y")
+        await store.list_directory(path(profile, "")[:-1])
+        came = come_late(here, 2.0, opcode)  # the first transmission; the second one is answered at once
+        await (store.rename(y, path(profile, "w")) if opcode is Opcode.RENAME else store.remove(y))
+        await put(connection, y, content(4500, 1))
+        assert not store.in_doubt()
+        await came.wait()
+        await trio.sleep(0.1)
+        assert y in here.files() or store.in_doubt()
+
+
+@pytest.mark.holds("rule 14.38")
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
+async def test_a_long_way_is_no_proof_that_listings_have_no_times(profile: str) -> None:
+    here = Rig(profile, {b"/d/a": b"x"}, LinkSettings(delay=1.4))
+    async with here.connected() as connection:
+        for _ in range(3):
+            await connection.store.list_directory(path(profile, "")[:-1])
+        assert connection.store.traits.lists_times
