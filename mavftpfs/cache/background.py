@@ -101,6 +101,7 @@ class Background:
         """Return counters; bytes_... in bytes. bytes_undelivered: of whole files; bytes_held: what they take
         here."""
         card, waiting = self._card, self.undelivered()
+        failed = [file for file in card.live if file.error is not None and file.has_name]
         return {
             "bytes_held": card.spool.held,
             "unacked_max": card.throttle.limit,
@@ -108,7 +109,7 @@ class Background:
             "files_undelivered": len(waiting),
             "broken": {_shown(file): _reason_then(file.error) for file in card.broken},
             "bytes_undelivered": sum(file.size for file in waiting),
-            "errors": {_shown(file): readable(str(file.error)) for file in card.live if file.error},
+            "errors": {_shown(file): readable(str(file.error)) for file in failed},
             **card.counts,
         }
 

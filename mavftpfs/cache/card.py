@@ -106,7 +106,9 @@ class Card:
         self.throttle = Throttle(self.live, self.cache.meter, options.link_rate, clock)
         self.counts = {"verified_by_crc": 0, "verified_by_size": 0, "checksums_unanswered": 0}
         self.parts: list[bytes] = []
-        self.repair = Repair(store, self.directories, self.own, nursery, lambda: self.blocked, clock)
+        self.repair = Repair(
+            store, self.directories, self.own, self.paths, nursery, lambda: self.blocked, clock
+        )
         self.names = Names(store, self.directories, self.own, self.live, self.repair, clock)
         self.repair.names = self.names
         self.restarted_at = -inf
@@ -179,6 +181,7 @@ class Card:
         it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
         file.lose_name()
+        self.names.settle(file)  # nothing of it is placed any more
         file.content.on_unneeded()
         file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
         self.throttle.waiting.unpark_all()

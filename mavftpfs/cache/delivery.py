@@ -98,7 +98,6 @@ async def _deliver(card: Card, file: File) -> None:
     try:
         card.require_disarmed()
         await _try(card, file)
-        file.error, file.start_after = None, float("-inf")
     except MavftpfsError as error:
         if isinstance(error, FileChanged) and file.state is State.DIRTY and file.base_matters:
             file.on(Event.REPLACED)
@@ -246,7 +245,7 @@ async def look_at_all(card: Card) -> float:
             again = min(again, LOOK_AGAIN)
             continue
         try:
-            async with file.lock:
+            async with file.lock, card.paths.steady(file):
                 await look(card, file)
         except MavftpfsError as error:
             log.info("what has the name %r is not known yet: %s", file.path, error)
@@ -269,6 +268,7 @@ def on_delivered(card: Card, file: File, sent: Known) -> None:
     file.base, file.unsure = Known(file.size, crc32=crc32), None
     file.fresh_at = card.clock()
     file.prove(file.fresh_at)
+    file.error, file.start_after = None, float("-inf")
     file.content.on_delivered()
     file.blocks.close_reader()
     file.blocks.drop()

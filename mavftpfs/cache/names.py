@@ -204,11 +204,15 @@ class Names:
     async def discard(self, path: bytes) -> None:
         """Remove a temporary name that is not needed any more. If that fails, `repair` removes it."""
         self._own.release(path)
+        gone = False
         try:
             await self.remove_if_there(path)
+            gone = True
         except MavftpfsError as error:
             log.info("%r stays until its directory is listed again: %s", path, error)
-            self._later.list_later(split(path)[0])
+        finally:
+            if not gone:  # also if the caller was cancelled
+                self._later.list_later(split(path)[0])
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
         """Rename; both paths fit a request.
@@ -261,6 +265,7 @@ class Names:
             second = own.need(first, Kind.NEW)
         except PathTooLong:
             return True
+        gone = False
         try:
             await store.create_empty(first)
             try:
@@ -269,6 +274,7 @@ class Names:
             except FtpNak:
                 store.traits.rename_works = False
             await store.remove(place)
+            gone = True
             if place == second:
                 store.traits.rename_works = True
         except FtpNak as nak:
@@ -277,7 +283,9 @@ class Names:
         finally:
             own.release(first)
             own.release(second)
-            self._directories.expire(split(near)[0])  # the next listing cleans up what is left
+            self._directories.expire(split(near)[0])
+            if not gone:
+                self._later.list_later(split(near)[0])
         return True
 
     async def purge(self, path: bytes) -> None:
@@ -309,10 +317,10 @@ class Names:
         """
         path = file.path
         with self._store.finishing():
-            await self._remove_asides(path)
             file.unsure = Unsure(temporary, None, sent, file.changes)
             self._later.look_later()
             try:
+                await self._remove_asides(path)
                 if file.base is None:
                     await self.rename(temporary, path)
                 else:

@@ -212,6 +212,8 @@ async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> 
     displaced = card.find(new)
     for file in list(card.files_below(old)):
         await uploads.abandon(card, file)
+        if file.unsure is not None and not file.unsure.in_place:
+            raise FileBusy(f"{file.path!r}: it is not known yet what the vehicle has there")
         if file.is_local and file.base is None:
             raise FileBusy(f"{file.path!r} is being written, and not on the vehicle yet")
     if displaced is not None:

@@ -10,8 +10,8 @@ Tasks take the locks in this order:
    takes it to fetch the bytes of the old file that stay. A read that holds it takes its path `shared`, to
    open the file. The read waits only for a call that holds the path alone, and such a call never reads
    through the cache.
-Every task may list a directory, whatever it holds, because the repair that follows a listing (`repair`) takes
-none of these locks.
+Every task may list a directory, whatever it holds, because the repair that follows a listing (`repair`) waits
+for none of these locks: it leaves alone a name that somebody uses.
 
 Two changes concern one another if they name the same path, whatever its case, or one names a directory above
 the other's. All other changes go on side by side, so a change that is not answered does not delay them.
@@ -86,6 +86,10 @@ class PathLocks:
                 if file.path == known:
                     yield known
                     return
+
+    def is_free(self, path: bytes) -> bool:
+        """Return whether nobody holds a path, or waits for it: `hold` would not wait."""
+        return not self._is_blocked(_Hold((path.lower(),), shared=False))
 
     def _is_blocked(self, wanted: _Hold) -> bool:
         """Return whether a call that has a lock, or asked for one before, is in the way."""

@@ -9,7 +9,8 @@ Each listing of a directory shows them, and `due_in` says in how many seconds wh
 | another mount's old file, its name missing | gets its name back | after 60 s |
 | another mount's, anything else | is removed | when it stayed the same for 600 s |
 
-What this mount still needs is left alone. An old file that tells no name becomes `recovered-oSSS`. Another
+What this mount still needs is left alone. An old file that tells no name becomes `recovered-oSSS`; so does a
+directory that another client had put in the place of the file before it was moved aside. Another
 computer's upload to a FAT card shows a size of 0 until its file is closed, which each upload does at least
 once a minute where the server keeps the content: so 600 s without a change say that nobody uploads.
 
@@ -26,6 +27,7 @@ import trio
 
 from mavftpfs.cache.directories import Directories, Directory
 from mavftpfs.cache.names import Names
+from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import Kind, OwnNames, Reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
@@ -82,6 +84,7 @@ class Repair:
         store: VehicleStore,
         directories: Directories,
         own: OwnNames,
+        paths: PathLocks,
         nursery: trio.Nursery,
         is_blocked: Callable[[], bool],
         clock: Callable[[], float],
@@ -90,6 +93,7 @@ class Repair:
         self._store = store
         self._directories = directories
         self._own = own
+        self._paths = paths
         self._nursery = nursery
         self._is_blocked = is_blocked
         self._clock = clock
@@ -148,8 +152,9 @@ class Repair:
             for left, name, seconds in found[:MOST_AT_ONCE]:
                 if seconds > 0.0 or self._own.is_needed(left, self._clock()):
                     continue
-                if not await self._repair(left, name, directory):
-                    self.list_later(path, IN_FLIGHT)
+                again = await self._repair(left, name, directory)
+                if again:
+                    self.list_later(path, again)
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
             self.list_later(path, AGAIN_AFTER)
@@ -164,8 +169,8 @@ class Repair:
         own, now, seen, found = self._own, self._clock(), directory.seen, []
         for entry in directory.entries.values():
             name, left = parse(entry.name), join(path, entry.name)
-            if name is None or entry.kind is EntryKind.DIRECTORY:
-                continue  # directories are never ours
+            if name is None or (entry.kind is EntryKind.DIRECTORY and name.kind is Kind.NEW):
+                continue
             there = split(self._target(left, name))[1] in directory.entries
             looks = (entry.size, there)
             if seen.get(entry.name, (None, 0.0))[0] != looks:
@@ -181,20 +186,26 @@ class Repair:
     def _target(self, left: bytes, name: Reserved) -> bytes:
         """Return the path that an old file is to get."""
         told = self._own.target_of(left, name)
-        return told or join(split(left)[0], b"recovered-o" + name.serial)
+        return told or join(split(left)[0], _recovered(name))
 
-    async def _repair(self, left: bytes, name: Reserved, directory: Directory) -> bool:
-        """Remove what is left, or give it its name; return False if that waits for the end of a flight."""
+    async def _repair(self, left: bytes, name: Reserved, directory: Directory) -> float:
+        """Remove what is left, or give it its name; return 0.0, or in how many seconds that is to be tried,
+        because it waits for the end of a flight, or for a program that is using its name."""
         target, ours = self._target(left, name), name.owner == self._own.owner
         waits = name.kind is Kind.OLD and split(target)[1] not in directory.entries
         if self._is_blocked() and not (ours and waits):
-            return False
-        if waits:
-            log.warning("%r was left by an interruption: renaming it to %r", left, target)
-            await self.names.rename(left, target, completes=ours)
-        else:
+            return IN_FLIGHT
+        if directory.entries[split(left)[1]].kind is EntryKind.DIRECTORY and not waits:
+            target, waits = join(split(left)[0], _recovered(name)), True
+        if not waits:
             await self.names.remove_if_there(left)
-        return True
+        elif not self._paths.is_free(target):
+            return AGAIN_AFTER
+        else:
+            async with self._paths.hold(target):  # or a delivery could give a new file the name first
+                log.warning("%r was left by an interruption: renaming it to %r", left, target)
+                await self.names.rename(left, target, completes=ours)
+        return 0.0
 
     def _start(self) -> None:
         self._news.set()
@@ -233,3 +244,7 @@ class Repair:
         except MavftpfsError as error:
             log.info("%r is repaired at a later listing: %s", directory, error)
             self.list_later(directory, AGAIN_AFTER)
+
+
+def _recovered(name: Reserved) -> bytes:
+    return b"recovered-o" + name.serial

@@ -147,10 +147,11 @@ async def abandon(card: Card, file: File) -> None:
     forget_attempt(file, attempt)
     try:
         await attempt.upload.end()
-        if not attempt.in_place and attempt.upload.may_exist:
-            await card.names.discard(attempt.path)
     finally:
-        card.own.release(attempt.path)
+        if attempt.in_place or not attempt.upload.may_exist:
+            card.own.on_gone(attempt.path)
+        else:
+            await card.names.discard(attempt.path)
 
 
 def forget_attempt(file: File, attempt: Attempt) -> None:

@@ -1,0 +1,247 @@
+"""What interruptions leave on the card is repaired, beside the programs that use its names."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import pytest
+import trio
+
+from mavftpfs.cache import namespace, uploads
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errors import FileBusy, MavftpfsError
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.rigs import Rig, rig, write_file
+from tests.support.transfers import content
+
+OLD, NEW = content(3_000, 1), content(20_000, 2)
+FILE, OTHER = b"/d/file", b"/d/other"
+QUICK = ConnectOptions(op_deadline=5.0)
+
+
+def torn(here: Rig) -> None:
+    here.connection.store.traits.rename_works = True
+    here.connection.store.traits.rename_replaces = False
+
+
+@pytest.mark.parametrize("nth", [1, 2])
+async def test_a_file_taken_back_in_the_gap_gets_its_old_file_back(nth: int) -> None:
+    async with rig("ardupilot5", {FILE: OLD}, options=QUICK) as here:
+        torn(here)
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, NEW)
+        here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=nth, drop=True)
+        with suppress(MavftpfsError):
+            await file.fsync()
+        there = await file.take_back()
+        here.faults.cut_after(None)
+        await trio.sleep(300)
+        await tree.list(b"/d")
+        await trio.sleep(300)
+        assert here.files().get(FILE) in (OLD, NEW), (there, here.files().keys())
+        assert here.litter() == []
+
+
+async def test_a_file_unsure_in_a_directory_that_gets_another_name_is_delivered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with rig("ardupilot5", {FILE: OLD}, options=QUICK) as here:
+        torn(here)
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        deliver_below = namespace._deliver_below
+
+        async def and_then_another_program_writes(*args: Any) -> None:
+            await deliver_below(*args)
+            file = await tree.open(FILE, write=True, truncate=True)
+            await file.write(0, NEW)
+            here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=2, drop=True)
+            with pytest.raises(MavftpfsError):
+                await file.release()
+            here.faults.cut_after(None)
+
+        monkeypatch.setattr(namespace, "_deliver_below", and_then_another_program_writes)
+        with pytest.raises(FileBusy):
+            await tree.rename(b"/d", b"/e")
+        await trio.sleep(600)
+        assert tree.undelivered() == [], tree.status()["errors"]
+        assert here.files() == {FILE: NEW}
+
+
+async def test_a_name_that_was_moved_away_does_not_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mount looks what has the name while a `mv` of it is under way."""
+    async with rig("px4", {FILE: OLD}, options=QUICK, link=LinkSettings(delay=0.05)) as here:
+        tree = here.mount(op_deadline=5.0)
+        card: Any = tree._card
+        await write_file(tree, b"/d/first", OLD)
+        await tree.list(b"/d")
+        deliver_below, look = namespace._deliver_below, card.repair.look
+
+        async def not_yet() -> float:
+            return float("inf")
+
+        async def and_then_another_program_writes(*args: Any) -> None:
+            await deliver_below(*args)
+            monkeypatch.setattr(card.repair, "look", not_yet)
+            file = await tree.open(FILE, write=True, truncate=True)
+            await file.write(0, NEW)
+            here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=1, drop=True)
+            with pytest.raises(MavftpfsError):
+                await file.release()
+            here.faults.cut_after(None)
+            here.faults.call_off()
+            here.faults.at(Opcode.RENAME, now.set)
+
+        now = trio.Event()
+
+        async def look_then() -> None:
+            await now.wait()
+            await look()
+
+        here.nursery.start_soon(look_then)
+        monkeypatch.setattr(namespace, "_deliver_below", and_then_another_program_writes)
+        moved = b"/d/moved"
+        try:
+            await tree.rename(FILE, moved)
+        except FileBusy:
+            moved = FILE
+        monkeypatch.setattr(card.repair, "look", look)
+        await trio.sleep(600)
+        assert tree.undelivered() == [], tree.status()["errors"]
+        assert here.files() == {moved: NEW, b"/d/first": OLD}, here.files().keys()
+
+
+async def test_no_temporary_file_stays_because_the_one_aside_could_not_be_removed() -> None:
+    async with rig("ardupilot5", {FILE: OLD}, options=QUICK) as here:
+        torn(here)
+        here.connection.store.in_doubt = lambda since=0.0: True
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        await write_file(tree, FILE, NEW)
+        assert len(here.litter()) == 1
+        here.faults.at(Opcode.REMOVE_FILE, lambda: here.faults.cut_after(0), drop=True)
+        with pytest.raises(MavftpfsError):
+            await write_file(tree, FILE, OLD)
+        here.faults.cut_after(None)
+        await trio.sleep(600)
+        await tree.list(b"/d")
+        await trio.sleep(30)
+        assert tree.undelivered() == []
+        assert here.data(FILE) == OLD
+        assert here.litter() == []
+
+
+async def test_a_cancelled_removal_of_a_temporary_file_is_made_up_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with rig("px4", {FILE: OLD}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        file = await tree.create(OTHER, exclusive=True)
+        await file.write(0, NEW)
+        here.faults.spoil = 1
+        with trio.CancelScope() as caller:
+            end = uploads.forget_attempt
+
+            def cancelled(*args: Any) -> None:
+                end(*args)
+                caller.cancel()
+
+            monkeypatch.setattr(uploads, "forget_attempt", cancelled)
+            await file.fsync()
+        monkeypatch.undo()
+        assert await file.take_back() is False
+        await trio.sleep(100)
+        await tree.tidy_up()
+        assert here.litter() == []
+
+
+@pytest.mark.parametrize("number", [0, 1, 4])
+async def test_repair_does_not_put_an_old_file_over_a_new_one(number: int) -> None:
+    """A mount was killed after it had moved the old file aside; a minute later the next one gives that its
+    name back, while a program makes the file anew. The name is in quarantine, so both wait."""
+    async with rig("px4-nuttx", {b"/d/x": OLD}, link=LinkSettings(delay=0.1)) as here:
+        tree, store = here.mount(), here.connection.store
+        await write_file(tree, b"/d/first", OLD)
+        here.put(b"/d/.mavftpfs-aaaaaaaoaaa-file", OLD)
+        tree.forget_caches()
+        await tree.list(b"/d")
+        file = await tree.create(FILE, exclusive=True)
+        await file.write(0, NEW)
+        await trio.sleep(55.0)
+        store._quarantine.on_changed(here.root + FILE, trio.current_time(), 5.0)  # repeated, after 5 s
+        await trio.sleep(number * 0.5)
+        told = None
+        try:
+            await file.release()
+        except MavftpfsError as error:
+            told = error
+        await trio.sleep(30)
+        await tree.list(b"/d")
+        assert told is not None or here.data(FILE) == NEW, here.files().keys()
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot5", "mavsdk"])
+async def test_a_directory_that_was_moved_aside_for_a_file_is_shown(profile: str) -> None:
+    """A program empties a file; others make it a directory before the program closes it."""
+    async with rig(profile, {FILE: OLD}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        await write_file(tree, b"/d/first", OLD)
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, NEW)
+        here.take(FILE)
+        here.put_directory(FILE)
+        here.put(FILE + b"/inside", b"theirs")
+        with suppress(MavftpfsError):
+            await file.release()
+        await trio.sleep(60)
+        shown = await tree.list(b"/d")
+        inside = [path for path in here.files() if path.endswith(b"/inside")]
+        assert len(inside) == 1
+        assert inside[0].split(b"/")[2] in dict(shown)
+
+
+async def test_no_error_is_shown_of_a_file_that_the_vehicle_turned_out_to_have() -> None:
+    async with rig("px4", {FILE: OLD}, options=QUICK) as here:
+        tree = here.mount(op_deadline=5.0)
+        await write_file(tree, b"/d/first", OLD)
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, NEW)
+        here.faults.lose_reply_to(Opcode.RENAME)
+        here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(1))
+        with pytest.raises(MavftpfsError):
+            await file.fsync()
+        here.faults.cut_after(None)
+        await trio.sleep(60)
+        assert here.data(FILE) == NEW
+        assert tree.undelivered() == []
+        assert tree.status()["errors"] == {}
+        file.close()
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot5"])
+async def test_what_was_taken_back_does_not_come_when_a_reader_has_it_open(profile: str) -> None:
+    async with rig(profile, {FILE: OLD}, options=QUICK) as here:
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        await write_file(tree, b"/d/first", OLD)
+        file = await tree.open(FILE, write=True, truncate=True)
+        reader = await tree.open(FILE)
+        await file.write(0, NEW)
+        here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), drop=True)
+        with suppress(MavftpfsError):
+            await file.fsync()
+        await file.take_back()
+        here.faults.cut_after(None)
+        # the user sees that it did not come, and puts something else there
+        other = await tree.open(FILE, write=True, truncate=True)
+        await other.write(0, b"third")
+        await other.release()
+        await trio.sleep(300)
+        assert here.data(FILE) == b"third"
+        reader.close()
