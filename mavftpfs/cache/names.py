@@ -320,7 +320,6 @@ class Names:
             file.unsure = Unsure(temporary, None, sent, file.changes)
             self._later.look_later()
             try:
-                await self._remove_asides(path)
                 if file.base is None:
                     await self.rename(temporary, path)
                 else:
@@ -363,8 +362,9 @@ class Names:
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        await self._remove_asides(target)
         own, shown = self._own, self._directories.entry(target)
+        if shown is not None:  # otherwise one of them may be the only copy of the old file
+            await self._remove_asides(target)
         aside = own.need(target, Kind.OLD)
         if file is not None and file.unsure is not None:
             file.unsure = dataclasses.replace(file.unsure, aside=aside)

@@ -11,7 +11,7 @@ import trio
 from mavftpfs.cache import namespace, uploads
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FileBusy, MavftpfsError
+from mavftpfs.shared.errors import FileBusy, MavftpfsError, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig, write_file
 from tests.support.transfers import content
@@ -245,3 +245,39 @@ async def test_what_was_taken_back_does_not_come_when_a_reader_has_it_open(profi
         await trio.sleep(300)
         assert here.data(FILE) == b"third"
         reader.close()
+
+
+@pytest.mark.parametrize("how", ["arm", "refuse"])
+@pytest.mark.parametrize("profile", ["ardupilot5", "px4-nuttx"])
+async def test_the_only_copy_of_the_old_file_stays_until_the_new_one_is_there(profile: str, how: str) -> None:
+    """A mv over the file was interrupted in the gap; then a program writes the file anew, and that fails."""
+    async with rig(profile, {FILE: OLD, OTHER: b"moved"}, options=ConnectOptions(op_deadline=5.0)) as here:
+        here.connection.store.traits.rename_works = True
+        if profile == "ardupilot5":
+            here.connection.store.traits.rename_replaces = False
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=2, drop=True)
+        with pytest.raises(RequestTimeout):
+            await tree.rename(OTHER, FILE)
+        assert OLD in here.files().values()
+        here.faults.cut_after(None)
+        here.faults.call_off()
+        here.faults.refuse(Opcode.RENAME, 1, times=4)  # repair cannot give the name back just now
+        await trio.sleep(3.0)
+        here.faults.call_off()
+
+        def trouble() -> None:
+            if how == "arm":
+                here.vehicle.arm()
+            else:
+                here.faults.refuse(Opcode.RENAME, 1, times=50)
+
+        here.faults.at(Opcode.REMOVE_FILE, trouble)
+        told = None
+        try:
+            await write_file(tree, FILE, NEW)
+        except MavftpfsError as error:
+            told = error
+        await trio.sleep(30)
+        assert {OLD, NEW} & set(here.files().values()), (told, here.files().keys())
