@@ -331,7 +331,7 @@ class Scheduler:
             self._set_holder(turn)
             self.server.vehicle.require(self.clock(), writing=user.writing)
             if user.failing_since is None:
-                user.failing_since = turn.granted_at
+                user.failing_since, user.loss = turn.granted_at, None
             yield turn
         finally:
             if turn is not None and self.holder is turn:
@@ -386,15 +386,15 @@ class Scheduler:
         return loss or RequestTimeout(f"no progress for {self._op_deadline:g} s")
 
     def lose(self, user: SessionUser, lost: SessionLost) -> None:
-        """Leave the session that its user found lost. The pause until the user's next try is as long as its
-        tries have failed, so each one doubles that time."""
+        """Leave the session that its user found lost. The user tries again at once. After a second loss
+        without progress it pauses as long as its tries have failed, so each pause doubles that time."""
         self.server.lose(lost)
-        now, cause = self.clock(), lost.__cause__
+        now, cause, first = self.clock(), lost.__cause__, user.loss is None
         user.loss = cause if isinstance(cause, MavftpfsError) else lost
         if user.failing_since is None:
             user.failing_since = now
         failing = now - user.failing_since
-        user.retry_at = now + min(failing, max(0.0, self._op_deadline - failing))
+        user.retry_at = now if first else now + min(failing, max(0.0, self._op_deadline - failing))
 
     @property
     def _moved(self) -> float:
