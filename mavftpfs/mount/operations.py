@@ -115,6 +115,7 @@ class Operations(pyfuse3.Operations):
             found = await self._tree.stat(path)
         except NotFound:
             return self._negative(path)
+        self._lose_names()
         # The parent may have another path by now.
         return self._attributes(self.inodes.lookup(self._child(parent_inode, name)), found)
 
@@ -143,6 +144,7 @@ class Operations(pyfuse3.Operations):
         handle = self._directory(fh)
         if start_id == 0:
             await self._take_snapshot(handle)
+            self._lose_names()
         elif start_id >= len(handle.entries) and handle.cut_short:
             raise FUSEError(errno.EIO)
         for offset, (name, found) in enumerate(handle.entries[start_id:], start_id + 1):
@@ -188,12 +190,12 @@ class Operations(pyfuse3.Operations):
         truncate, append = bool(flags & os.O_TRUNC), bool(flags & os.O_APPEND)
         writing = truncate or flags & os.O_ACCMODE != os.O_RDONLY
         known = self._inode(inode)
-        self._lose_name(known)
+        self._lose_names()
         path = self._path(inode)
         file = await self._tree.open(
             path, write=writing, truncate=truncate, append=append, program=lambda: program_of(ctx.pid)
         )
-        self._lose_name(known)
+        self._lose_names()
         if known.path is None:
             file.close()
             raise FUSEError(errno.ESTALE)  # the kernel looks the name up again, and opens the new inode
@@ -217,7 +219,7 @@ class Operations(pyfuse3.Operations):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
-        self._lose_name(self.inodes.reserve(path))
+        self._lose_names()
         self._set_by_users.at(path).mode = stat_bits.S_IMODE(mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
@@ -437,11 +439,12 @@ class Operations(pyfuse3.Operations):
 
     # -- helpers ----------------------------------------------------------------------------------
 
-    def _lose_name(self, inode: Inode) -> None:
-        """Take the path from an inode if an open file lost the name: another client replaced the file, or a
+    def _lose_names(self) -> None:
+        """Take the path from each inode whose open file lost the name: another client replaced the file, or a
         write failed. The path gets another inode, because the kernel has one page cache for each."""
         for handle in self.files:
-            if handle.ino == inode.ino and inode.path is not None and not handle.file.has_name:
+            inode = self.inodes.get(handle.ino)
+            if inode is not None and inode.path is not None and not handle.file.has_name:
                 self.inodes.unlink(inode.path)
 
     def _inode(self, ino: int) -> Inode:
@@ -505,9 +508,12 @@ class Operations(pyfuse3.Operations):
 
     async def _attributes_of(self, ino: int) -> EntryAttributes:
         inode = self._inode(ino)
-        self._lose_name(inode)
+        self._lose_names()
         if inode.path is not None:
-            return self._attributes(inode, await self._tree.stat(inode.path))
+            found = await self._tree.stat(inode.path)
+            self._lose_names()
+            if inode.path is not None:
+                return self._attributes(inode, found)
         for handle in self.files:
             if handle.ino == ino:
                 entry = self._attributes(inode, Stat(EntryKind.FILE, handle.file.size, 0, 0.0))

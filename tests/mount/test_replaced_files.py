@@ -86,3 +86,42 @@ def test_a_file_that_grew_is_the_same_file(field: Field) -> None:
     (card / "file.bin").write_bytes(b"old" * 300)
     mount = field.mount(field.sim(card, "ardupilot5").source, "dir_timeout=0.1")
     mount.python(GROWING, mount.path / "file.bin", card / "file.bin", timeout=60)
+
+
+STATING = """
+import os, sys, time
+path, card, by_name = sys.argv[1:]
+old = os.open(path, os.O_RDONLY)
+number = os.fstat(old).st_ino
+with open(card + ".new", "wb") as file:
+    file.write(b"NEW")
+os.replace(card + ".new", card)
+while os.stat(path).st_size != 3 if by_name else os.fstat(old).st_nlink:
+    assert os.fstat(old).st_size == 900, os.fstat(old)
+    time.sleep(0.02)
+last = os.fstat(old)
+assert (last.st_nlink, last.st_size, last.st_ino) == (0, 900, number), last
+assert os.stat(path).st_ino != number
+"""
+
+
+@pytest.mark.parametrize("by_name", ["by name", ""])
+def test_the_old_handle_shows_no_attributes_of_the_new_file(field: Field, by_name: str) -> None:
+    card = field.local("card")
+    (card / "file.bin").write_bytes(b"old" * 300)
+    mount = field.mount(field.sim(card, "px4").source, "dir_timeout=0.1")
+    mount.python(STATING, mount.path / "file.bin", card / "file.bin", by_name, timeout=60)
+
+
+def test_tail_follows_the_name_to_the_new_file(field: Field) -> None:
+    card = field.local("card")
+    (card / "file.txt").write_bytes(b"old line\n" * 100)
+    mount = field.mount(field.sim(card, "px4").source, "dir_timeout=0.1")
+    with mount.started("tail", "-F", "-s", "0.2", mount.path / "file.txt") as tail:
+        assert tail.stdout is not None
+        assert tail.stdout.readline() == "old line\n"
+        (card / "new.txt").write_text("new line\n")
+        (card / "new.txt").replace(card / "file.txt")
+        while (line := tail.stdout.readline()) == "old line\n":
+            pass
+        assert line == "new line\n"
