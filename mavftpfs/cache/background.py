@@ -125,7 +125,7 @@ class Background:
 
     def retry(self) -> None:
         """Deliver all files that no program is writing: the vehicle is back, or may be written again. Errors
-        that this ends are forgotten."""
+        that may have passed are forgotten."""
         for file in self._card.live:
             if isinstance(file.error, PASSING):
                 file.error = None

@@ -49,8 +49,8 @@ class Card:
 
     Attributes:
         clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks.
-        live: the files that are open, or of which the vehicle lacks something. closed: others of which bytes
-            are here, the least recently used first.
+        live: the files that are open, also those without a name, or of which the vehicle lacks something.
+        closed: others of which bytes are here, the least recently used first.
         broken: the last file of each path of which a write failed, the oldest first.
         own: names of temporary files. names: changes names. repair: see there.
         restarted_at: when the vehicle restarted, by the clock.

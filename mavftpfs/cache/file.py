@@ -9,6 +9,9 @@ handles of a file share them. TRANSITIONS is the table of the states.
              program empties or removes it, but its deliveries fail; otherwise it lost the name
     BROKEN   a program was told that a write failed, so nothing of the file is ever placed; it lost its name
 
+`base` and `content.base_limit` say what may be replaced: without a base the name has to be free. Of a base no
+byte of which stays, whatever has the name by then is replaced. Any other base must still be there.
+
 Two facts stand beside the state. `unsure`: what this mount was placing under the name when an interruption
 hid the outcome; `looking` finds it out. `proven_at`: when the vehicle last proved that it has the base. That
 proof is void if it is older than the file's last opening on the vehicle, or than the mount's epoch (`card`).
@@ -115,11 +118,11 @@ class File(Entry):
         changes: counts the changes of the content. failed_at: that count when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
         handles: how many are open; writers: how many of them may write. changers: the open handles that
-            changed the file since the vehicle last had all of it.
+            wrote to the file, or truncated it, since the vehicle last had all of it.
         verified: see OpenFile.verified.
         delivered_since_open: it was delivered since its first writer opened it.
         start_after: no upload begins by itself before that time (infinite: only a close sends the file).
-        in_kernel: the kernel may have pages of it, and all of them are right.
+        in_kernel: the kernel may have pages of it, and none is of an older version.
         lock: a program changes the file, it is being delivered, or a call takes its name or content away.
         delivery: the scope of the delivery that is under way. claims: how many calls wait
             for the lock to take the name or the content away; they go before deliveries.

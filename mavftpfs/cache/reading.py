@@ -11,7 +11,9 @@
 turns of other users. The reply to an open tells the size, and a listing that began after it the mtime, where
 listings tell any. A file that is equal, or larger, is the same, because logs grow; handles read up to the
 size that it had when a program last opened it. If another file has the name, the file is STALE: its handles
-get FileChanged, and the name gets another File.
+get FileChanged, and the name gets another File. Between two comparisons (COMPARE_PAUSE) a program may get
+bytes of the next version. The comparison at the file's end finds that out, so a program that reads to the end
+gets the error.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ what that listing took if that is more. A read that reaches the end of the file 
 
 async def opened(card: Card, path: bytes) -> tuple[File, bool]:
     """Return the file of a path, proven to be the vehicle's just now, or with pending changes; and whether
-    its bytes are those that it had before.
+    pages that the kernel has of it are right.
 
     Raises:
         NotFound, NotADirectory, IsADirectory. DataUnproven: the size in the reply is smaller than listed.
@@ -86,7 +88,7 @@ async def _revalidate(card: Card, file: File, found: Found) -> bool | None:
     it turned out to be replaced, so that the path is another file's."""
     listed_at = found.directory.listed_at
     if file.base is not None:
-        answer = compare(replace(_known(card, file), at_open=True), Listed(found.entry))
+        answer = compare(replace(_version(card, file), at_open=True), Listed(found.entry))
         if answer is Sameness.OTHER and listed_at > file.proven_at:
             if file.handles:
                 on_replaced(card, file)
@@ -293,7 +295,7 @@ async def _base_bytes(
 # --- is it the same file?
 
 
-def _known(card: Card, file: File) -> Known:
+def _version(card: Card, file: File) -> Known:
     assert file.base is not None
     return replace(file.base, restarted=card.restarted_at >= file.proven_at)
 
@@ -349,7 +351,7 @@ def _is_own(file: File) -> bool:
 def _compare(card: Card, file: File, directory: Directory) -> None:
     """Compare a file with a listing that began after its last proof."""
     entry = directory.entries.get(file.name)
-    answer = compare(_known(card, file), Listed(entry, directory.complete))
+    answer = compare(_version(card, file), Listed(entry, directory.complete))
     if answer is Sameness.OTHER:
         on_replaced(card, file)
     elif entry is not None and file.base is not None:  # else the listing is incomplete, and does not tell

@@ -15,6 +15,7 @@ import trio
 from mavftpfs.cache import reading
 from mavftpfs.cache.handles import ReadHandle
 from mavftpfs.cache.tree import OpenFile, Tree
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import Armed, FileChanged
 from mavftpfs.shared.model import split
@@ -110,6 +111,25 @@ async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int | 
             assert await copy(tree) == OLD
         assert here.connection.vehicle.reboots == 1
         assert await copy(tree) == (NEW[:size] if size else OLD)
+
+
+@pytest.mark.parametrize("profile", [*EVERY, "px4-2026"])
+async def test_to_open_a_replaced_file_twice_costs_no_request_more(profile: str) -> None:
+    """The first open() of a mount is answered with ESTALE: the kernel looks the name up, and opens again."""
+    requests: list[int] = []
+    for opens in (1, 2):
+        async with opened(profile) as (here, tree, handle):
+            await read_on(handle)
+            await trio.sleep(30.0)
+            replace(here, NEW)
+            await trio.sleep(30.0)
+            before = here.count(*Opcode)
+            for _ in range(opens - 1):
+                (await tree.open(PATH)).close()
+            assert await copy(tree) == NEW
+            await trio.sleep(IDLE)
+            requests.append(here.count(*Opcode) - before)
+    assert requests[0] == requests[1]
 
 
 async def test_listings_without_times_do_not_keep_an_old_version_for_programs_that_open_it() -> None:
