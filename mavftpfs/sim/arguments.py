@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
+from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 
@@ -22,7 +23,7 @@ Profiles:
 The link is given as the vehicle sees it: udpout:127.0.0.1:14550 pushes to a
 ground station on this computer, as PX4's simulator does; udpin:0.0.0.0:14550
 waits to be spoken to; tcpin:127.0.0.1:5760 is what ArduPilot's simulator does;
-pty makes a serial port and prints the SOURCE for it. With any of --rate,
+pty makes a serial port and prints the SOURCE for it. With any of --rate, --mtu,
 --delay, --jitter, --loss, --burst-loss, --dup, --corrupt or --reorder, frames
 go through the model of a bad link.
 
@@ -49,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--link", default=DEFAULT_LINK, metavar="URL", help=f"link to serve (default: {DEFAULT_LINK})"
     )
     parser.add_argument("--system", type=_system, default=1, metavar="ID", help="system id (default: 1)")
+    parser.add_argument(
+        "--clamp",
+        type=_data_bytes,
+        default=MAX_DATA,
+        metavar="N",
+        help=f"send at most N bytes of a file in a reply, as PX4 may over a radio (default: {MAX_DATA})",
+    )
     parser.add_argument("--armed", action="store_true", help="start armed")
     parser.add_argument(
         "--telemetry", type=_rate, default=0.0, metavar="B/s", help="rate of other messages (default: none)"
@@ -61,6 +69,7 @@ def link_settings(args: argparse.Namespace) -> LinkSettings:
     return LinkSettings(
         rate=args.rate,
         queue=int(args.queue),
+        mtu=None if args.mtu is None else int(args.mtu),
         duplex=Duplex(args.duplex),
         delay=args.delay,
         jitter=args.jitter,
@@ -83,6 +92,7 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
         metavar="B",
         help=f"bytes that may wait for the transmitter (default: {DEFAULT_QUEUE})",
     )
+    group.add_argument("--mtu", type=_bytes, metavar="B", help="largest frame that arrives (default: any)")
     group.add_argument(
         "--duplex",
         choices=[d.value for d in Duplex],
@@ -121,6 +131,12 @@ def _between(low: float, high: float, what: str) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def _data_bytes(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MAX_DATA:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of bytes from 1 to {MAX_DATA}")
+    return int(text)
 
 
 def _system(text: str) -> int:

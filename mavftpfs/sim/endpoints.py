@@ -15,6 +15,7 @@ import sys
 import tty
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import replace
 from io import FileIO
 from typing import TextIO
 
@@ -185,7 +186,7 @@ def run(args: argparse.Namespace) -> int:
         LinkClosed: the link cannot be opened.
     """
     rng = random.Random(args.seed)
-    profile = PROFILES[args.profile]
+    profile = replace(PROFILES[args.profile], longest_reply=args.clamp)
     try:
         tree = DirectoryTree(args.directory)
     except OSError as exc:

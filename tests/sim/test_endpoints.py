@@ -38,7 +38,7 @@ def arguments(*words: str) -> argparse.Namespace:
 
 
 MODEL_WORDS = """
-    --rate 5760 --queue 1000 --duplex half --delay .1 --jitter .2 --loss .3 --burst-loss .4 --dup .5
+    --rate 5760 --queue 1000 --mtu 200 --duplex half --delay .1 --jitter .2 --loss .3 --burst-loss .4 --dup .5
     --corrupt .6 --reorder .7 --seed 8 --armed --telemetry 500 --profile mavsdk
 """
 
@@ -46,7 +46,7 @@ MODEL_WORDS = """
 def test_arguments_reach_the_model() -> None:
     args = arguments("DIR", *MODEL_WORDS.split())
     assert link_settings(args) == LinkSettings(
-        rate=5760, queue=1000, duplex=Duplex.HALF, delay=0.1, jitter=0.2, loss=0.3, burst_loss=0.4,
+        rate=5760, queue=1000, mtu=200, duplex=Duplex.HALF, delay=0.1, jitter=0.2, loss=0.3, burst_loss=0.4,
         duplicate=0.5, corrupt=0.6, reorder=0.7,
     )  # fmt: skip
     assert (args.seed, args.armed, args.telemetry, args.profile) == (8, True, 500.0, "mavsdk")
