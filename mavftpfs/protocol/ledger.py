@@ -113,8 +113,9 @@ class Ledger:
         """Take out the requests that a row of usual replies, from index `at` on, answers; return them with
         their data.
 
-        A usual reply is an ACK that `Engine.receive` would believe, to an outstanding request with the opcode
-        `bulk` of its operation, sent later than `after`. The row ends where operation or time change.
+        A usual reply is an ACK to an outstanding request with the opcode `bulk` of its operation, sent later
+        than `after`, with its session and offset. That is stricter than `Request.fits`: where a server echoes
+        less, its answers go through `Engine.receive`. The row ends where operation or time change.
         """
         table, outstanding = self._table, self.outstanding
         request = table.get(replies[at][0])

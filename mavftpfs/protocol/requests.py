@@ -66,6 +66,13 @@ RETRY_POLICIES: dict[int, RetryPolicy] = dict.fromkeys(range(256), _PATH) | {
 class Request:
     """A request under one seq, and what became of it so far.
 
+    | state | outstanding | owed |
+    |---|---|---|
+    | in flight | yes | one for each transmission without an answer |
+    | lost: its operation asks again, or the same request goes out again | no | more than 0 |
+    | answered, and a repetition may be answered, too | no | more than 0 |
+    | forgotten | no | 0 |
+
     Attributes:
         follows: the request carries the engine's session.
         outstanding: the request is in flight: neither answered nor lost.

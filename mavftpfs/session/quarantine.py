@@ -60,7 +60,8 @@ class Quarantine:
         """
         name, took = path.lower(), min(max(took, LEAST_IF_REPEATED / 2), MOST / 2) if took else 0.0
         since, before = self._changed.pop(name, (now, 0.0))
-        # An earlier, longer quarantine stays.
+        # An earlier, longer quarantine stays. `left` counts `took` twice, so a second that passed is half a
+        # second of it.
         self._changed[name] = now, max(took, before - (now - since) / 2)
         while now - next(iter(self._changed.values()))[0] > MOST:
             del self._changed[next(iter(self._changed))]

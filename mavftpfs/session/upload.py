@@ -82,7 +82,9 @@ class Upload(SessionUser):
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
         self._awaited_since = 0.0  # the first of them
-        self._waits_for_finish = False  # until then nothing is sent: refused, or all would go again
+        # Until then nothing is sent: the upload was refused (`_fail`), or more bytes would cost the whole
+        # file once more (`_complete`).
+        self._waits_for_finish = False
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
         self._changed = trio.lowlevel.ParkingLot()
@@ -270,7 +272,8 @@ class Upload(SessionUser):
         return session
 
     async def _reopen(self, turn: Turn) -> OpenSession | None:
-        """Open an interrupted file to resume it; return None if it lacks bytes of the last checkpoint.
+        """Open an interrupted file to resume it; return None if it lacks bytes of the last checkpoint. Each
+        open closes the one before.
 
         The first call since the vehicle's start finds out whether OpenFileWO empties files (docs/servers.md
         8), by the size in the ACK of a later OpenFileRO, because the ACK of OpenFileWO may hold the size
@@ -351,7 +354,8 @@ class Upload(SessionUser):
                 fed_at = clock()
             stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
             # After a silence the session may be gone (servers.md 14.9), which the answer to Terminate shows.
-            # If closing costs the whole file, the upload closes it only if another client was heard.
+            # If closing costs the whole file, the upload closes it only if another client was heard;
+            # otherwise the transfer's own patience ends it.
             closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
             if stalled and self.failing_since is not None:
