@@ -292,6 +292,6 @@ class WriteTransfer(Operation):
         super().finish()
 
 
-def is_path_refusal(error: MavftpfsError | None) -> bool:
+def is_path_refusal(nak: FtpNak) -> bool:
     """Return whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
-    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _PATH_CODES
+    return nak.opcode == Opcode.WRITE_FILE and nak.code in _PATH_CODES

@@ -17,8 +17,6 @@ from mavftpfs.shared.sameness import Known, Opened, Sameness, compare
 FIRST_WANT = 0.05
 """Seconds for which an opened file stays open for its first read although another file waits."""
 
-_OFTEN = 0.25
-
 
 class FileStream(SessionUser):
     """Implements cache.remote.Reader. A stream outlives the server's session on its file: ranges that did not
@@ -175,32 +173,24 @@ class FileStream(SessionUser):
             return  # `distrust` left the session meanwhile, or nothing is pending
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
-        driver, engine = server.driver, server.engine
-        server.transfer = self._transfer = transfer
-        self._received = 0
+        engine = server.engine
+        self._transfer, self._received = transfer, 0
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = engine.in_flight > 0
         try:
-            driver.start(transfer, server.wake, self._on_batch)
-            while not (transfer.done or transfer.idle or self.closed or server.session is None):
-                if turn.is_over() or (turn.contended and not transfer.demanded):
-                    break
-                if isinstance(transfer, BurstTransfer):
-                    # Bursts do not follow one another while others wait for an answer, because PX4 fills the
-                    # link with a burst, and the answer finds no room there.
-                    transfer.by_requests = engine.serves_others(transfer)
-                # A new range may have woken this task, and with nothing in flight no answer sends a request
-                # for it.
-                driver.kick()
-                await server.sleep(_OFTEN)
-                if server.is_stalled(transfer):
-                    raise SessionLost("no answer for a while during a read", by_server=False)
+            with server.running(transfer, self._on_batch):
+                while not (transfer.done or transfer.idle or self.closed or server.session is None):
+                    if turn.is_over() or (turn.contended and not transfer.demanded):
+                        break
+                    if isinstance(transfer, BurstTransfer):
+                        # Bursts do not follow one another while others wait for an answer, because PX4 fills
+                        # the link with a burst, and the answer finds no room there.
+                        transfer.by_requests = engine.serves_others(transfer)
+                    await server.look_again()
+                    if server.is_stalled(transfer):
+                        raise SessionLost("no answer for a while during a read", by_server=False)
         finally:
-            server.transfer = self._transfer = None
-            transfer.finish()
-            driver.cancel(transfer)
-        if transfer.error is not None:
-            raise transfer.error
+            self._transfer = None
 
     def _on_batch(self, now: float) -> None:
         """Report to the sink, once for each batch of replies, how many bytes arrived."""

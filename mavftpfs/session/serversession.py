@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf, nextafter
@@ -55,6 +55,9 @@ TERMINATE_LIMIT = 5.0
 STALL = 2.0
 """Seconds without a reply, while a file is read or written, after which the file is opened anew, because the
 server may have closed its session."""
+
+_OFTEN = 0.25
+"""Seconds between two looks at a running transfer at most."""
 
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
@@ -266,6 +269,33 @@ class ServerSession:
         """Wait until something changes, at most `seconds`."""
         with trio.move_on_after(seconds):
             await self.changed.park()
+
+    # --- using the open file
+
+    @contextmanager
+    def running(self, transfer: Operation, on_batch: Callable[[float], None] | None = None) -> Iterator[None]:
+        """Run a transfer of the open file for the length of the body, unless `leave` cancels it. The body
+        waits by `look_again` until the transfer is done, or ends it before. on_batch: see `Driver.start`.
+
+        Raises:
+            MavftpfsError: the error of the transfer.
+        """
+        self.transfer = transfer
+        try:
+            self.driver.start(transfer, self.wake, on_batch)
+            yield
+        finally:
+            self.transfer = None
+            transfer.finish()
+            self.driver.cancel(transfer)
+        if transfer.error is not None:
+            raise transfer.error
+
+    async def look_again(self) -> None:
+        """Send what a running transfer was given to send, because with nothing in flight no answer causes
+        that, and wait until something changes, or for a moment."""
+        self.driver.kick()
+        await self.sleep(_OFTEN)
 
     # --- opening
 

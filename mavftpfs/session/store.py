@@ -77,9 +77,6 @@ HURRY = 3.0
 VERIFY_LIMIT = 4.0
 """Seconds to look whether an unanswered change happened. The caller waits for them beyond `op_deadline`."""
 
-_OFTEN = 0.25
-"""Seconds between two checks of a running transfer at most."""
-
 SWEEPS = 3
 """Listings of a directory at most, because its names changed during the earlier ones."""
 
@@ -203,8 +200,10 @@ class Store:
             async with self._opened(path) as session:
                 epoch = self._server.epoch
                 operation = ReadToEof(session.id, block, limit)
-                with suppress(DataUnproven):
-                    await self._server.driver.run(operation)
+                with suppress(DataUnproven), self._server.running(operation):
+                    while not operation.done:
+                        self._server.require_open(session)
+                        await self._server.look_again()
                 self._server.require_open(session)
             if self._server.epoch != epoch:
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
@@ -279,21 +278,14 @@ class Store:
             self._quarantine.on_changed(path, self._clock())
 
     async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
-        server, driver = self._server, self._server.driver
+        server = self._server
         chunks = ChunkSize(min(self._scheduler.read_chunks.size, self._scheduler.write_chunks.size))
         transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1, on_drained=server.wake)
-        try:
-            driver.start(transfer, server.wake)
+        with server.running(transfer):
             while not transfer.done and not transfer.drained:
                 server.require_open(session)
                 self._vehicle.require(self._clock(), writing=True)
-                driver.kick()
-                await server.sleep(_OFTEN)
-            if transfer.error is not None:
-                raise transfer.error
-        finally:
-            transfer.finish()
-            driver.cancel(transfer)
+                await server.look_again()
 
     def open_upload(self, path: bytes, source: SendBuffer) -> Upload:
         """Queue an upload. The upload sends nothing before its source has something or `finish` is called."""

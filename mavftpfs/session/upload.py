@@ -48,8 +48,6 @@ Terminate."""
 REFUSALS = (FtpNak, ProtocolError)
 """Errors after which the upload is tried again only at the next `finish`."""
 
-_OFTEN = 0.25
-
 
 class Stop(Enum):
     """Why an upload lets go of the session."""
@@ -77,7 +75,6 @@ class Upload(SessionUser):
         self._scheduler = scheduler
         self._server = scheduler.server
         self._vehicle = scheduler.server.vehicle
-        self._driver = scheduler.server.driver
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
@@ -308,7 +305,7 @@ class Upload(SessionUser):
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
-        server, stop = self._server, None
+        server = self._server
         # An interactive user that waits gets the session after these requests. On a slow radio a whole queue
         # of them takes a quarter of a second.
         queue = self._engine.traits.queue_limit
@@ -320,18 +317,18 @@ class Upload(SessionUser):
             in_flight=queue // 2 if queue and turn.interactive_waits else None,
             on_drained=server.wake,
         )
-        self._transfer = server.transfer = transfer
+        self._transfer = transfer
         try:
-            self._driver.start(transfer, server.wake, self._on_batch)
-            stop = await self._watch(turn, session, transfer)
+            with server.running(transfer, self._on_batch):
+                stop = await self._watch(turn, session, transfer)
+        except FtpNak as error:
+            if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
+                # That client's requests with a path do not alternate with these writes; the next turns try
+                # again.
+                raise SessionLost(f"beside another FTP client: {error}") from error
+            raise
         finally:
-            self._end_transfer()
-        error = transfer.error
-        if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
-            # That client's requests with a path do not alternate with these writes; the next turns try again.
-            raise SessionLost(f"beside another FTP client: {error}") from error
-        if error is not None:
-            raise error
+            self._transfer = None
         assert stop is not None
         return stop
 
@@ -365,8 +362,7 @@ class Upload(SessionUser):
             transfer.paused = stop is not None
             if stop is not None and (transfer.idle or stalled or stop is Stop.ARMED):
                 return stop
-            self._driver.kick()
-            await server.sleep(_OFTEN)
+            await server.look_again()
         return None
 
     def _reason_to_stop(
@@ -384,14 +380,6 @@ class Upload(SessionUser):
         else:
             over = self._keeps_content and self._clock() - session.opened_at >= CHECKPOINT_EVERY
         return Stop.YIELD if over else None
-
-    def _end_transfer(self) -> None:
-        """End the transfer: what was not ACKed goes back to the source."""
-        transfer, self._transfer = self._transfer, None
-        if transfer is not None:
-            self._server.transfer = None
-            transfer.finish()
-            self._driver.cancel(transfer)
 
     # --- letting go
 

@@ -179,6 +179,20 @@ async def test_a_session_that_vanished_raises_it() -> None:
         reader.close()
 
 
+@pytest.mark.holds("promise 6")
+@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
+async def test_an_at_file_is_written_no_further_once_another_client_opened_a_file(profile: str) -> None:
+    """The news and an ACK come together; the next WriteFile would change the other client's file."""
+    here = Rig(profile, {b"/d/theirs": b"theirs"}, CLEAN)
+    async with here.connected() as connection:
+        opens = partial(here.another_asks, Opcode.CREATE_FILE, path(profile, "theirs"))
+        here.faults.at(Opcode.WRITE_FILE, opens, nth=5)
+        with pytest.raises(SessionLost):
+            await connection.store.write_whole(path(profile, "x"), [content(200)] * 50)
+        await trio.sleep(1.0)
+        assert here.count(Opcode.WRITE_FILE) == 5
+
+
 async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) -> None:
     """Read a file; other bytes than its own are provisional by then."""
     sink, epoch = MemorySink(len(expected)), connection.store.epoch
