@@ -357,7 +357,7 @@ class Scheduler:
             while not self._is_next(user):
                 if (refusal := self._queue[user]) is not None:
                     raise refusal
-                now, others_until = self.clock(), self.others_until
+                now, others_until = self.clock(), self.server.others_until
                 if now >= self.deadline(user):
                     raise SessionBusy(_OTHERS) if now < others_until else RequestTimeout(_KEPT)
                 user.on_queued()
@@ -374,9 +374,9 @@ class Scheduler:
         if user.awaited_since is None:
             return inf
         since = max(user.awaited_since, self._moved)
-        if self.clock() < self.others_until:
+        if self.clock() < self.server.others_until:
             return self.server.busy_at(since)
-        return max(since, self.server.others.file_open_until) + self._longest_wait
+        return max(since, self.server.others_until) + self._longest_wait
 
     def failure(self, user: SessionUser) -> MavftpfsError | None:
         """Return the error if a user made no progress for `op_deadline`, and let it begin anew."""
@@ -441,14 +441,7 @@ class Scheduler:
         if self._queue.get(user) is not None or self.is_excluded(user.path):
             return False
         session = self.server.session
-        return now >= self.others_until or (session is not None and user.goes_on(session))
-
-    @property
-    def others_until(self) -> float:
-        """The time until which this connection opens no file, because that might end another client's
-        session."""
-        several = self._driver.engine.traits.several_sessions
-        return -inf if several else self.server.others.file_open_until
+        return now >= self.server.others_until or (session is not None and user.goes_on(session))
 
     # --- paths that are about to change
 
@@ -521,11 +514,11 @@ class Scheduler:
             self.serving.set()
             while True:
                 await trio.lowlevel.checkpoint()
-                if self._queue and self.clock() < self.others_until:
+                if self._queue and self.clock() < self.server.others_until:
                     await self.server.learn_several_sessions()
                 now, wait = self.clock(), self._closes_in(self.clock())
-                if now < self.others_until:  # after which another user may be next
-                    wait = min(wait, self.others_until - now)
+                if now < self.server.others_until:  # after which another user may be next
+                    wait = min(wait, self.server.others_until - now)
                 if wait > 0.0:
                     await self.server.sleep(wait)
                 else:

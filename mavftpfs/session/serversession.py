@@ -400,7 +400,7 @@ class ServerSession:
             return
         if nak.code == NakCode.FAIL:
             raise nak
-        if self.clock() < self.others.file_open_until:
+        if self.clock() < self.others_until:
             raise SessionTaken(_IN_USE) from nak
         for seconds in tried.silences:
             await self.driver.be_silent(seconds)
@@ -415,16 +415,22 @@ class ServerSession:
         they last closed a file; never if the connection is patient."""
         return inf if self.patient else max(since, self.others.closed_at) + self.op_deadline
 
+    @property
+    def others_until(self) -> float:
+        """The time until which this connection opens no file, because that might end another client's
+        session."""
+        return -inf if self.engine.traits.several_sessions else self.others.file_open_until
+
     async def wait_for_others(self, since: float) -> None:
         """Wait until no other client has a file open.
 
         Raises:
             SessionBusy: see `busy_at`.
         """
-        while (now := self.clock()) < self.others.file_open_until:
+        while (now := self.clock()) < self.others_until:
             if now >= self.busy_at(since):
                 raise SessionBusy(_IN_USE)
-            await self.sleep(min(self.others.file_open_until, self.busy_at(since)) - now)
+            await self.sleep(min(self.others_until, self.busy_at(since)) - now)
 
     # --- closing
 
@@ -476,7 +482,7 @@ class ServerSession:
         closed = False
         for session in {session for session, _ in self.maybe_open}:
             # MAVSDK ends the session of another client, whatever id is asked for.
-            if self.engine.traits.ack_carries_own_session or self.clock() >= self.others.file_open_until:
+            if self.engine.traits.ack_carries_own_session or self.clock() >= self.others_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
             self._forget(session)

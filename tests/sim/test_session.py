@@ -594,6 +594,32 @@ async def test_also_one_that_it_took_right_behind_our_open() -> None:
     assert here.data(b"/d/its") == b""
 
 
+async def test_an_open_that_finds_all_of_several_sessions_taken_is_told_in_time() -> None:
+    """Such a server is asked beside another client's file, and nobody waits until that is closed."""
+    here = Rig("ardupilot5", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        assert await read_file(connection, b"/d/f") == DATA  # tells how session ids are given out
+
+        async def load(session: int) -> None:
+            here.another_asks(Opcode.OPEN_FILE_RO, b"/d/theirs", session=session)
+            while True:
+                await trio.sleep(1.0)
+                here.another_asks(Opcode.READ_FILE, session=session)
+
+        nursery.start_soon(load, 71)
+        await trio.sleep(1.5)
+        assert await read_file(connection, b"/d/f") == DATA
+        await trio.sleep(4.0)
+        for session in range(72, 76):
+            nursery.start_soon(load, session)
+        await trio.sleep(0.5)
+        opens = here.count(Opcode.OPEN_FILE_RO)
+        with trio.fail_after(30.0), pytest.raises(SessionBusy):
+            await read_file(connection, b"/d/f")
+        assert here.count(Opcode.OPEN_FILE_RO) - opens == 3, "at once, and after each silence"
+        nursery.cancel_scope.cancel()
+
+
 @pytest.mark.holds("promise 6")
 async def test_a_client_whose_file_our_open_ended_is_not_waited_for() -> None:
     """Both opened a file when a third one had closed its own. The first one notices, and closes nothing."""
