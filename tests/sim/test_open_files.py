@@ -5,8 +5,6 @@ A vehicle that replaces a file between two sessions of its server: test_replaced
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-
 import pytest
 import trio
 
@@ -250,46 +248,6 @@ async def test_open_files_below_a_renamed_directory_follow(here: Rig, tree: Tree
     assert (await tree.stat(b"/there/new")).size == 6
     with pytest.raises(NotFound):
         await tree.stat(NEW)
-
-
-async def rename_over_directory(tree: Tree) -> None:
-    await tree.unlink(FILE)
-    await tree.rename(b"/d", b"/moved", noreplace=False)
-
-
-LoseName = Callable[[Tree], Awaitable[None]]
-LOSE: dict[str, LoseName] = {
-    "unlink": lambda tree: tree.unlink(FILE),
-    "rename over": lambda tree: tree.rename(OTHER, FILE, noreplace=False),
-    "directory renamed": rename_over_directory,
-}
-
-
-@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
-@pytest.mark.parametrize("how", sorted(LOSE))
-async def test_nothing_stays_when_the_last_reader_closes_at_any_request(how: str, profile: str) -> None:
-    for count in range(1, 20):
-        async with rig(profile, {FILE: DATA * 7, OTHER: b"it"}, link=LinkSettings(delay=0.3)) as here:
-            tree, asked = here.mount(), trio.Event()
-            reading = await tree.open(FILE)
-            await reading.read(0, 1)
-            here.faults.after(count, asked.set)
-
-            async def close_beside(reading: OpenFile = reading, asked: trio.Event = asked) -> None:
-                with trio.move_on_after(30):
-                    await asked.wait()
-                await reading.release()
-
-            async with trio.open_nursery() as programs:
-                programs.start_soon(close_beside)
-                await LOSE[how](tree)
-                reached = asked.is_set()
-            await trio.sleep(5)
-            assert here.litter() == []
-            if not reached:
-                assert count > 2
-                return
-    raise AssertionError("it never ended")
 
 
 # --- files that lose their name: only here
