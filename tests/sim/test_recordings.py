@@ -14,12 +14,12 @@ import pytest
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload
-from mavftpfs.sim.parameters import Parameter, Selection, Table
+from mavftpfs.sim.parameters import Selection, Table
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.pseudo import VirtualTrees
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.recordings import Step, data_of
+from tests.support.recordings import Step, data_of, unpacked
 from tests.support.recordings import load_recording as load
 from tests.support.replies import decode_reply
 
@@ -100,26 +100,10 @@ def build_virtual(name: str, steps: list[Step]) -> VirtualTrees | None:
     sys_files[b"storage.bin"] = bytes(16384)
     locations = downloaded(steps, "@ROMFS/locations.txt: burst 239")
     return VirtualTrees(
-        table=Table(unpack_parameters(downloaded(steps, "@PARAM/param.pck: burst 239"))),
+        table=Table(unpacked(downloaded(steps, "@PARAM/param.pck: burst 239"))),
         sys_files=sys_files,
         romfs={b"locations.txt": locations, b"models/x": b""},
     )
-
-
-def unpack_parameters(packed: bytes) -> list[Parameter]:
-    """Parse param.pck: each name lies over the one before it; pad bytes are skipped."""
-    params: list[Parameter] = []
-    at, last = 6, b""
-    while at < len(packed):
-        if packed[at] == 0:
-            at += 1
-            continue
-        kind, lengths = packed[at] & 15, packed[at + 1]
-        start = at + 3 + (lengths >> 4)
-        last = last[: lengths & 15] + packed[at + 2 : start]
-        at = start + {1: 1, 2: 2, 3: 4, 4: 4}[kind]
-        params.append(Parameter(last, kind, packed[start:at]))
-    return params
 
 
 # -- the replay ----------------------------------------------------------------------------------
@@ -178,8 +162,8 @@ def test_replies_take_as_long_as_those_of_the_real_server(name: str) -> None:
 def test_parameter_file_depends_on_the_block_size() -> None:
     """The recorded vehicle's file had 14882 bytes in blocks of 239 and 14901 in blocks of 80."""
     packed = downloaded(load("ardupilot"), "@PARAM/param.pck: burst 239")
-    params = unpack_parameters(packed)
+    params = unpacked(packed)
     table = Table(params)
     assert table.download(Selection(), 239, 0) == packed
     assert len(table.download(Selection(), 80, 0)) == 14901
-    assert unpack_parameters(table.download(Selection(), 80, 0)) == params
+    assert unpacked(table.download(Selection(), 80, 0)) == params

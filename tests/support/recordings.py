@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.protocol.payload import Payload
+from mavftpfs.sim.parameters import HEADER, Parameter
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -47,3 +48,22 @@ def _payload(row: dict[str, Any]) -> Payload:
 def data_of(step: Step) -> bytes:
     """Return what the ACKs of a step carry."""
     return b"".join(reply.data for _, reply in step.replies if reply.opcode == 128)
+
+
+def unpacked(packed: bytes) -> list[Parameter]:
+    """Parse param.pck: each name lies over the one before it; pad bytes are skipped."""
+    params: list[Parameter] = []
+    at, last = HEADER.size, b""
+    while at < len(packed):
+        if packed[at] == 0:
+            at += 1
+            continue
+        kind, flags, lengths = packed[at] & 15, packed[at] >> 4, packed[at + 1]
+        start, width = at + 3 + (lengths >> 4), {1: 1, 2: 2, 3: 4, 4: 4}[kind]
+        last = last[: lengths & 15] + packed[at + 2 : start]
+        at = start + width
+        default = packed[at : at + width] if flags else None
+        value = packed[start:at]
+        params.append(Parameter(last, kind, value, default, misfit=default == value))
+        at += width if flags else 0
+    return params

@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 
 from mavftpfs.sim.parameters import (
-    HEADER,
     INT32,
     LenientUpload,
     Parameter,
@@ -19,28 +18,9 @@ from mavftpfs.sim.parameters import (
     parameter,
     selection,
 )
-from tests.support.recordings import Step, data_of, load_recording
+from tests.support.recordings import Step, data_of, load_recording, unpacked
 
 PX4, ARDUPILOT = "px4-2026-virtual", "ardupilot-virtual"
-
-
-def unpacked(packed: bytes) -> list[Parameter]:
-    """Parse param.pck: each name lies over the one before it; pad bytes are skipped."""
-    params: list[Parameter] = []
-    at, last = HEADER.size, b""
-    while at < len(packed):
-        if packed[at] == 0:
-            at += 1
-            continue
-        kind, flags, lengths = packed[at] & 15, packed[at] >> 4, packed[at + 1]
-        start, width = at + 3 + (lengths >> 4), {1: 1, 2: 2, 3: 4, 4: 4}[kind]
-        last = last[: lengths & 15] + packed[at + 2 : start]
-        at = start + width
-        default = packed[at : at + width] if flags else None
-        value = packed[start:at]
-        params.append(Parameter(last, kind, value, default, misfit=default == value))
-        at += width if flags else 0
-    return params
 
 
 def steps_of(name: str) -> dict[str, Step]:
