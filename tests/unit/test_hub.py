@@ -181,13 +181,6 @@ def test_a_client_that_names_no_vehicle_is_told_only_the_heartbeats_of_all(net: 
     assert OTHER in net.sides(beat(ONE), PORT, AT_ONE)
 
 
-def test_a_client_that_turns_to_another_vehicle_is_told_of_that_one(net: Net) -> None:
-    assert MOUNT not in net.sides(attitude(TWO), PORT, AT_TWO)
-    net.send(ftp(CLIENT, TWO), MOUNT)
-    assert MOUNT in net.sides(attitude(TWO), PORT, AT_TWO)
-    assert MOUNT not in net.sides(attitude(ONE), PORT, AT_ONE)
-
-
 @pytest.mark.holds("promise 1")
 def test_a_second_sender_of_one_id_reaches_no_endpoint_and_is_said(net: Net) -> None:
     assert net.sides(ftp(ONE, STATION), PORT, ELSEWHERE) == {MOUNT}, "which judges for itself"
@@ -255,19 +248,6 @@ def test_who_left_is_forgotten(net: Net) -> None:
 
 def waiting(text: str) -> Waiting:
     return Waiting(Place(PORT, None), text.encode())
-
-
-def test_a_frame_waits_for_at_most_one_of_each_other_side() -> None:
-    outbox = Outbox(1000)
-    for number in range(3):
-        outbox.push(MOUNT, waiting(f"m{number}"))
-        outbox.push(OTHER, waiting(f"o{number}"))
-    outbox.pop()
-    outbox.push(EAST, waiting("e0"))
-    outbox.push(EAST, waiting("e1"))
-    order = [outbox.pop().frame.decode() for _ in range(7)]
-    assert order == ["o0", "m1", "e0", "o1", "m2", "e1", "o2"]
-    assert not outbox
 
 
 def test_a_side_that_floods_loses_its_own_frames() -> None:
