@@ -7,7 +7,7 @@ import json
 from functools import partial
 
 from mavftpfs.cli.verbs import run
-from mavftpfs.client.scan import Entry
+from mavftpfs.client.scan import Component
 from mavftpfs.client.scan import scan as find
 from mavftpfs.shared.errors import ExitCode
 from mavftpfs.shared.readable import printable
@@ -22,7 +22,7 @@ def scan(args: argparse.Namespace) -> int:
         return ExitCode.OK
     waits_for_first = True
 
-    def show(entry: Entry) -> None:
+    def show(entry: Component) -> None:
         nonlocal waits_for_first
         if waits_for_first:
             print(f"{HEADER}  WHAT, FIRMWARE, UNIQUE ID, FTP")
@@ -33,7 +33,7 @@ def scan(args: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def lines_of(entry: Entry) -> tuple[str, str]:
+def lines_of(entry: Component) -> tuple[str, str]:
     """Return the two lines of a component."""
     address = f"{entry['system']}/{entry['component']}"
     about = [entry["what"]]

@@ -20,6 +20,7 @@ import trio
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.client.several import ON_COMMAND_LINE, unnamed_by
 from mavftpfs.client.status import snapshot
 from mavftpfs.client.trace import TlogWriter, text_line
 from mavftpfs.client.undelivered import rescue, spool_for
@@ -27,7 +28,6 @@ from mavftpfs.client.watcher import Watcher
 from mavftpfs.link.base import Link, plain_nursery
 from mavftpfs.link.hublink import PortRequest
 from mavftpfs.link.messages import OWN_COMPONENT, Address, AutopilotVersion
-from mavftpfs.link.peers import names_of, vehicles_in
 from mavftpfs.link.samelink import leads_back
 from mavftpfs.link.sharing import open_shared
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
@@ -200,7 +200,9 @@ async def with_tree(
 
             def notice() -> str:
                 left = rescue(spool, rescue_for) if spool is not None and rescue_for is not None else ""
-                return "; ".join(filter(None, (other_vehicles_heard(connection, options), left)))
+                unnamed = unnamed_by(connection, options)
+                others = "" if unnamed is None else unnamed.note(ON_COMMAND_LINE)
+                return "; ".join(filter(None, (others, left)))
 
             tree = Tree(
                 connection.store,
@@ -219,21 +221,6 @@ async def with_tree(
                 connection.news.clear()  # the tree can begin nothing while the session is closed
                 if spool is not None and (rescue_for is None or not (tree.undelivered() or tree.broken())):
                     spool.discard()
-
-
-def other_vehicles_heard(connection: Connection, options: Options) -> str:
-    """Return a line about other vehicles on the link, if the user named none and the first one is used;
-    otherwise ""."""
-    address = connection.vehicle.address
-    if options.target_system or address is None:
-        return ""
-    found = vehicles_in(connection.vehicle.heard.values())
-    others = [one for one in found if one.source.system != address.system]
-    if not others:
-        return ""
-    first = f"{address.system}/{address.component}"
-    choose = f"-o target_system={others[0].source.system}, or -o all"
-    return f"this is {first}; {names_of(others)} is heard, too: {choose}"
 
 
 def process_name() -> str:

@@ -29,12 +29,11 @@ from mavftpfs.client.mounts import (
     require_usable,
     status_of,
 )
-from mavftpfs.client.several import Unnamed
+from mavftpfs.client.several import Unnamed, unnamed_by
 from mavftpfs.client.status import Facts
 from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.uri import LinkSpec
-from mavftpfs.session.connection import HEARD_SOON, Connection
 from mavftpfs.shared import errors, readonly
 from mavftpfs.shared.errors import NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
@@ -457,21 +456,8 @@ class Target:
         up = attached(self.spec, self.options, sinks=self.sinks, list_root=list_root, writing=writing)
         async with up as vehicle, _answered_by(deadline, vehicle, self.options):
             yield replace(
-                session_of(vehicle, self.options), unnamed=_unnamed(vehicle.connection, self.options)
+                session_of(vehicle, self.options), unnamed=unnamed_by(vehicle.connection, self.options)
             )
-
-
-def _unnamed(connection: Connection, options: Options) -> Unnamed | None:
-    """Return the vehicles on the link of a connection, None if the options name one."""
-    address = connection.vehicle.address
-    if options.target_system or address is None:
-        return None
-
-    async def listened() -> None:
-        await trio.sleep_until(connection.began_at + HEARD_SOON)
-
-    heard = connection.vehicle.heard
-    return Unnamed(connection.link.description, address.system, heard.values, listened)
 
 
 def session_of(vehicle: Attached, options: Options) -> Session:

@@ -23,7 +23,8 @@ from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.options import Options
 from mavftpfs.shared.readable import readable_time
 
-Entry = dict[str, Any]
+Component = dict[str, Any]
+"""The facts of a component on a link, as of `scan --json`."""
 
 LISTEN_TIME = 3.0
 """Seconds in which every component sends its heartbeat at least twice."""
@@ -31,7 +32,7 @@ PROBE_TIME = 6.0
 """The most seconds for a component to answer a listing."""
 
 
-async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
+async def scan(target: Target, show: Callable[[Component], None]) -> list[Component]:
     """Return the components that send heartbeats on a link, and which of them answer MAVLink FTP.
 
     show: called with each as soon as it is known. A component that does not answer takes PROBE_TIME, or
@@ -51,13 +52,13 @@ async def scan(target: Target, show: Callable[[Entry], None]) -> list[Entry]:
     return sorted(found, key=itemgetter("system", "component"))
 
 
-def _shown(entries: list[Entry], show: Callable[[Entry], None]) -> list[Entry]:
+def _shown(entries: list[Component], show: Callable[[Component], None]) -> list[Component]:
     for entry in entries:
         show(entry)
     return entries
 
 
-async def _by_mount(mountpoint: str) -> list[Entry]:
+async def _by_mount(mountpoint: str) -> list[Component]:
     """Return the entries from a mount, or from the mounts of several vehicles."""
     status = await usable_status(mountpoint)
     if "members" in status:
@@ -66,7 +67,7 @@ async def _by_mount(mountpoint: str) -> list[Entry]:
     return _of_mount(status)
 
 
-async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]) -> AsyncIterator[Entry]:
+async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]) -> AsyncIterator[Component]:
     """Yield the other components that are heard, with their answers to MAVLink FTP."""
     assert target.spec is not None
     options, tell = target.options, target.sinks.tell
@@ -99,7 +100,7 @@ async def _listen(
     return found
 
 
-def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:
+def _entry(heartbeat: Heartbeat, ftp: str) -> Component:
     """Return the entry for a heartbeat; ftp: the words about its sender's files."""
     return {
         "system": heartbeat.source.system,
@@ -116,7 +117,7 @@ def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:
     }
 
 
-async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: float) -> Entry:
+async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: float) -> Component:
     address = heartbeat.source
     entry = _entry(heartbeat, "not asked (a ground station)")
     if heartbeat.vehicle_type == MAV_TYPE_GCS:
@@ -165,7 +166,7 @@ def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
     return seen + _second(facts)
 
 
-def _own_entry(status: Mapping[str, Any]) -> Entry:
+def _own_entry(status: Mapping[str, Any]) -> Component:
     """Return the entry of a mount's vehicle."""
     vehicle, lost = status["vehicle"], status["link"]["state"] == "lost"
     return {
@@ -184,9 +185,9 @@ def _own_entry(status: Mapping[str, Any]) -> Entry:
     }
 
 
-def _of_mounts(statuses: Sequence[Mapping[str, Any]]) -> list[Entry]:
+def _of_mounts(statuses: Sequence[Mapping[str, Any]]) -> list[Component]:
     """Return the entries of mounts' vehicles, one for each vehicle, however many mounts it has."""
-    found: dict[tuple[Any, ...], Entry] = {}
+    found: dict[tuple[Any, ...], Component] = {}
     for status in sorted(statuses, key=lambda status: status["link"]["state"] == "lost"):
         entry = _own_entry(status)
         same = found.setdefault((entry["system"], entry["component"], entry["uid"]), entry)
@@ -200,7 +201,7 @@ def _second(facts: Mapping[str, Any]) -> list[str]:
     return [] if second is None else [second_vehicle(facts)]
 
 
-def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
+def _of_mount(status: Mapping[str, Any]) -> list[Component]:
     """Return the entries of a mount's vehicle, and of others that the mount hears; these are not asked."""
     own = _own_entry(status)
     others = [one for one in heartbeats_in(status) if one.source != (own["system"], own["component"])]

@@ -17,7 +17,9 @@ import trio
 from mavftpfs.link.base import plain_nursery
 from mavftpfs.link.messages import Heartbeat
 from mavftpfs.link.peers import names_of, vehicles_in
+from mavftpfs.session.connection import HEARD_SOON, Connection
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.options import Options
 
 ON_COMMAND_LINE, IN_PYTHON = "-o target_system=", "target_system="
 """The spellings of the option that names a vehicle."""
@@ -63,7 +65,7 @@ class Unnamed:
         if not others:
             return ""
         return (
-            f"reading from vehicle {self.taken}, which was heard first on {self.place}; also heard: "
+            f"this is vehicle {self.taken}, which was heard first on {self.place}; also heard: "
             f"{names_of(others)}; to choose one, use {option}{others[0].source.system}"
         )
 
@@ -90,3 +92,16 @@ class Unnamed:
                 yield
         finally:
             look()
+
+
+def unnamed_by(connection: Connection, options: Options) -> Unnamed | None:
+    """Return the vehicles on the link of a connection, None if the options name one."""
+    address = connection.vehicle.address
+    if options.target_system or address is None:
+        return None
+
+    async def listened() -> None:
+        await trio.sleep_until(connection.began_at + HEARD_SOON)
+
+    heard = connection.vehicle.heard
+    return Unnamed(connection.link.description, address.system, heard.values, listened)

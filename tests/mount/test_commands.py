@@ -135,7 +135,7 @@ def test_a_command_says_which_of_several_vehicles_it_reads(
     _, said = command("get", source, "/log/a.bin", "--to", folder, *slow)
     assert said.count("was heard first on") == 1
     assert any(
-        f"reading from vehicle {one}, which was heard first on {source}; also heard: {other}/1 (PX4" in said
+        f"this is vehicle {one}, which was heard first on {source}; also heard: {other}/1 (PX4" in said
         and f"; to choose one, use -o target_system={other}\n" in said
         for one, other in ((1, 2), (2, 1))
     )
@@ -149,7 +149,7 @@ def test_a_mount_of_one_of_several_vehicles_is_no_choice(
     mount = field.mount(source, "target_system=2")
     wait_until("both are heard", lambda: len(mount.status()["connection"]["heard"]) == 2)
     assert "several vehicles are heard" in command("mkdir", source, "/new", code=1)[1]
-    assert "reading from vehicle 2" in command("ls", source)[1]
+    assert "this is vehicle 2" in command("ls", source)[1]
     command("mkdir", mount.path, "/new")
     command("rmdir", source, "/new", "-o", "target_system=2")
 

@@ -13,6 +13,7 @@ import trio
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.client import connect as compose
+from mavftpfs.client.several import ON_COMMAND_LINE, unnamed_by
 from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
@@ -211,10 +212,17 @@ async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(monkeypatch: pytest
 async def test_another_vehicle_that_is_heard_is_said(target: int) -> None:
     options = Options(target_system=target)
     async with Rig("px4", {b"/d": None}).connected() as connection:
-        assert compose.other_vehicles_heard(connection, options) == ""
+        unnamed = unnamed_by(connection, options)
+        assert (unnamed is None) is bool(target)
+        if unnamed is None:
+            return
+        assert unnamed.note(ON_COMMAND_LINE) == ""
         other, station = Address(2, 1), Address(255, 190)
         heard = connection.vehicle.heard
         heard[other] = Heartbeat(other, 2, 3, armed=False)
         heard[station] = Heartbeat(station, MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, armed=False)
-        said = "this is 1/1; 2/1 (ArduPilot quadrotor, disarmed) is heard, too: -o target_system=2, or -o all"
-        assert compose.other_vehicles_heard(connection, options) == ("" if target else said)
+        said = unnamed.note(ON_COMMAND_LINE)
+        assert said.startswith("this is vehicle 1, which was heard first on ")
+        assert said.endswith(
+            "also heard: 2/1 (ArduPilot quadrotor, disarmed); to choose one, use -o target_system=2"
+        )
