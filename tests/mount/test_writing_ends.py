@@ -332,16 +332,18 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
-def test_a_mount_that_lost_its_socket_is_asked_and_ended_all_the_same(field: Field, data: Path) -> None:
-    """systemd removes a user's runtime directory at logout; a mount in the background goes on."""
+def test_a_mount_whose_socket_was_removed_is_unmounted_and_uploads_all_the_same(
+    field: Field, data: Path
+) -> None:
     mount, vehicle, card = holding(field, data)
     process = mount.alive()
-    for _ in range(3):
-        find_socket(str(mount.path)).unlink()
-        assert "1 file" in command("status", mount.path)[0]
-    vehicle.resume()
-    command("umount", mount.path)
+    find_socket(str(mount.path)).unlink()
+    shown = command("status", mount.path, code=ExitCode.MOUNT_FAILED)[0]
+    assert shown == f"{mount.path}: its socket cannot be reached from here\n"
+    said = command("umount", mount.path, code=ExitCode.UNDELIVERED)[1]
+    assert "the mount cannot be asked; it uploads pending changes by itself" in said
     mount.process = None
+    vehicle.resume()
     assert process.wait() == 0
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
@@ -506,7 +508,7 @@ def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
     )
     listed = command("recover")[0]
     for reason in (
-        "a program was still writing it",
+        "its program had not closed it",
         "only the changed parts of it",
         "its path on the vehicle is unknown",
     ):
