@@ -32,7 +32,7 @@ class RetryPolicy(NamedTuple):
         ordered: servers answer in order, so answers to later requests prove a loss.
         echoes_offset: an ACK carries the request's offset; None: where the server was seen to do so.
         backoff: a transmission waits at least this share of the time without progress.
-        work: seconds that the slowest server works at the request, beyond the round trip.
+        work: seconds that the slowest server works at the request, beyond the round trip (CalcFileCRC32).
         usual_work: seconds that a usual server does; the first transmission waits for so long.
     """
 

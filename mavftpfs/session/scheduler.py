@@ -120,7 +120,7 @@ class SessionUser:
     @property
     def awaited_since(self) -> float | None:
         """When a caller began to wait for this user, so that it gets a turn or an error in time. None if no
-        caller waits, as for an upload in the background."""
+        caller waits: an upload in the background has only `waiting_since`, and readahead neither."""
         return self.waiting_since
 
     @property
@@ -290,7 +290,7 @@ class Scheduler:
         self._nursery: trio.Nursery | None = None
         self._tidying = False
         self._used_at = clock()  # end of the last turn, or the janitor's last try
-        self._moved_at = -inf  # see `_moved`
+        self._answered_at = -inf  # see `_answered_in_turn_at`
 
     # --- turns
 
@@ -337,7 +337,7 @@ class Scheduler:
             if turn is not None and self.holder is turn:
                 now = self.clock()
                 user.on_turn(turn.began, now)
-                self._moved_at, self._used_at = self._moved, now
+                self._answered_at, self._used_at = self._answered_in_turn_at, now
                 self._set_holder(None)
             user.waiting_since = None
 
@@ -373,7 +373,7 @@ class Scheduler:
         never if no caller waits."""
         if user.awaited_since is None:
             return inf
-        since = max(user.awaited_since, self._moved)
+        since = max(user.awaited_since, self._answered_in_turn_at)
         if self.clock() < self.server.others_until:
             return self.server.busy_at(since)
         return max(since, self.server.others_until) + self._longest_wait
@@ -397,10 +397,10 @@ class Scheduler:
         user.retry_at = now if first else now + min(failing, max(0.0, self._op_deadline - failing))
 
     @property
-    def _moved(self) -> float:
+    def _answered_in_turn_at(self) -> float:
         """When the vehicle last answered during a turn. Answers to listings outside of turns do not count."""
         answered_at, holder = self._driver.last_reply_at, self.holder
-        return answered_at if holder is not None and answered_at >= holder.granted_at else self._moved_at
+        return answered_at if holder is not None and answered_at >= holder.granted_at else self._answered_at
 
     def _set_holder(self, turn: Turn | None) -> None:
         self.holder = turn

@@ -120,8 +120,8 @@ class ServerSession:
         operation that reads or writes it now.
         maybe_open: (session id, path) of each file that this connection may have open: its open or its
         Terminate is not answered (yet), or `distrust` moved it here. The path is b"" if that is not known.
-        file_since: when the last open went out; from its ACK on, when that came. Requests that went out
-        before concern an earlier file.
+        newest_open_at: the time of the newest open: when it went out, then when its ACK came. A request that
+        went out earlier belongs to an earlier file.
         epoch: the time of the last `distrust` of reads, always later than the one before. Bytes that were
         read before it, and not long before, may be another file's.
         quarantine: of names that were changed.
@@ -149,7 +149,7 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: set[tuple[int, bytes]] = set()
-        self.file_since = -inf
+        self.newest_open_at = -inf
         self.epoch = self._distrusted_at = -inf
         self.quarantine = Quarantine()
         self.others = OtherClients(rng)
@@ -190,7 +190,7 @@ class ServerSession:
         took = shared and took_session(payload)
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
         # If no file was opened since reads were last distrusted, no more bytes are suspect.
-        opened = session is not None or self.file_since >= self.epoch
+        opened = session is not None or self.newest_open_at >= self.epoch
         self.distrust("another FTP client is active", reads=(took or missed) and opened)
         self.wake()
 
@@ -224,7 +224,7 @@ class ServerSession:
             name, _, _ = request.data.partition(b"\0")
             if not self.quarantine.left(name, self.clock()):
                 self.on_unexplained(reply, late)
-        elif request.first_sent >= self.file_since:
+        elif request.first_sent >= self.newest_open_at:
             return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
         elif reply.req_opcode in OPENING:
             if self.session is None or self.session.seq != reply.seq:
@@ -237,7 +237,9 @@ class ServerSession:
         before the next open. The server may have restarted meanwhile."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
-        self._leave()
+        if self.session is not None:
+            self.maybe_open.add((self.session.id, self.session.path))
+            self.session, self.engine.session = None, self.engine.home_session
         self.wake()
 
     def lose(self, lost: SessionLost) -> None:
@@ -247,12 +249,6 @@ class ServerSession:
             self.distrust(str(lost), reads=True)
         else:
             self.leave()
-
-    def _leave(self) -> None:
-        """Move the open file to `maybe_open`."""
-        if self.session is not None:
-            self.maybe_open.add((self.session.id, self.session.path))
-            self.session, self.engine.session = None, self.engine.home_session
 
     def _forget(self, session: int) -> None:
         """Note that this connection has no file open under this id."""
@@ -330,12 +326,13 @@ class ServerSession:
         asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
         operation = OpenRequest(opcode, wire_path(path), session=asked)
         operation.on_opened = partial(self._on_opened, path, tried)
-        # After a time-out or a cancellation these stay: the server may have opened the file, under either id.
+        # After a time-out or a cancellation these stay: the server may have opened the file. PX4 and MAVSDK
+        # answer with id 0, whatever was asked for; until an ACK tells which, the file may have either id.
         if echoes is not False:
             self.maybe_open.add((asked, path))
         if not echoes:
             self.maybe_open.add((0, path))
-        self.file_since = self.clock()
+        self.newest_open_at = self.clock()
         try:
             await self.driver.run(operation)
         except FtpNak as nak:
@@ -357,7 +354,7 @@ class ServerSession:
             seq=operation.reply.seq,
             resent=tried.resent or operation.retransmitted,
         )
-        self.engine.session, self.file_since = self.session.id, self.session.opened_at
+        self.engine.session, self.newest_open_at = self.session.id, self.session.opened_at
 
     # --- when the session is taken
 
@@ -448,7 +445,7 @@ class ServerSession:
         session = self.session
         if session is None:
             return True
-        self._leave()
+        self.leave()
         asked_at = self.clock()
         try:
             with trio.move_on_after(limit):
@@ -459,6 +456,7 @@ class ServerSession:
             self._forget(session.id)
             if nak.code not in _NOT_OPEN:
                 raise
+            # The file was in use when the first transmission went out.
             return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
         raise RequestTimeout("no answer to TerminateSession")
 
