@@ -23,7 +23,10 @@ THEIRS, MORE, BESIDE = content(800, 5), content(150, 6), content(3000, 7)
 TAKES = 300.0
 """Seconds for which the other computer uploads."""
 
-PIECE = 100
+PIECE = 75
+"""Bytes it writes every 7.5 s. A client that pauses for 10 s with a file open loses it to the mount
+(`session.others.LEFT_OPEN`)."""
+
 PATIENCE = 60
 
 
