@@ -343,9 +343,10 @@ async def _prove(card: Card, file: File, *, at_end: bool) -> None:
 
 
 def _is_own(file: File) -> bool:
-    """Return whether a file has pending changes and is locked. Then a delivery may be under way, which
-    compares the vehicle's file itself, and may be just replacing it."""
-    return file.is_local and file.lock.locked()
+    """Return whether a file has pending changes and is locked, or is sent under its own name. In the first
+    case a delivery may be under way, which compares the vehicle's file itself, and may be just replacing it.
+    In the second one the vehicle has a part of the new file."""
+    return file.is_local and (file.lock.locked() or file.lies_in_place)
 
 
 def _compare(card: Card, file: File, directory: Directory) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import trio
 
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
@@ -297,6 +298,30 @@ async def test_overwriting_in_place_that_failed_goes_on_later() -> None:
             await file.flush()
             assert here.data(FILE) == b"%d" % number * 700
             await file.release()
+
+
+async def test_a_part_in_place_that_is_listed_in_flight_is_not_the_file_of_others() -> None:
+    """The program overwrites every byte of the old file, and does not empty it, as rsync --inplace does."""
+    new = content(60_000)
+    async with rig("littlefs", {FILE: new[::-1]}, link=LinkSettings(rate=20_000.0)) as here:
+        tree = here.mount(inplace=True)
+        file = await tree.open(FILE, write=True)
+        await file.write(0, new)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(_is_refused_in_flight, file)
+            await trio.sleep(2)
+            await here.arm()
+        assert 0 < len(here.data(FILE)) < len(new)
+        await trio.sleep(30)
+        await tree.list(b"/d")
+        await here.disarm()
+        assert await tree.drain(60) == []
+        assert here.data(FILE) == new
+
+
+async def _is_refused_in_flight(file: OpenFile) -> None:
+    with pytest.raises(Armed):
+        await file.release()
 
 
 async def test_what_others_wrote_before_anything_of_ours_went_out_in_place_stays() -> None:
