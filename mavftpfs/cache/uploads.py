@@ -144,7 +144,7 @@ async def abandon(card: Card, file: File) -> None:
     attempt = file.attempt
     if attempt is None:
         return
-    forget_attempt(file, attempt)
+    forget_attempt(card, file, attempt)
     try:
         await attempt.upload.end()
     finally:
@@ -154,9 +154,12 @@ async def abandon(card: Card, file: File) -> None:
             await card.names.discard(attempt.path)
 
 
-def forget_attempt(file: File, attempt: Attempt) -> None:
+def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
     """Note that an attempt ended without success. Bytes under the file's own name belong to the file."""
     if file.lies_in_place:
+        # The next listing shows a part: less than this, so that nobody else seems to write it.
+        card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, attempt.sending.size))
+        card.directories.expire(split(attempt.path)[0])
         file.unsure = Unsure(attempt.path, None, Known(attempt.sending.size), file.changes, in_place=True)
     file.attempt = None
 

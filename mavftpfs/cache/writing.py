@@ -296,7 +296,7 @@ def _detach(card: Card, file: File) -> Attempt | None:
     """Note that nothing of a file is to be placed; return the attempt to send it, which the caller ends."""
     attempt = file.attempt
     if attempt is not None:
-        uploads.forget_attempt(file, attempt)
+        uploads.forget_attempt(card, file, attempt)
         if not attempt.in_place and attempt.upload.may_exist:
             card.parts.append(attempt.path)
     if file.base is None and file.lies_in_place:

@@ -26,6 +26,7 @@ from mavftpfs.shared.errors import (
     NotFound,
     WriteFailed,
 )
+from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import KINDS, Rig, card, open_to_copy, read_file, rig, write_file
 from tests.support.transfers import content
 
@@ -169,6 +170,23 @@ async def test_the_name_is_free_for_the_next_program_at_once(each: Rig, path: by
     with pytest.raises(WriteFailed):
         await file.release()
     assert tree.status()["bytes_held"] == 0
+
+
+async def test_what_a_failed_write_left_in_place_is_not_being_written_by_others() -> None:
+    """Listings saw it grow. (The card cannot rename, and the old file was emptied.)"""
+    async with rig("littlefs", {FILE: OLD}, link=LinkSettings(rate=20_000.0)) as here:
+        tree = here.mount(inplace=True, dir_timeout=0.0)
+        file = await part_of(tree, FILE)
+        for _ in range(3):
+            await trio.sleep(1.0)
+            await tree.list(b"/d")
+        with pytest.raises(FileTooLarge):
+            await file.write(BEYOND, b"x")
+        await trio.sleep(1.0)
+        assert (await tree.stat(FILE)).size == len(here.data(FILE)) > 0
+        await write_file(tree, FILE, b"again")
+        assert here.data(FILE) == b"again"
+        file.close()
 
 
 async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
