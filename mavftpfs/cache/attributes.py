@@ -30,7 +30,7 @@ _LOG_DATE = re.compile(rb"/log/(\d{4})-(\d{2})-(\d{2})(?:/(\d{2})_(\d{2})_(\d{2}
 
 @dataclass(frozen=True, slots=True)
 class Stat:
-    """What is known of one path.
+    """The attributes of one path, as far as they are known.
 
     size: bytes, 0 <= size < 2**63. mtime_ns: nanoseconds since 1970 UTC, never unknown. valid_for: seconds
     the kernel may keep these attributes; 0 means ask again.

@@ -25,8 +25,8 @@ RequireDirectory = Callable[[bytes], Awaitable[None]]
 """Checks that the directory of a path exists."""
 
 NAMES = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
-"""What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
-find out whether the disk cuts names short."""
+"""Files that editors and file managers make beside those they work on; vim makes `.*.sw?x` for a moment, to
+learn whether the disk cuts names short."""
 
 _PATTERN = compile_pattern("|".join(map(translate, NAMES)).encode())
 

@@ -13,11 +13,11 @@ from mavftpfs.shared.sameness import Known
 
 @dataclass(frozen=True, slots=True)
 class Unsure:
-    """What was being placed under a name.
+    """The placing of a file under its name that was interrupted, or is under way.
 
-    temporary: the verified temporary file; aside: where the old file is, or may be, None if it was not moved.
-    sent: what is placed. changes: the file's `changes` when that was sent. in_place: no temporary file is
-    placed, the card may have bytes of the file under its own name.
+    temporary: the verified temporary file. aside: the name that the old file has, or may have; None if it was
+    not moved. sent: the content that is placed. changes: the file's `changes` when that was sent. in_place:
+    no temporary file is placed, because the card may have bytes of the file under its own name.
     """
 
     temporary: bytes

@@ -1,4 +1,4 @@
-"""What interruptions leave on the card is repaired, beside the programs that use its names."""
+"""Repair of the files that interruptions leave on the card, beside the programs that use its names."""
 
 from __future__ import annotations
 
