@@ -106,7 +106,7 @@ class Times:
             return None
         if known.size is None:
             known.size = size
-        if known.listed is None:  # our own writing left it unknown until the next listing
+        if known.listed is None:  # this mount's writing left it unknown until the next listing
             known.listed = listed
         if (known.size, known.listed) != (size, listed if listed is not None else known.listed):
             del self._times[name]

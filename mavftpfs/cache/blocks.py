@@ -310,7 +310,8 @@ class Blocks:
         that no other read waits for are not fetched.
 
         Raises:
-            RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
+            RequestTimeout: none of the missing bytes came for `patience` seconds. Otherwise the
+                error of on_failed.
         """
         missing = self.missing(start, stop)
         if not missing:

@@ -181,7 +181,7 @@ class Card:
         it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
         file.lose_name()
-        self.names.settle(file)  # nothing of it is placed any more
+        self.names.settle(file)  # nothing of it is to be placed
         file.content.on_unneeded()
         file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
         self.throttle.waiting.unpark_all()
@@ -245,7 +245,7 @@ class Card:
         does.
 
         Raises:
-            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
+            NotFound, NotADirectory: its directory. Otherwise as RemoteStore.list_directory.
         """
         file, (parent, name) = self.find(path), split(path)
         if file is not None and file.is_local:

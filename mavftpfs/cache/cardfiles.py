@@ -180,4 +180,4 @@ class CardFiles(Source):
 
     def _require_shown(self, path: bytes) -> None:
         if is_reserved(split(path)[1]) and not self._card.options.read_only:
-            raise NotFound(f"{path!r} is a name of our own")
+            raise NotFound(f"{path!r} is a name of a temporary file")

@@ -52,7 +52,7 @@ RESEND_PAUSE = 1.0
 """Seconds before such a file is sent again: the cause may last a moment."""
 
 LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
-"""Seconds after which it is tried again to find out what has a name; the second if only a checksum is
+"""Seconds after which mavftpfs looks again what has a name; the second if only a checksum is
 lacking, which is asked for after the flight."""
 
 SHORT = 4096

@@ -4,8 +4,8 @@ There is no stat on the wire (servers.md 14.30): everything known of a path come
 listing is fresh for a while. A name that a fresh and complete listing lacks does not exist. Expired listings
 are remembered, and served while the vehicle is lost.
 
-A listing takes many requests. It may show a change that we make meanwhile, or not. So a listing under way is
-a `Sweep`, which notes each of our changes, and a noted change beats what the sweep saw. Entries behind a
+A listing takes many requests, and may or may not show a change that this mount makes meanwhile. So a
+listing under way is a `Sweep`, which notes each of these changes, and a noted change counts. Entries behind a
 changed name may move between the sweep's pages (servers.md 6, "Concurrent change"), so the result expires at
 once.
 
@@ -63,8 +63,8 @@ COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
 
 LOOK_FACTOR = 5
-"""A listing that took T seconds is recent enough to change names by for LOOK_FACTOR * T. Else each mv and rm
-over a slow link would list a long directory again."""
+"""A listing that took T seconds is recent enough to change names by for LOOK_FACTOR * T. Otherwise each mv
+and rm over a slow link would list a long directory again."""
 
 STILL_GROWING = 30.0
 """A file that was seen to grow is taken to be open on the vehicle for so many seconds."""
@@ -76,7 +76,7 @@ LOOK = 1.0
 """Seconds after which a caller that has an older listing checks whether the vehicle is lost."""
 
 SWEEP_TRIES = 3
-"""How often a directory is listed at most because we changed names in it meanwhile."""
+"""How often a directory is listed at most because this mount changed names in it meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,8 +180,8 @@ class Directories:
             directory.growing[name] = self.clock()
 
     def put(self, path: bytes, entry: DirEntry | None) -> None:
-        """Note that we made, wrote, renamed or removed (None) this name. Directories below it are listed
-        again."""
+        """Note that this mount made, wrote, renamed or removed (None) this name. Directories below it are
+        listed again."""
         self.forget(path)
         parent, name = split(path)
         if entry is not None and entry.name != name:
@@ -259,7 +259,7 @@ class Directories:
 
         Raises:
             NotFound: its parent's listing does not show it. ListingIncomplete: nor does it prove anything.
-            NotADirectory: a part of the path is a file. Else as RemoteStore.list_directory.
+            NotADirectory: a part of the path is a file. Otherwise as RemoteStore.list_directory.
         """
         if path.count(b"/") > MAX_DEPTH:
             raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
@@ -289,7 +289,7 @@ class Directories:
         """Return a directory's listing that begins now, or that did not begin before a time.
 
         Raises:
-            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
+            NotFound, NotADirectory, VehicleLost; otherwise as RemoteStore.list_directory.
         """
         since = self.clock() if not_before is None else not_before
         for _ in range(SWEEP_TRIES):
@@ -310,7 +310,7 @@ class Directories:
         known one at once.
 
         Raises:
-            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
+            NotFound, NotADirectory, VehicleLost; otherwise as RemoteStore.list_directory.
         """
         directory = self.known(path)
         if directory is None:
@@ -338,7 +338,7 @@ class Directories:
         caller.
 
         Raises:
-            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
+            NotFound, NotADirectory, VehicleLost; otherwise as RemoteStore.list_directory.
         """
         if path == self._options.root:
             await self._walk_to_root()
@@ -412,7 +412,7 @@ class Directories:
         sweep.folder.prune()
 
     def remember(self, sweep: Sweep, listing: Listing) -> Directory:
-        """Remember a listing and return it, our own changes applied."""
+        """Remember a listing and return it, with this mount's changes."""
         now, old = self.clock(), sweep.folder.listing
         if not (listing.complete or (old is not None and not old.complete)):
             count = len(listing.entries)
@@ -453,7 +453,7 @@ class Directories:
 
 
 def _see_growth(old: Directory, new: Directory, sweep: Sweep) -> None:
-    """Note which files grew since the last listing without our writing, and keep what was noted before."""
+    """Note which files grew since the last listing without writes of this mount, and keep earlier notes."""
     for name in new.entries.keys() & old.entries.keys() - sweep.changes.keys():
         if new.size_of(name) > old.size_of(name):
             new.growing[name] = new.ended_at

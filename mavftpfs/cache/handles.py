@@ -249,7 +249,7 @@ class WriteHandle(ReadHandle):
         """Wait until not too much is un-ACKed. size: bytes that the file will have.
 
         Raises:
-            FileTooLarge, Armed. Else as delivery.deliver, when nothing moves.
+            FileTooLarge, Armed. Otherwise as delivery.deliver, when nothing moves.
         """
         if size > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")

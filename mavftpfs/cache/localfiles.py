@@ -177,7 +177,7 @@ class LocalFiles(Source):
         file.mtime_ns = self._now_ns()
 
     def forget_unused(self, file: LocalFile) -> None:
-        """Stop counting the bytes of a file that has neither a name nor a handle any more."""
+        """Stop counting the bytes of a file that lost its name and its last handle."""
         if not file.has_name and not file.handles:
             self.used -= len(file.data)
 

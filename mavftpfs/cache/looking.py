@@ -28,13 +28,13 @@ log = logging.getLogger("mavftpfs.cache")
 
 async def look(card: Card, file: File) -> bool:
     """Find out what has the name of an unsure file, and give a missing name its file; return whether the
-    vehicle has what was placed (rules 1 and 3). Then the file is not unsure any more. The caller holds the
+    vehicle has what was placed (rules 1 and 3). Then the file stops being unsure. The caller holds the
     file's lock.
 
     If nothing has the name, and nothing was left of it, the file has no base from now on.
 
     Raises:
-        NotVerified: the vehicle told no checksum. Armed: none is asked for in flight. Else as Directories.ask
+        NotVerified: the vehicle sent no checksum. Armed: none is asked for in flight. Also as Directories.ask
         and Names.rename. The file stays unsure.
     """
     unsure, path = file.unsure, file.path

@@ -138,10 +138,10 @@ class Names:
         """Refuse a new name that the card takes for an existing one.
 
         FAT ignores case, and dots and blanks at the end of a name (servers.md 9). If a listing shows a name
-        that differs only in that, the new name is opened to find out.
+        that differs only in that, the new name is opened to learn that.
 
         Raises:
-            AlreadyExists. Else as entry and VehicleStore.stat_size.
+            AlreadyExists. Otherwise as entry and VehicleStore.stat_size.
         """
         parent, name = split(path)
         entries = (await self._directories.get(parent)).entries
@@ -160,7 +160,7 @@ class Names:
         A directory that looks empty may hold reserved names, of another mount that may be at work.
 
         Raises:
-            DirectoryNotEmpty; FileBusy: only reserved names are in it. Else as Directories.ask.
+            DirectoryNotEmpty; FileBusy: only reserved names are in it. Otherwise as Directories.ask.
         """
         names = (await self._directories.ask(path)).entries
         if not all(is_reserved(name) for name in names):
@@ -171,7 +171,7 @@ class Names:
     # --- changing
 
     async def remove(self, path: bytes) -> None:
-        """Remove a file; no temporary name rests before, because it is used once. Raises as VehicleStore."""
+        """Remove a file; a temporary one at once, because its name is used once. Raises as VehicleStore."""
         async with self._changing(path):
             await self._store.remove(path, at_once=is_reserved(split(path)[1]))
         self._on_gone(path)
@@ -202,7 +202,7 @@ class Names:
         self._directories.put(path, DirEntry(b"", EntryKind.DIRECTORY))
 
     async def discard(self, path: bytes) -> None:
-        """Remove a temporary name that is not needed any more. If that fails, `repair` removes it."""
+        """Remove a temporary file that is no longer needed. If that fails, `repair` removes it."""
         self._own.release(path)
         gone = False
         try:
@@ -220,8 +220,8 @@ class Names:
         completes: see VehicleStore. over: a file has the new name.
 
         Raises:
-            NotSupported: the card cannot rename. AlreadyExists: the new name is taken, and not `over`. Else
-            as VehicleStore.
+            NotSupported: the card cannot rename. AlreadyExists: the new name is taken, and not `over`.
+            Otherwise as VehicleStore.
         """
         store = self._store
         if store.traits.rename_works is False:
@@ -242,8 +242,8 @@ class Names:
         self._directories.rename(old, new)
 
     async def learn_rename_works(self, near: bytes) -> None:
-        """Learn with an empty file of ours whether the card can rename (`Traits.rename_works`). near: a path
-        beside which it is made.
+        """Learn with an empty temporary file whether the card can rename (`Traits.rename_works`). near: a
+        path beside which it is made.
 
         The refusal of another file's rename does not tell: its error number proves nothing (servers.md 12),
         and the card may refuse only that name. An ACK does not tell either. So the file is removed under its
@@ -313,7 +313,7 @@ class Names:
         compare the file under its name first; then it calls `settle`. sent: what is placed.
 
         Raises:
-            OutcomeUnknown: the file stays unsure. Else as rename and replace: the file was not placed.
+            OutcomeUnknown: the file stays unsure. Otherwise as rename and replace: the file was not placed.
         """
         path = file.path
         with self._store.finishing():
@@ -331,7 +331,7 @@ class Names:
                 raise
 
     def settle(self, file: File) -> None:
-        """Note that it is known what has the name of a file. What is left of its placing is repaired."""
+        """Note that it is known what has the name of a file. `repair` removes the rest of its placing."""
         unsure, file.unsure = file.unsure, None
         if unsure is not None:
             own, now = self._own, self._clock()
@@ -347,8 +347,8 @@ class Names:
         first (servers.md 9).
 
         Raises:
-            NotSupported: the server does not rename. Else as VehicleStore.rename. After an error the old file
-            has its name again. After OutcomeUnknown that is not known, and `repair` looks.
+            NotSupported: the server does not rename. Otherwise as VehicleStore.rename. After an error the old
+            file has its name again. After OutcomeUnknown that is not known, and `repair` looks.
         """
         traits = self._store.traits
         if traits.rename_replaces is not False and not is_on_nuttx(target):
@@ -409,7 +409,7 @@ class Names:
         """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
 
         Raises:
-            OutcomeUnknown: the target may have no file. Else as replace.
+            OutcomeUnknown: the target may have no file. Otherwise as replace.
         """
         moved = await self._move_aside(target, aside)
         try:

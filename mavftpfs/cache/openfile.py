@@ -51,7 +51,7 @@ class OpenFile:
         """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
 
         If the handle changed the file before, an error breaks the file: nothing of it reaches the card, and
-        it has no name any more.
+        it loses its name.
 
         Raises:
             NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken. WriteFailed: the file is broken.

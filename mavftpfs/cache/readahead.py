@@ -17,7 +17,7 @@ MAX_WINDOW = 8 * 1024 * 1024
 class Plan:
     """The bytes to ask for besides the read itself: [start, stop), empty if start == stop.
 
-    seeked: the reader went elsewhere, so earlier readahead is of no use any more.
+    seeked: the reader went elsewhere, so earlier readahead is useless.
     """
 
     start: int = 0

@@ -149,11 +149,11 @@ async def _require_listed(card: Card, path: bytes, size: int) -> DirEntry:
     A size that is too small would make a copy too short, without an error.
 
     Raises:
-        DataUnproven: the listing shows another size. NotFound; else as RemoteStore.list_directory.
+        DataUnproven: the listing shows another size. NotFound; otherwise as RemoteStore.list_directory.
     """
     entry = await card.directories.ask_entry(path)
     if entry is None:
-        raise NotFound(f"{path!r} does not exist any more")
+        raise NotFound(f"{path!r} was removed from the vehicle")
     if entry.size != size:
         raise DataUnproven(f"{path!r} has {entry.size} bytes as listed, and {size} as opened")
     return entry
@@ -260,7 +260,8 @@ async def _base_bytes(
     """Return bytes of the vehicle's file, at most a piece, not proven yet. None: see _piece.
 
     Raises:
-        FileChanged: another file has the name, or none. Else as RemoteStore.open_reader and Blocks.wait_for.
+        FileChanged: another file has the name, or none. Otherwise as RemoteStore.open_reader and
+            Blocks.wait_for.
     """
     file.require_base()
     blocks, ahead = file.blocks, (stop, stop)
@@ -325,7 +326,7 @@ async def _prove(card: Card, file: File, *, at_end: bool) -> None:
     """Check by a listing, if one can tell more, that the vehicle's file of this name is still the same.
 
     Raises:
-        FileChanged: it is another one. Else as RemoteStore.list_directory.
+        FileChanged: it is another one. Otherwise as RemoteStore.list_directory.
     """
     if not _needs_proof(card, file, at_end=at_end):
         return

@@ -6,8 +6,8 @@ A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory`, with a descri
   Nothing more while a program writes, and no close was confirmed or refused;
 - what `writing.describe` tells of a file that could not be delivered.
 
-The description is written before the first byte, and removed when the vehicle has all of the file, or no
-program wants it any more. So the next mount can always say what it found, whenever the process was killed:
+The description is written before the first byte, and removed when the vehicle has all of the file, or all
+programs are done with it. So the next mount can always say what it found, whenever the process was killed:
 `SpoolDirectory.rescue` moves what has a description to a recovery directory. A mount that ends moves
 there what it could not deliver. From there nothing is sent to a vehicle by itself, because the file on the
 vehicle may have changed since. And it may be another vehicle with the same system id.
@@ -60,7 +60,7 @@ class SpoolDirectory:
     def rescue(self, recovery: Path) -> list[Path]:
         """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
 
-        What cannot be moved stays where a later mount finds it.
+        A file that cannot be moved stays where a later mount finds it.
 
         Raises:
             OSError: there was something, and nothing of it could be moved.

@@ -59,7 +59,7 @@ class Reader(Protocol):
 
     def drop(self, *, demand: bool = True) -> None:
         """Forget all wants (a read was interrupted); demand: False: those for which no program waits (after
-        a seek, or a release). What is on its way still comes."""
+        a seek, or a release). Bytes of requests in flight still arrive."""
         ...
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class RemoteStore(Protocol):
         """Read an `@` file to its end with one constant block size, whatever size it claims.
 
         Raises:
-            DataUnproven: longer than `limit`. Else as open_reader.
+            DataUnproven: longer than `limit`. Otherwise as open_reader.
         """
         ...
 
@@ -149,7 +149,7 @@ class Upload(Protocol):
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed. SessionLost: the session was lost again
-            and again without progress. LocalProtocolError: it was ended meanwhile. Else as the source.
+            and again without progress. LocalProtocolError: it was ended meanwhile. Otherwise as the source.
         """
         ...
 

@@ -9,7 +9,7 @@ Each listing of a directory shows them, and `due_in` says in how many seconds wh
 | another mount's old file, its name missing | gets its name back | after 60 s |
 | another mount's, anything else | is removed | when it stayed the same for 600 s |
 
-What this mount still needs is left alone. An old file that tells no name becomes `recovered-oSSS`; so does a
+Files that this mount still needs stay. An old file whose name is unknown becomes `recovered-oSSS`; so does a
 directory that another client had put in the place of the file before it was moved aside. Another
 computer's upload to a FAT card shows a size of 0 until its file is closed, which each upload does at least
 once a minute where the server keeps the content: so 600 s without a change say that nobody uploads.
@@ -119,7 +119,7 @@ class Repair:
         self._start()
 
     def retry(self) -> None:
-        """Do at once what waits for the vehicle or for the end of a flight: there are news of the vehicle."""
+        """Do at once what waits for the vehicle or for the end of a flight: there is news of the vehicle."""
         now = self._clock()
         self._due = {key: at if key[1] else now for key, at in self._due.items()}
         if self._look_at < inf:

@@ -138,7 +138,7 @@ class OwnNames:
         return None if name.target is None else join(split(path)[0], name.target)
 
     def on_gone(self, path: bytes) -> None:
-        """Note that nothing has the name any more."""
+        """Note that no file has the name."""
         self.needed.pop(path, None)
         self.targets.pop(path, None)
 
@@ -156,7 +156,7 @@ class OwnNames:
 
     def follow_rename(self, old: bytes, new: bytes) -> set[bytes]:
         """Note that a directory has another name; return the directories at and below it that have old files
-        of ours."""
+        of this mount."""
         self.needed = {renamed(path, old, new): until for path, until in self.needed.items()}
         self.targets = {
             renamed(path, old, new): renamed(target, old, new) for path, target in self.targets.items()

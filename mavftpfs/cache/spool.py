@@ -76,7 +76,7 @@ class SpoolContent:
     """The local file with the held bytes of one file (`content.Content`).
 
     Attributes:
-        name: the file's path on the vehicle, None once no program wants it any more.
+        name: the file's path on the vehicle, None once all programs are done with it.
         held: the extents that are kept.
     """
 
@@ -94,7 +94,7 @@ class SpoolContent:
 
         Raises:
             NoSpace: the budget is used up, or the local disk is full. SpoolFailed: the local disk fails.
-                What was kept before is as it was.
+                The bytes that were kept before stay.
         """
         try:
             self._open()
@@ -174,7 +174,7 @@ class SpoolContent:
             try:
                 os.close(self._file)
             except OSError as exc:
-                log.warning("closing %s: %s", self._path, exc)  # its bytes are not needed any more
+                log.warning("closing %s: %s", self._path, exc)  # its bytes are useless by now
         if self._path is not None:
             self._spool.remove_file(self._path)
         self._file = self._path = self._told = None

@@ -54,7 +54,7 @@ class Program(Hashable, Protocol):
     """A process that opens files; equal to itself alone."""
 
     def ended(self) -> bool:
-        """Return whether it ended, so that it saves nothing any more."""
+        """Return whether it ended, so that it stopped saving."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ class Texts(Source, ABC, Generic[B]):
         """Return a text. reread: read the vehicle now; else what was read last will do, if anything was.
 
         Raises:
-            NotFound: the vehicle has nothing that the text could show. Else as RemoteStore.read_whole.
+            NotFound: the vehicle has nothing that the text could show. Otherwise as RemoteStore.read_whole.
         """
 
     @abstractmethod
@@ -167,7 +167,7 @@ class Texts(Source, ABC, Generic[B]):
         """Change the vehicle, where a text asks for it.
 
         Raises:
-            Refused: the vehicle did not take it, or not all of it. Else as RemoteStore.read_whole.
+            Refused: the vehicle did not take it, or not all of it. Otherwise as RemoteStore.read_whole.
         """
 
     # --- what the tree asks
@@ -183,7 +183,7 @@ class Texts(Source, ABC, Generic[B]):
         return path == self.directory or (self.owns(path) and split(path)[1] != LAST_ERROR)
 
     async def stat(self, path: bytes) -> Stat:
-        """Return attributes. Raises NotFound; else as show."""
+        """Return attributes. Raises NotFound; otherwise as show."""
         return await self._stat(split(path)[1])
 
     async def _stat(self, name: bytes) -> Stat:
@@ -213,7 +213,7 @@ class Texts(Source, ABC, Generic[B]):
         """Open one.
 
         Raises:
-            ReadOnly, Armed, NotFound; else as show.
+            ReadOnly, Armed, NotFound; otherwise as show.
         """
         name = split(path)[1]
         if name == LAST_ERROR:
@@ -278,7 +278,7 @@ class Texts(Source, ABC, Generic[B]):
         """Save a text; one save at a time. base: what its handle showed before.
 
         Raises:
-            InvalidText, NotTaken, Armed; else as RemoteStore.read_whole.
+            InvalidText, NotTaken, Armed; otherwise as RemoteStore.read_whole.
         """
         async with self._saving:
             reads: Reads[B] = self._reads.get(program, Reads())
@@ -314,7 +314,7 @@ class Texts(Source, ABC, Generic[B]):
         while it was read. Returns the bytes that were parsed, too.
 
         Raises:
-            RemoteProtocolError; else as RemoteStore.read_whole.
+            RemoteProtocolError; otherwise as RemoteStore.read_whole.
         """
         try:
             return raw, parse(raw)
@@ -327,7 +327,7 @@ class Texts(Source, ABC, Generic[B]):
         self, name: bytes, file: bytes, uploads: Sequence[Sequence[bytes]]
     ) -> MavftpfsError | None:
         """Send what a save makes, in pieces that are not cut, and return why that ended, if it failed. Its
-        progress is in `transfers`, until the save ends. What came of it only another download tells.
+        progress is in `transfers`, until the save ends. Only another download shows its result.
         """
         failure: MavftpfsError | None = None
         self._virtual.outdate(file)

@@ -105,11 +105,11 @@ class Throttle:
         return False
 
     async def while_full(self, file: File, deliver: Callable[[], Awaitable[None]]) -> None:
-        """Run a delivery only for its error. Once bytes move again it is cancelled: the program is still
+        """Run a delivery only for its error, and cancel it once bytes move again: the program is still
         writing, so a completed delivery would place half a file.
 
         Raises:
-            What the delivery failed with.
+            The error of the delivery.
         """
         delivery, watch = trio.CancelScope(), trio.CancelScope()
 

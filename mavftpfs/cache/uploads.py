@@ -101,7 +101,7 @@ async def need_attempt(card: Card, file: File) -> Attempt:
     """Return the attempt that is under way if it still fits, else a new one.
 
     Raises:
-        As require_deliverable and require_untouched; else as VehicleStore.open_upload.
+        As require_deliverable and require_untouched; otherwise as VehicleStore.open_upload.
     """
     attempt, traits = file.attempt, card.store.traits
     require_deliverable(card, file)
@@ -109,7 +109,7 @@ async def need_attempt(card: Card, file: File) -> Attempt:
         return attempt
     if attempt is not None:
         await abandon(card, file)
-    # With `inplace` the card may have no room for both files, so it is found out before any file.
+    # With `inplace` the card may have no room for both files, so this is learnt before any file is sent.
     overwrites = card.options.inplace and file.base is not None
     if traits.rename_works is None and (file.size >= START_AT or overwrites):
         await card.names.learn_rename_works(file.path)
@@ -169,7 +169,7 @@ async def require_untouched(card: Card, file: File) -> None:
     still the same.
 
     Raises:
-        AlreadyExists. FileChanged: others changed the base. Else as Names.is_free and is_same.
+        AlreadyExists. FileChanged: others changed the base. Otherwise as Names.is_free and is_same.
     """
     path = file.path
     if file.lies_in_place:

@@ -28,7 +28,7 @@ async def check(card: Card, path: bytes, file: File, *, doubted: bool) -> int | 
     Raises:
         VerificationFailed: the vehicle has another file or none.
         NotVerified: doubted, and the vehicle told no CRC32. Armed: none is asked for in flight, and it is
-        doubted, or nothing may be changed now. Else as VehicleStore.stat_size.
+        doubted, or nothing may be changed now. Otherwise as VehicleStore.stat_size.
     """
     crc32, why = None, None
     if file.size and (doubted or file.size <= card.options.verify_max):
@@ -45,7 +45,7 @@ async def check(card: Card, path: bytes, file: File, *, doubted: bool) -> int | 
     if not crc32:
         size = await card.names.size(path)
         if size is None:
-            raise VerificationFailed(f"{path!r} is not there any more")
+            raise VerificationFailed(f"{path!r} is gone from the vehicle")
         if size != file.size:
             raise VerificationFailed(f"{path!r} has {size} bytes there, {file.size} were written")
     file.verified = "size" if crc32 is None else "size and CRC32"

@@ -180,7 +180,7 @@ class VirtualTrees(Source):
         """Return attributes. A file whose listed size lies is read to know its true size.
 
         Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory and read_whole.
+            NotFound, NotADirectory; otherwise as RemoteStore.list_directory and read_whole.
         """
         found = await self._find(path)
         seen = self._look(path)
@@ -235,7 +235,7 @@ class VirtualTrees(Source):
         """Read the file whole, unless that was just done.
 
         Raises:
-            ReadOnly, NotFound, NotADirectory, IsADirectory; else as RemoteStore.read_whole.
+            ReadOnly, NotFound, NotADirectory, IsADirectory; otherwise as RemoteStore.read_whole.
         """
         if how.write:
             self._refuse(path)
@@ -252,7 +252,7 @@ class VirtualTrees(Source):
         LIVE_TIME; else what was read last will do, if anything was.
 
         Raises:
-            NotFound; else as RemoteStore.read_whole.
+            NotFound; otherwise as RemoteStore.read_whole.
         """
         await self._find(path)
         seen = self._look(path)
@@ -280,7 +280,7 @@ class VirtualTrees(Source):
         """Return the listed entry; in a tree that no listing shows, the entry of a file.
 
         Raises:
-            NotFound: also for a listed file that was seen not to open. Else as Directories.find.
+            NotFound: also for a listed file that was seen not to open. Otherwise as Directories.find.
         """
         tree = tree_of(path)
         if tree not in UNLISTABLE:
@@ -328,7 +328,7 @@ class VirtualTrees(Source):
         """Take a snapshot; concurrent callers share it.
 
         Raises:
-            NotFound: the vehicle does not know the file, listed or not. Else as RemoteStore.read_whole.
+            NotFound: the vehicle does not know the file, listed or not. Otherwise as RemoteStore.read_whole.
         """
         return await self._reading.run(path, partial(self._read_once, path))
 

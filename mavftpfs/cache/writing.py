@@ -90,8 +90,8 @@ async def made(card: Card, path: bytes) -> File | None:
     """Make a file, as far as programs see; return None if there is one.
 
     Raises:
-        NotFound, NotADirectory: its directory. AlreadyExists: another spelling of a file that is there. Else
-        as RemoteStore.list_directory.
+        NotFound, NotADirectory: its directory. AlreadyExists: another spelling of a file that is there.
+        Otherwise as RemoteStore.list_directory.
     """
     require_writable(path)
     require_listable(path)

@@ -142,8 +142,8 @@ class PipeLink:
 
     Args:
         pipe: None if it is opened later.
-        outbox_limit: bytes to keep for a slow peer. What does not fit is dropped whole, because a stream must
-            never be cut inside a frame.
+        outbox_limit: bytes to keep for a slow peer. Frames without room are dropped whole, because a stream
+            must never be cut inside a frame.
 
     Attributes:
         backlog: see Link.

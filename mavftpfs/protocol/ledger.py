@@ -33,7 +33,7 @@ class Ghost(Operation):
     ghost for requests."""
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nothing to do: the answer is not wanted any more."""
+        """Nothing to do: nobody waits for the answer."""
 
 
 class Ledger:
@@ -147,7 +147,7 @@ class Ledger:
             self._table.pop(request.seq + 1, None)
 
     def lose(self, request: Request) -> None:
-        """Note that a request is not outstanding any more; answers may still come."""
+        """Note that a request stopped being outstanding; answers may still arrive."""
         request.outstanding = False
         del self.outstanding[request.order]
         self._late[request.seq + 1] = request
@@ -156,7 +156,7 @@ class Ledger:
             del self._late[oldest], self._table[oldest]
 
     def late_by(self, seq: int, now: float) -> float | None:
-        """Return the seconds since the request with this answer went out; None: not known any more."""
+        """Return the seconds since the request with this answer went out; None: forgotten."""
         for first, last, sent_at in reversed(self._sent):
             if (seq - 1 - first) % (LAST_SEQ + 1) <= (last - first) % (LAST_SEQ + 1):
                 return now - sent_at

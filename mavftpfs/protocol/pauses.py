@@ -2,8 +2,8 @@
 
 A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
 pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
-pace. Otherwise the server would have nothing to do for a round trip after the pause. What is lost then
-overflowed its buffer, and says nothing of the link.
+pace. Otherwise the server would have nothing to do for a round trip after the pause. A loss then
+comes from its full buffer, and proves nothing of the link.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ class Timers:
     def sample(self, request: Request, now: float) -> float:
         """Return the round trip of a transmission that was answered, and learn from it.
 
-        What was sent in one batch and answered in one batch is one sample: a hundred equal ones would say
+        Requests that were sent and answered in one batch are one sample: a hundred equal ones would say
         that round trips never vary.
         """
         policy = request.policy

@@ -69,9 +69,7 @@ _OLD_WAY_FROM = 2
 """The try from which AUTOPILOT_VERSION is also requested in the way of older firmware."""
 
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
-_TELLS_NO_ID = (
-    "%d/%d does not report its unique id any more: nothing is read from it or written to it until it does"
-)
+_TELLS_NO_ID = "%d/%d stopped sending its unique id: nothing is read from it or written to it until it does"
 
 
 @dataclass(frozen=True, slots=True)

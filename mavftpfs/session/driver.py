@@ -24,7 +24,7 @@ from mavftpfs.shared.errors import RequestTimeout
 
 log = logging.getLogger("mavftpfs.session")
 
-_MOVED = "the vehicle is not heard at %s any more; its id is asked for at %s"
+_MOVED = "the vehicle is silent at %s; its id is asked for at %s"
 _IGNORED = (
     "%s says that it is %d/%d, too: ignored as long as the vehicle is heard where it was; "
     "if these are two vehicles, and not frames that a router sends back, give each a system id of its own"

@@ -81,7 +81,7 @@ SWEEPS = 3
 """Listings of a directory at most, because its names changed during the earlier ones."""
 
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
-"""Refusals if a name does not exist (any more); the errno may be a stale one (docs/servers.md 12)."""
+"""Refusals if a name does not exist; the errno may be a stale one (docs/servers.md 12)."""
 
 
 class Store:

@@ -46,14 +46,14 @@ ABSENCE = 2.5
 """Seconds of silence in which a vehicle may have restarted, or have been exchanged for another: no autopilot
 starts faster. (A cable that is moved reopens the link, which is told.)"""
 
-_REPLACED = "another vehicle answers, or the one that was mounted does not tell its unique id any more"
+_REPLACED = "another vehicle answers, or the mounted one stopped sending its unique id"
 _SILENT = "the vehicle is silent; waiting for its heartbeat"
 
 _OPCODE_INDEX = 3
 _REBOOT_SLACK_MS = 2000
 _OLDEST_NEWS_MS = 20_000
 """Of a restart that is news the boot time is less than twice what passed since the last message (simulators
-may run faster than the clock), and this. What is behind and more than that was held back by the network."""
+may run faster than the clock), and this. A message that is further behind was held back by the network."""
 
 _MISSING_MS = 20_000
 """Less boot time than half of what passed, and this beyond it, is a restart that nobody saw: a full queue
@@ -173,7 +173,7 @@ class Identity:
 def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
     """Return whether two answers are of two boards.
 
-    What one of them lacks tells nothing: uid2 is an extension, which MAVLink 1 frames do not carry.
+    A field that one of them lacks proves nothing: uid2 is an extension, which MAVLink 1 frames do not carry.
     """
     if known.uid and version.uid and known.uid != version.uid:
         return True
@@ -274,7 +274,7 @@ class Vehicle:
     def why_lost(self, now: float) -> str | None:
         """Return why nothing should begin that needs the vehicle; None if it may.
 
-        What is under way goes on until a request has timed out, too (`lost`): the vehicle may come back.
+        Requests in flight go on until one of them has timed out, too (`lost`): the vehicle may return.
         """
         if self.identity.standing is Standing.STRANGER:
             return _REPLACED

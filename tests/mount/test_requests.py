@@ -1,7 +1,7 @@
 """The exact cost of each command in requests: on a radio each is a round trip that somebody waits for.
 
 Counted by the vehicle, on a link without loss, Terminate and verification included. A number that grows is a
-regression; one that shrinks is a reason to look whether something is not checked any more.
+regression; one that shrinks is a reason to look whether a check is missing.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ async def test_what_another_client_does_decides_whether_bytes_are_in_doubt() -> 
         assert await doubts(Opcode.LIST_DIRECTORY)
         assert not await doubts(Opcode.LIST_DIRECTORY)
         assert await doubts(Opcode.READ_FILE)
-        assert not await doubts(Opcode.READ_FILE), "our file is not open any more"
+        assert not await doubts(Opcode.READ_FILE), "the mount's file was closed"
         assert not await doubts(Opcode.TERMINATE_SESSION)
         assert not await doubts(Opcode.LIST_DIRECTORY, 3.0)
         assert await doubts(Opcode.LIST_DIRECTORY, 11.0)

@@ -100,7 +100,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(caplog: pytest.Log
         assert connection.status()["link"]["address"] == "10.0.0.2:14550"
         assert not connection.vehicle.lost(trio.current_time())
     assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
-        "the vehicle is not heard at 10.0.0.1:14550 any more; its id is asked for at 10.0.0.2:14550"
+        "the vehicle is silent at 10.0.0.1:14550; its id is asked for at 10.0.0.2:14550"
     ]
 
 

@@ -31,7 +31,7 @@ D, A, B = b"/d", b"/d/a", b"/d/b"
 
 
 async def listed(here: Rig) -> Tree:
-    """Mount, and list the directory; return the tree when that is not news any more."""
+    """Mount, and list the directory; return the tree when that listing has expired."""
     tree = here.mount()
     await tree.list(D)
     await trio.sleep(LONG)

@@ -83,7 +83,7 @@ async def test_it_is_what_it_was_for_everybody(here: Rig, tree: Tree) -> None:
     assert await read_file(tree, FILE) == OLD
     with pytest.raises(NotFound):
         await tree.stat(FRESH)
-    assert await reader.read(0, len(OLD)) == NEW[: len(OLD)]  # of a file that has no name any more
+    assert await reader.read(0, len(OLD)) == NEW[: len(OLD)]  # of a file that lost its name
     await reader.release()
 
 

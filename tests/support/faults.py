@@ -116,7 +116,7 @@ class Faults:
         self._meetings.append(_Meeting(None, count, twice=True))
 
     def call_off(self) -> None:
-        """Let what was to happen at certain requests not happen any more."""
+        """Cancel the faults that were to happen at certain requests."""
         self._meetings.clear()
 
     def times(self, opcode: Opcode) -> list[float]:

@@ -133,7 +133,7 @@ def unmount(path: Path) -> None:
             subprocess.run(command, check=False, timeout=END_TIMEOUT, capture_output=True)
         return not mounted_at(path)
 
-    wait_until("no program uses the mount any more", unmounted)
+    wait_until("all programs stopped using the mount", unmounted)
 
 
 def abort_mount(path: Path) -> None:
@@ -215,7 +215,7 @@ class Mount:
         return self.process
 
     def kill(self) -> None:
-        """kill -9 of the mount's process, until the kernel knows too that nobody serves the mount any more:
+        """kill -9 of the mount's process, until the kernel knows, too, that nobody serves the mount:
         that may be after the process was reaped."""
         process, self.process = self.alive(), None
         process.kill()

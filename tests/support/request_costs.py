@@ -45,7 +45,7 @@ class Case:
     """One command; `$1` is an empty directory on the local disk.
 
     cost: on most servers. before: what runs first, uncounted. prepare: fills the directory on the card before
-    it is mounted. aged: what was listed before is no news any more when the script starts.
+    it is mounted. aged: earlier listings have expired when the script starts.
     """
 
     name: str

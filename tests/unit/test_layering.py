@@ -47,7 +47,7 @@ IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"mount.guard", "mount.invalidator", "mount.kernel", "mount.operations", "mount.root"},
+    "pyfuse3": {"mount.guard", "mount.invalidator", "mount.kernel", "mount.operations"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli.drawing", "cli.demo"},

@@ -194,7 +194,7 @@ async def test_a_listing_that_is_always_raced_is_given_up_on(here: Rig, tree: Tr
 
 
 async def test_a_tree_that_is_only_read_shows_what_others_left(here: Rig) -> None:
-    """Names like those of our own, too: there may be nothing else left of a file."""
+    """Names like those of temporary files, too: there may be nothing else left of a file."""
     tree = here.mount(read_only=True)
     left = Reserved(new_owner(Random(1)), Kind.NEW, b"sss", b"a.txt").name
     for name in (left, b".a.txt.swp"):

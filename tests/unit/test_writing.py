@@ -124,7 +124,7 @@ def test_a_lost_session_gives_everything_back(codes: tuple[int, ...]) -> None:
     assert isinstance(transfer.error.__cause__, FtpNak)
     assert source.in_flight.empty
     assert list(source.todo) == [(239, len(CONTENT))]
-    engine.receive(ack(requests[1]), 0.2)  # too late: nobody takes it for this file any more
+    engine.receive(ack(requests[1]), 0.2)  # too late to count for this file
     assert source.acked.total == 239
 
 

@@ -228,7 +228,7 @@ class Side:
         return os.fstat(self.slots[slot]).st_size if slot in self.slots else -1
 
     def name_of(self, number: int) -> str | None:
-        """Return the path of an open file, None if it has none any more."""
+        """Return the path of an open file, None if it lost its name."""
         meant = os.fstat(number)
         for path in FILES:
             try:
