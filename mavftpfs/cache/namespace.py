@@ -17,7 +17,7 @@ import trio
 
 from mavftpfs.cache import delivery, reading, uploads
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Event
+from mavftpfs.cache.file import Event, File
 from mavftpfs.cache.reserved import fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -66,9 +66,11 @@ async def rmdir(card: Card, path: bytes) -> None:
 
 
 async def unlink(card: Card, path: bytes) -> None:
-    """See Tree.unlink."""
-    card.require_changeable()
+    """See Tree.unlink. A file that the vehicle never had needs no request, so a cut link and a flight do not
+    keep a program from removing it."""
     require_not_ours(path)
+    if not _is_only_here(card, card.find(path)):
+        card.require_changeable()
     async with _claim(card, path), card.paths.hold(path):
         await _unlink(card, path)
     card.forget_time(path)
@@ -134,8 +136,21 @@ async def _require_empty(card: Card, path: bytes) -> None:
 # --- inside: unlinking
 
 
+def _is_only_here(card: Card, file: File | None) -> bool:
+    """Return whether the vehicle never had a file of this mount, nor may have a part of it under its name, as
+    a card that cannot rename may."""
+    if file is None or not file.is_local or card.store.traits.rename_works is False:
+        return False
+    return file.base is None and file.unsure is None and (file.attempt is None or not file.attempt.in_place)
+
+
 async def _unlink(card: Card, path: bytes) -> None:
     file = card.find(path)
+    if file is not None and _is_only_here(card, file):
+        card.forget_broken(path)
+        await uploads.drop(card, file)
+        return
+    card.require_changeable()
     if file is not None:
         await delivery.look(card, file)
         await uploads.abandon(card, file)

@@ -281,3 +281,26 @@ async def test_the_only_copy_of_the_old_file_stays_until_the_new_one_is_there(pr
             told = error
         await trio.sleep(30)
         assert {OLD, NEW} & set(here.files().values()), (told, here.files().keys())
+
+
+@pytest.mark.parametrize("how", ["cut", "armed"])
+async def test_a_program_removes_what_the_vehicle_never_had(how: str) -> None:
+    """As rsync removes its temporary file after a failed close, on a link that comes and goes."""
+    async with rig("px4", {OTHER: OLD}, options=QUICK) as here:
+        tree = here.mount(op_deadline=5.0)
+        await tree.list(b"/d")
+        file = await tree.create(FILE, exclusive=True)
+        await file.write(0, NEW)
+        here.faults.at(
+            Opcode.WRITE_FILE, lambda: here.faults.cut_after(0) if how == "cut" else here.vehicle.arm()
+        )
+        with pytest.raises(MavftpfsError):
+            await file.release()
+        await tree.unlink(FILE)
+        assert tree.undelivered() == []
+        assert [name for name, _ in await tree.list(b"/d")] == [b"other"]
+        here.faults.cut_after(None)
+        here.vehicle.disarm()
+        await trio.sleep(100)
+        assert here.files() == {OTHER: OLD}
+        assert here.litter() == []
