@@ -28,9 +28,9 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Repair
-from mavftpfs.cache.reserved import OwnNames, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.spool import Spool
+from mavftpfs.cache.temporary import TemporaryNames, new_owner
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import Armed, FileBusy, FileChanged
@@ -92,7 +92,7 @@ class Card:
         self.root = self.directories.root
         self.cache = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self.paths = PathLocks(options.op_deadline)
-        self.own = OwnNames(new_owner(rng), rng)
+        self.own = TemporaryNames(new_owner(rng), rng)
         self.spool = Spool(
             None if spool is None else spool.path,
             vehicle=lambda: {"system": store.address()[0], "uid": store.board()},

@@ -8,8 +8,8 @@ from mavftpfs.cache.card import Card
 from mavftpfs.cache.directories import Directory, Found
 from mavftpfs.cache.file import File, State
 from mavftpfs.cache.handles import ReadHandle, WriteHandle
-from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.source import Opening, Source
+from mavftpfs.cache.temporary import is_temporary
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotDeliveredYet, NotFound
 from mavftpfs.shared.model import EntryKind, join, split
 
@@ -65,7 +65,7 @@ class CardFiles(Source):
         directory = await card.directories.get(path)
         shown = {}
         for name, entry in directory.entries.items():
-            if card.options.read_only or not is_reserved(name):
+            if card.options.read_only or not is_temporary(name):
                 shown[name] = self.stat_listed(join(path, name), Found(entry, directory))
         folder = card.root.find_folder(path)
         for child in [] if folder is None else folder.children.values():
@@ -179,5 +179,5 @@ class CardFiles(Source):
             raise IsADirectory("the mount's root is a directory")
 
     def _require_shown(self, path: bytes) -> None:
-        if is_reserved(split(path)[1]) and not self._card.options.read_only:
+        if is_temporary(split(path)[1]) and not self._card.options.read_only:
             raise NotFound(f"{path!r} is a name of a temporary file")

@@ -70,9 +70,9 @@ async def deliver(card: Card, file: File, *, wanted: Callable[[], bool] | None =
     try:
         while (file.undelivered or file.attempt is not None) and (wanted is None or wanted()):
             async with file.lock:
-                if file.claims:  # the name or the content goes first: the lock is fair
+                if file.preempting:  # the name or the content goes first: the lock is fair
                     continue
-                # If a claim cancels it, also while it waits for its path, the loop goes on.
+                # If a call preempts it, also while it waits for its path, the loop goes on.
                 with trio.CancelScope() as file.delivery:
                     await _deliver_under_its_name(card, file)
                     break
@@ -198,7 +198,7 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
     once it was seen to rename.
 
     Raises:
-        VerificationFailed: the file is not there, so it is sent again, whatever has the name. Else as
+        VerificationFailed: the file is not there, so it is sent again, whatever has the name. Also as
         verify.check.
     """
     store, path = card.store, file.path
@@ -297,7 +297,7 @@ async def withdraw(card: Card, file: File) -> bool | None:
     it, too.
     """
     with suppress(FileBusy):  # otherwise it is just getting its name
-        async with file.claim(card.options.op_deadline), card.paths.steady(file, lasting=True):
+        async with file.preempt(card.options.op_deadline), card.paths.steady(file, lasting=True):
             return await _withdraw(card, file)
     return None
 

@@ -102,7 +102,7 @@ class Attempt:
     def fits(self, *, in_place: bool) -> bool:
         """Return whether a delivery may continue the attempt: no program changed a byte that was sent, and
         the card still takes the file at the same place."""
-        return not self.sending.overtaken and in_place == self.in_place
+        return not self.sending.invalidated and in_place == self.in_place
 
 
 class File(Entry):
@@ -124,7 +124,7 @@ class File(Entry):
         start_after: no upload begins by itself before that time (infinite: only a close sends the file).
         in_kernel: the kernel may have pages of it, and none is of an older version.
         lock: a program changes the file, it is being delivered, or a call takes its name or content away.
-        delivery: the scope of the delivery that is under way. claims: how many calls wait
+        delivery: the scope of the delivery that is under way. preempting: how many calls wait
             for the lock to take the name or the content away; they go before deliveries.
     """
 
@@ -147,7 +147,7 @@ class File(Entry):
         self.in_kernel = False
         self.lock = trio.Lock()
         self.delivery: trio.CancelScope | None = None
-        self.claims = 0
+        self.preempting = 0
 
     # --- what it is
 
@@ -196,7 +196,7 @@ class File(Entry):
     @property
     def unacked(self) -> int:
         """Bytes that are to be sent, and not ACKed yet. A file is sent as a whole."""
-        if self.attempt is not None and not self.attempt.sending.overtaken:
+        if self.attempt is not None and not self.attempt.sending.invalidated:
             return self.attempt.sending.unacked
         return self.content.size if self.state is State.DIRTY else 0
 
@@ -250,7 +250,7 @@ class File(Entry):
         self.proven_at = max(self.proven_at, at)
 
     @asynccontextmanager
-    async def claim(self, patience: float) -> AsyncIterator[None]:
+    async def preempt(self, patience: float) -> AsyncIterator[None]:
         """Hold the lock while the body removes, renames or empties the file. A delivery that is under way is
         cancelled first, and its caller begins it again later. Exception: a file that is being placed is
         waited for.
@@ -258,7 +258,7 @@ class File(Entry):
         Raises:
             FileBusy: the file was not placed within `patience` seconds.
         """
-        self.claims += 1
+        self.preempting += 1
         try:
             if self.delivery is not None:
                 self.delivery.cancel()
@@ -267,7 +267,7 @@ class File(Entry):
             if scope.cancelled_caught:
                 raise FileBusy(f"{self.path!r} is just getting its name on the vehicle")
         finally:
-            self.claims -= 1
+            self.preempting -= 1
         try:
             yield
         finally:

@@ -199,7 +199,7 @@ class WriteHandle(ReadHandle):
                 await self._have_room(size)
             except MavftpfsError as error:
                 refused = error
-        async with file.claim(self._card.options.op_deadline) if empties else file.lock:
+        async with file.preempt(self._card.options.op_deadline) if empties else file.lock:
             try:
                 file.require_not_broken()
                 if refused is not None:

@@ -28,7 +28,7 @@ from typing import Protocol
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.file import File
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.reserved import Kind, OwnNames, is_reserved, parse
+from mavftpfs.cache.temporary import Kind, TemporaryNames, is_temporary, parse
 from mavftpfs.cache.unsure import Unsure
 from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
@@ -72,7 +72,7 @@ class Names:
         self,
         store: VehicleStore,
         directories: Directories,
-        own: OwnNames,
+        own: TemporaryNames,
         files: Collection[File],
         later: Later,
         clock: Callable[[], float],
@@ -147,7 +147,7 @@ class Names:
         entries = (await self._directories.get(parent)).entries
         plain, alike = _plain(name), set()
         for other, entry in entries.items():
-            if _plain(other) == plain and not is_reserved(other):
+            if _plain(other) == plain and not is_temporary(other):
                 alike.add(entry.kind)
         if not alike or name in entries:
             return
@@ -157,13 +157,13 @@ class Names:
     async def require_empty(self, path: bytes) -> None:
         """Check by a new listing that a directory is empty.
 
-        A directory that looks empty may hold reserved names, of another mount that may be at work.
+        A directory that looks empty may hold temporary names, of another mount that may be at work.
 
         Raises:
-            DirectoryNotEmpty; FileBusy: only reserved names are in it. Otherwise as Directories.ask.
+            DirectoryNotEmpty; FileBusy: only temporary names are in it. Otherwise as Directories.ask.
         """
         names = (await self._directories.ask(path)).entries
-        if not all(is_reserved(name) for name in names):
+        if not all(is_temporary(name) for name in names):
             raise DirectoryNotEmpty(f"{path!r} is not empty")
         if names:
             raise FileBusy(f"{path!r} holds temporary files, perhaps of another mount")
@@ -173,7 +173,7 @@ class Names:
     async def remove(self, path: bytes) -> None:
         """Remove a file; a temporary one at once, because its name is used once. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._store.remove(path, at_once=is_reserved(split(path)[1]))
+            await self._store.remove(path, at_once=is_temporary(split(path)[1]))
         self._on_gone(path)
 
     async def remove_if_there(self, path: bytes) -> None:
@@ -298,9 +298,9 @@ class Names:
         parent, _ = split(path)
         directory = self._directories.known(parent)
         for entry in [] if directory is None else list(directory.entries):
-            reserved, left = parse(entry), join(parent, entry)
-            old = reserved is not None and reserved.kind is Kind.OLD
-            if reserved is not None and old and self._own.target_of(left, reserved) == path:
+            temporary, left = parse(entry), join(parent, entry)
+            old = temporary is not None and temporary.kind is Kind.OLD
+            if temporary is not None and old and self._own.target_of(left, temporary) == path:
                 await self.remove_if_there(left)
 
     # --- giving a verified file its name

@@ -18,7 +18,7 @@ import trio
 from mavftpfs.cache import delivery, reading, uploads
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Event, File
-from mavftpfs.cache.reserved import fits_rename, require_not_ours
+from mavftpfs.cache.temporary import fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -71,7 +71,7 @@ async def unlink(card: Card, path: bytes) -> None:
     require_not_ours(path)
     if not _is_only_here(card, card.find(path)):
         card.require_changeable()
-    async with _claim(card, path), card.paths.hold(path):
+    async with _preempting(card, path), card.paths.hold(path):
         await _unlink(card, path)
     card.forget_time(path)
 
@@ -86,21 +86,21 @@ async def rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> None
         raise InvalidMove(f"{old!r} cannot become a part of itself")
     if old != new:
         await _deliver_below(card, old)
-    claimed = nullcontext() if noreplace or old == new else _claim(card, new)
-    async with claimed, card.paths.hold(old, new):
+    preempting = nullcontext() if noreplace or old == new else _preempting(card, new)
+    async with preempting, card.paths.hold(old, new):
         await _rename(card, old, new, noreplace=noreplace)
 
 
 @asynccontextmanager
-async def _claim(card: Card, path: bytes) -> AsyncIterator[None]:
-    """Claim the file of a path, if it is open or not delivered, for a body that takes its name away.
+async def _preempting(card: Card, path: bytes) -> AsyncIterator[None]:
+    """Preempt the file of a path, if it is open or not delivered, for a body that takes its name away.
 
     Raises:
-        FileBusy: see File.claim.
+        FileBusy: see File.preempt.
     """
     file = card.find(path)
     try:
-        async with nullcontext() if file is None else file.claim(card.options.op_deadline):
+        async with nullcontext() if file is None else file.preempt(card.options.op_deadline):
             yield
     finally:
         if file is not None:

@@ -2,7 +2,7 @@
 
 Tasks take the locks in this order:
 1. The *file's lock*, `file.File.lock`. A writer or a delivery of a file holds it, and so does a call that
-   removes, renames or empties the file (`File.claim`).
+   removes, renames or empties the file (`File.preempt`).
 2. The *path lock*, here. A change of names (mkdir, rmdir, unlink, rename) holds the paths concerned alone. A
    call that opens or delivers a file holds its path `shared`: beside others that share it, but not during a
    change of its name, because the call would then find neither the old file nor the new one.

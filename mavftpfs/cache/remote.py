@@ -188,7 +188,7 @@ class VehicleStore(RemoteStore, Protocol):
 
     def in_doubt(self, since: float = inf) -> bool:
         """Return whether there is doubt: something in the last ten minutes, or since a time of the caches'
-        clock, says that a file may have other bytes than the ACKs say. That is a late copy of a request,
+        clock, says that a file may have other bytes than the ACKs say. That is a late duplicate of a request,
         another FTP client, a lost session, or a restart."""
         ...
 
@@ -216,7 +216,7 @@ class VehicleStore(RemoteStore, Protocol):
         something, or `finish` is called. Unless the name is new, the caller waited for the end of its
         quarantine (`wait_out`).
 
-        `path` is a reserved name, or, on cards that cannot rename, the file's own: it is free, or has the
+        `path` is a temporary name, or, on cards that cannot rename, the file's own: it is free, or has the
         file that is to be replaced. An upload that was interrupted goes on by OpenFileWO where that was seen
         to keep what the file has, else all of it is sent again.
         """

@@ -29,7 +29,7 @@ from mavftpfs.cache.directories import Directories, Directory
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
-from mavftpfs.cache.reserved import Kind, OwnNames, Reserved, parse
+from mavftpfs.cache.temporary import Kind, TemporaryName, TemporaryNames, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
 from mavftpfs.shared.model import EntryKind, join, split
 
@@ -55,7 +55,7 @@ IN_FLIGHT = 60.0
 """Seconds before a directory is listed again in which something waits for the end of a flight."""
 
 
-def due_in(name: Reserved, owner: bytes, *, target_there: bool, age: float) -> float:
+def due_in(name: TemporaryName, owner: bytes, *, target_there: bool, age: float) -> float:
     """Return in how many seconds a temporary name is to be repaired; 0 or less: now.
 
     owner: this mount's token. target_there: whether the name that it belongs to has a file. age: seconds
@@ -83,7 +83,7 @@ class Repair:
         self,
         store: VehicleStore,
         directories: Directories,
-        own: OwnNames,
+        own: TemporaryNames,
         paths: PathLocks,
         nursery: trio.Nursery,
         is_blocked: Callable[[], bool],
@@ -163,7 +163,7 @@ class Repair:
 
     # --- inside
 
-    def _see(self, path: bytes, directory: Directory) -> list[tuple[bytes, Reserved, float]]:
+    def _see(self, path: bytes, directory: Directory) -> list[tuple[bytes, TemporaryName, float]]:
         """Return the temporary names in a listing, those of old files first, each with the seconds until it
         is to be repaired."""
         own, now, seen, found = self._own, self._clock(), directory.seen, []
@@ -183,12 +183,12 @@ class Repair:
             del seen[gone]
         return sorted(found, key=lambda one: one[1].kind is not Kind.OLD)
 
-    def _target(self, left: bytes, name: Reserved) -> bytes:
+    def _target(self, left: bytes, name: TemporaryName) -> bytes:
         """Return the path that an old file is to get."""
         told = self._own.target_of(left, name)
         return told or join(split(left)[0], _recovered(name))
 
-    async def _repair(self, left: bytes, name: Reserved, directory: Directory) -> float:
+    async def _repair(self, left: bytes, name: TemporaryName, directory: Directory) -> float:
         """Remove what is left, or give it its name; return 0.0, or in how many seconds that is to be tried,
         because it waits for the end of a flight, or for a program that is using its name."""
         target, ours = self._target(left, name), name.owner == self._own.owner
@@ -246,5 +246,5 @@ class Repair:
             self.list_later(directory, AGAIN_AFTER)
 
 
-def _recovered(name: Reserved) -> bytes:
+def _recovered(name: TemporaryName) -> bytes:
     return b"recovered-o" + name.serial

@@ -44,7 +44,7 @@ MAX_TEXT = 4 << 20
 """Bytes of the longest text that can be saved."""
 
 MAX_READS, MAX_PROGRAM_READS = 32, 8
-"""So many texts that were read are remembered, of all programs and of one."""
+"""The most texts that are remembered after a read, of all programs and of one."""
 
 B = TypeVar("B")
 P = TypeVar("P")

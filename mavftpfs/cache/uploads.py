@@ -15,7 +15,7 @@ import trio
 from mavftpfs.cache import verify
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Attempt, File, State
-from mavftpfs.cache.reserved import Kind, is_reserved
+from mavftpfs.cache.temporary import Kind, is_temporary
 from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -74,12 +74,12 @@ async def push(card: Card, file: File) -> None:
         return
     card.touch(file)
     if attempt is not None:
-        if not attempt.sending.overtaken:
+        if not attempt.sending.invalidated:
             attempt.sending.growing = True
             attempt.upload.wake()
             return
         file.start_after = float("inf")  # a program that changed sent bytes will do so again
-    due = card.clock() >= file.start_after and not card.blocked and not file.claims
+    due = card.clock() >= file.start_after and not card.blocked and not file.preempting
     if not due or file.base_matters or file.unacked < START_AT or not may_pass(file) or file.unsure:
         return  # of a file that only changes every byte is sent again: that waits for the close
     try:
@@ -215,7 +215,7 @@ async def remove_parts(card: Card, path: bytes | None = None) -> None:
     """
     for part in [part for part in card.parts if path in (None, part)]:
         try:
-            if not (is_reserved(split(part)[1]) or await _is_part(card, part)):
+            if not (is_temporary(split(part)[1]) or await _is_part(card, part)):
                 log.warning("%r stays on the card: it may be a part of a failed copy, or another file", part)
             else:
                 await card.names.remove_if_there(part)

@@ -24,7 +24,7 @@ from mavftpfs.cache import reading, uploads
 from mavftpfs.cache.blocks import NEVER
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Attempt, Event, File, State
-from mavftpfs.cache.reserved import require_writable
+from mavftpfs.cache.temporary import require_writable
 from mavftpfs.shared.errors import (
     FileBusy,
     FileChanged,

@@ -147,9 +147,7 @@ def _run(words: list[str]) -> int:
 
 
 _GONE_FLAGS = {
-    ("sync", "--by-sysid"): "directories are named by unique ids",
-    ("sync", "--again"): "to fetch a log again, delete LOCAL/.mavftpfs-logs",
-    ("get", "--no-resume"): "to fetch a file anew, delete it here first",
+    ("get", "--no-resume"): "to download a file anew, delete it here first",
 }
 """Removed flags that are ignored, so that scripts with them still run. Drop the table after 1.0."""
 

@@ -133,7 +133,7 @@ class Downloads:
                 self.fail(path, exc)
         found = list(dict.fromkeys(found))
         if selection.by_name and not found and not self.outcome.failed:
-            raise NotFound("--include and --exclude leave no file to fetch")
+            raise NotFound("--include and --exclude leave no file to download")
         _require_apart(found)
         await self.fetch_all(found)
 

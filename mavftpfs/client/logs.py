@@ -160,7 +160,7 @@ async def _listed(downloads: Downloads, request: SyncRequest) -> list[Wanted]:
     ]
     taken = [log for log in logs if selection.takes(log.remote.removeprefix(join(place, b"")))]
     if logs and not taken:
-        downloads.reports.says(f"--include and --exclude leave no log to fetch ({len(logs)} in all)")
+        downloads.reports.says(f"--include and --exclude leave no log to download ({len(logs)} in all)")
     for path, error in unlisted:
         downloads.fail(path, error)
     return selection.of_logs(taken)

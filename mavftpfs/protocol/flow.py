@@ -55,7 +55,7 @@ SLACK = 2
 """The window is wider than the path by so many, which keeps the slowest part busy between two answers."""
 
 DEPTH, DEPTH_SERIAL = 3, 2
-"""So many may go out at once (the second at a serial port), or as many as the path carries in TICK."""
+"""Requests that may go out at once (the second at a serial port), or as many as the path carries in TICK."""
 
 ROUNDS = 10
 """The path's rate is the best one of so many rounds: enough to outlast a bad round, few enough to notice a
@@ -166,7 +166,7 @@ class Flow:
         cap: how many may be in flight where the server's queue decides: of writes, and beside another client.
         loss: the share of requests that the link loses, 0..1: what overflows a queue, or the buffer of a
             server that pauses, does not count.
-        alone: no other FTP client was heard lately.
+        sole_client: no other FTP client was heard lately.
         limited: the last `room` was less because of `bwlimit=`.
         sent_at: when requests went out last.
     """
@@ -175,7 +175,7 @@ class Flow:
         self, *, serial: bool = False, limit: int | None = None, bwlimit: float | None = None
     ) -> None:
         self._bwlimit = inf if bwlimit is None else bwlimit
-        self.alone = self.limited = False
+        self.sole_client = self.limited = False
         self.loss = 0.0
         self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
@@ -230,10 +230,10 @@ class Flow:
         """Return how many requests may go out now. paced: also more than the server queues, evenly spread."""
         self._lacks = -inf
         self.limited = False
-        capped = self._queues_few and not (paced and self.alone)
+        capped = self._queues_few and not (paced and self.sole_client)
         window = self.cap if capped and not self._before_silence else self.window
         room = window - in_flight
-        if capped and self.alone and not self._hurried:
+        if capped and self.sole_client and not self._hurried:
             room += 1  # one more fits a short queue that no other client fills (servers.md 3)
         if urgent:
             self._hurried = True

@@ -217,7 +217,7 @@ class Connection:
         self._tell("reboot")
 
     def _on_another_client(self, payload: bytes, newcomer: bool) -> None:
-        self.engine.flow.alone = False
+        self.engine.flow.sole_client = False
         self.scheduler.server.on_another_client(payload, newcomer=newcomer)
 
     def _on_armed(self, armed: bool) -> None:
@@ -258,7 +258,7 @@ class Connection:
         driver = self.driver
         while True:
             driver.send(driver.framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID))
-            self.engine.flow.alone = not self.vehicle.another_client_heard(self.clock())
+            self.engine.flow.sole_client = not self.vehicle.another_client_heard(self.clock())
             await trio.sleep(HEARTBEAT_PERIOD)
             if not self.was_lost and self.vehicle.lost(self.clock()):
                 self.was_lost = True

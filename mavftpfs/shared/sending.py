@@ -31,7 +31,8 @@ class SendBuffer:
         has_checkpoint: a Terminate was ACKed since the file was begun, so the card has the proven bytes.
         begun: CreateFile was sent, so the file was made, or emptied, for this attempt.
         handed_out: one past the highest byte that was ever handed out.
-        overtaken: bytes changed, or were cut off, after they were handed out, so the file must be sent again.
+        invalidated: bytes changed, or were cut off, after they were handed out, so the file must be sent
+            again.
         reached: one past the highest byte that was ACKed; after the session was lost, one past the highest
             proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
@@ -46,7 +47,7 @@ class SendBuffer:
         self.ranges.todo.add(0, size)
         self.acked = ExtentSet()
         self.proven = ExtentSet()
-        self.begun = self.has_checkpoint = self.overtaken = self.growing = False
+        self.begun = self.has_checkpoint = self.invalidated = self.growing = False
         self._progress = progress
         self._read = read
         self.handed_out = 0
@@ -60,7 +61,7 @@ class SendBuffer:
 
     def on_changed(self, start: int, size: int) -> None:
         """Note that the file changed from `start` on, perhaps to its end, and has `size` bytes now."""
-        self.overtaken |= start < self.handed_out
+        self.invalidated |= start < self.handed_out
         if size > self.size:
             self.ranges.todo.add(self.size, size)
         else:
@@ -125,7 +126,7 @@ class SendBuffer:
     def _next(self, limit: int) -> tuple[int, int] | None:
         """Return the next bytes to hand out."""
         found = self.ranges.todo.first()
-        if found is None or self.overtaken:
+        if found is None or self.invalidated:
             return None
         start, stop = found[0], min(found[1], found[0] + limit)
         if self.growing and stop == self.size:

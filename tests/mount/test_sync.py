@@ -29,7 +29,7 @@ from tests.support.neighbours import Beating
 from tests.support.vehicles import HOST, PROJECT, Program, free_udp_port
 
 FAR = ("--delay", "0.2")
-"""So that a growing log has grown between its last read and the next question, on a busy machine too."""
+"""A round trip in which a growing log grows before the next question, on a busy machine, too."""
 
 
 def argv(*words: object) -> list[str]:
@@ -180,7 +180,7 @@ def test_patterns_that_leave_nothing_are_said(field: Field, tmp_path: Path) -> N
     logs_of(vehicle.root / "log")
     out, err = run("sync", vehicle.source, tmp_path / "logs", "--include", "*.nope")
     assert out.startswith("0 new (0 B), 0 here already")
-    assert err == "mavftpfs: --include and --exclude leave no log to fetch (3 in all)\n"
+    assert err == "mavftpfs: --include and --exclude leave no log to download (3 in all)\n"
     assert run("sync", vehicle.source, tmp_path / "logs", "--include", "*.ulg")[1] == ""
     assert run("sync", vehicle.source, tmp_path / "logs", "--since", "2h")[1] == ""
 
@@ -269,7 +269,7 @@ trap 'kill $vehicle; wait $vehicle' EXIT
 
 @pytest.mark.needs("namespaces")
 def test_a_mount_of_another_network_namespace_is_another_vehicles(field: Field) -> None:
-    """Its port is spelled the same, and its files can be seen from there."""
+    """The two ports are spelled alike, and the mount's files can be seen from there."""
     vehicle = field.sim(field.local("card"))
     (vehicle.root / "ours").touch()
     (theirs := field.local("theirs") / "theirs").touch()

@@ -28,7 +28,7 @@ from mavftpfs.shared.options import Options
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0
-"""So long that only being told makes the kernel ask again."""
+"""Seconds: so many that the kernel asks again only after a notice."""
 
 
 class Server:

@@ -363,7 +363,7 @@ async def test_long_listings_one_after_the_other_leave_an_upload_on_nuttx_its_tu
 
 @pytest.mark.holds("promise 7")
 async def test_a_client_that_lists_beside_an_upload_on_nuttx_does_not_pass_for_a_protected_file() -> None:
-    """Its requests for paths take no turns with the upload, which is refused each time that it goes on."""
+    """The client's requests for paths take no turns with the upload, which is refused when it goes on."""
     data = content(40_000)
     here = Rig("px4-nuttx", {b"/d": None}, LinkSettings(rate=20_000.0, delay=0.1))
     here.card.add_directory(b"/etc")

@@ -26,7 +26,7 @@ EVERY_PROFILE = sorted(PROFILES)
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_an_existing_directory_is_not_taken_for_ours(profile: str) -> None:
-    """Its reply lost, mkdir of what was there before must still be refused."""
+    """The mkdir of an existing directory is refused even if the reply to it was lost."""
     here = Rig(profile, {b"/d": None})
     here.put(b"/d/dir/inner", b"x")
     async with here.connected() as connection:

@@ -675,7 +675,7 @@ async def test_bytes_travel_while_the_program_still_writes(here: Rig) -> None:
 
 @pytest.mark.holds("promise 4")
 async def test_a_pause_of_the_link_gives_no_half_file_its_name() -> None:
-    """Its program is writing on: later bytes would count as the change of a part, and be refused."""
+    """The program is still writing: later bytes would count as the change of a part, and be refused."""
     async with rig(link=LinkSettings(rate=10_000.0, delay=0.05)) as here:
         file = await here.mount().create(b"/new", exclusive=True)
         data = content(400_000)

@@ -766,7 +766,7 @@ async def test_a_file_that_may_have_been_emptied_while_it_was_sent_is_compared()
 @pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
 async def test_a_write_that_arrives_in_the_next_file_is_noticed(profile: str) -> None:
-    """Its ACK is explained, because it was repeated. Both files had the same session id."""
+    """The repetition of the WriteFile explains its ACK. Both files had the same session id."""
     one, two = content(20_000, 1), content(300_000, 2)
     async with rig(profile, {b"/d/f": b"x"}, link=CLEAN) as here:
         tree = here.mount(verify_max=1000)

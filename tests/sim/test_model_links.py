@@ -46,7 +46,7 @@ CALLS = 100
 """Of one sequence."""
 
 ONCE = (Phase.generate,)
-"""Nothing is made smaller: a hundred calls less one are another history, and minutes pass."""
+"""hypothesis shrinks no example: a hundred calls less one are another history, and minutes pass."""
 
 
 def varied(sequence: list[tuple[Any, ...]]) -> bool:

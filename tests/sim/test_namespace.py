@@ -14,7 +14,7 @@ from mavftpfs.cache.background import PAUSES
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.options import MIN_CACHE_SIZE
 from mavftpfs.cache.repair import AGAIN_AFTER, NAMELESS_FOR, SAME_FOR
-from mavftpfs.cache.reserved import Kind, Reserved
+from mavftpfs.cache.temporary import Kind, TemporaryName
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
@@ -238,7 +238,7 @@ async def rename(tree: Tree, path: bytes) -> None:
 async def test_a_name_that_no_listing_can_show_is_refused_and_nothing_is_sent(
     fat: Rig, act: Callable[[Tree, bytes], Awaitable[None]], path: bytes
 ) -> None:
-    """Such a file could never be removed. Names that never reach the vehicle may be any."""
+    """A file that no listing shows could never be removed. Names that never reach the vehicle may be any."""
     tree = fat.mount()
     with pytest.raises(MavftpfsError) as told:
         await act(tree, path)
@@ -267,7 +267,7 @@ async def test_odd_names_that_are_listed_are_not_refused(name: bytes) -> None:
 
 
 def leave(here: Rig, kind: Kind, name: bytes, data: bytes) -> bytes:
-    path = b"/d/" + Reserved(b"zzzz", kind, b"abc", name).name
+    path = b"/d/" + TemporaryName(b"zzzz", kind, b"abc", name).name
     here.put(path, data)
     return path
 
@@ -316,7 +316,7 @@ async def test_nothing_is_cleaned_up_in_flight_and_who_cannot_lists_all_the_same
 OLD, NEW = bytes(range(256)) * 4, b"new content " * 100
 FILE, OTHER = b"/d/file.txt", b"/d/other"
 LONG = b"/" + b"f" * 150
-"""Its reserved names do not tell where they belong."""
+"""A path so long that its temporary names do not contain its name."""
 
 
 @pytest.fixture

@@ -371,7 +371,7 @@ async def test_our_own_listings_make_nobody_wait_longer_for_another_client() -> 
 
 @pytest.mark.parametrize("profile", ONE_SESSION)
 async def test_a_client_that_only_lists_does_not_keep_our_lost_open_open(profile: str) -> None:
-    """Its requests keep that session alive; it can only be ours."""
+    """The client's requests keep the session alive, which only this connection can have opened."""
     here = Rig(profile, {b"/d/f": DATA}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
 
@@ -510,7 +510,7 @@ async def test_a_command_waits_for_another_client_as_long_as_that_reads(profile:
 
 
 async def test_a_user_that_waits_for_another_client_keeps_nobody_from_its_path() -> None:
-    """Its open was refused, so it gave its turn back."""
+    """The user's open was refused, so the user gave its turn back."""
     here = Rig("px4", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         sink = MemorySink(len(DATA))
@@ -595,7 +595,7 @@ async def test_also_one_that_it_took_right_behind_our_open() -> None:
 
 
 async def test_an_open_that_finds_all_of_several_sessions_taken_is_told_in_time() -> None:
-    """Such a server is asked beside another client's file, and nobody waits until that is closed."""
+    """A server with several sessions is asked beside another client's file, whose close nobody awaits."""
     here = Rig("ardupilot5", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     async with here.connected() as connection, trio.open_nursery() as nursery:
         assert await read_file(connection, b"/d/f") == DATA  # tells how session ids are given out
@@ -622,7 +622,8 @@ async def test_an_open_that_finds_all_of_several_sessions_taken_is_told_in_time(
 
 @pytest.mark.holds("promise 6")
 async def test_a_client_whose_file_our_open_ended_is_not_waited_for() -> None:
-    """Both opened a file when a third one had closed its own. The first one notices, and closes nothing."""
+    """Two clients opened a file when a third one had closed its own. The first one notices, and closes
+    nothing."""
     here = Rig("px4-2026", {b"/d/f": DATA, b"/d/theirs": OTHER}, LINK)
     handle, came = here.server.handle, trio.Event()
 

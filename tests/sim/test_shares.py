@@ -26,7 +26,7 @@ START = 0.06
 SHORT_QUEUE = 4096
 BOTH = pytest.mark.parametrize("direction", ["read", "write"])
 HARDER = pytest.mark.parametrize("direction", [pytest.param("read", marks=pytest.mark.soak), "write"])
-"""Both, but reading, which is the easier one here, in the soak only."""
+"""The two directions, but reading, which is the easier one here, in the soak only."""
 
 
 def target(case: Case) -> float:

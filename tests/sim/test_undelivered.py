@@ -275,7 +275,7 @@ async def test_an_append_to_a_name_of_a_rename_without_an_answer_is_refused_and_
 
 @pytest.mark.parametrize("carried_out", [False, True])
 async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(carried_out: bool) -> None:
-    """Nothing of the old file was to stay, and the other file may be nowhere else."""
+    """No byte of the old file was to stay, and the other file may be nowhere else."""
     async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, b"new")
@@ -287,8 +287,7 @@ async def test_a_new_content_is_not_put_over_a_file_that_got_the_name_unnoticed(
 
 @pytest.mark.parametrize("data", [b"new", b""])
 async def test_after_that_refusal_the_name_can_be_written_anew(data: bytes) -> None:
-    """Such a write begins a new copy: by O_TRUNC, and through the library also by the calls that make
-    files."""
+    """A program begins a new copy: by O_TRUNC, and through the library also by the calls that make files."""
     async with mounted("px4", TWO) as (here, tree):
         file = await tree.open(FILE, write=True, truncate=True)
         await file.write(0, data)

@@ -260,7 +260,7 @@ async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
 @pytest.mark.parametrize("more", [b"", b"more"])
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
 async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: str, more: bytes) -> None:
-    """Nothing was under way just then, and nothing is sent before it is known who is at the other end."""
+    """No request was in flight just then, and mavftpfs sends none before it knows who is at the other end."""
     here = Rig(profile, {b"/d": None}, PLAIN)
     here.link.is_stream = True
     here.vehicle.set_stream(True)

@@ -106,8 +106,8 @@ async def test_what_others_write_too_is_theirs(here: Rig, tree: Tree) -> None:
 
 
 async def test_a_listing_does_not_wait_because_its_requests_came_late(here: Rig, tree: Tree) -> None:
-    """Names rest after late copies, for up to ten seconds, but not a reserved name that is only removed.
-    (ArduPilot refuses the listing for 3 s: one of these requests opened a file.)"""
+    """Names are in quarantine after late duplicates, for up to ten seconds, but not a temporary name that is
+    only removed. (ArduPilot refuses the listing for 3 s: one of these requests opened a file.)"""
     handle, held = here.server.handle, []
     here.faults.orphans = True
     here.server.handle = lambda *request: held.append(request)  # type: ignore[method-assign]

@@ -97,7 +97,7 @@ def repository(folder: Path) -> None:
 
 
 REWRITE = "open 1, create 1, read 2, write 2, close 2"
-"""Fetch a small file, and send it under a reserved name."""
+"""Fetch a small file, and send it under a temporary name."""
 
 APPEND = f"{REWRITE}, crc 2, rename 1; 602 B"
 """The old file is compared once more before it is replaced."""

@@ -23,7 +23,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.cache.reserved import is_reserved
+from mavftpfs.cache.temporary import is_temporary
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import subscribe
 from mavftpfs.protocol.payload import Opcode
@@ -177,7 +177,7 @@ class Rig:
 
     def litter(self) -> list[bytes]:
         """Return which files under names of ours are there."""
-        return [path for path in self.files() if is_reserved(split(path)[1])]
+        return [path for path in self.files() if is_temporary(split(path)[1])]
 
     def _below(self, folder: bytes) -> Iterator[tuple[bytes, Kind]]:
         for entry in self.card.entries(self.root + folder):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from difflib import unified_diff
 from pathlib import Path
 
-from mavftpfs.cache.reserved import parse
+from mavftpfs.cache.temporary import parse
 from tests.support.mounts import Mount, wait_until
 from tests.support.trees import COMPARE, differing, walk
 

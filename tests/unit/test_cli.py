@@ -176,8 +176,6 @@ def test_a_command_names_an_option_that_is_gone(capsys: pytest.CaptureFixture[st
 UNITS_OF_0_2 = [
     ("/dev/ttyACM0", "/home/me/drone-ttyACM0", "-o", ""),
     ("/dev/ttyACM0", "/home/me/drone-ttyACM0", "-o", "ro,cache_dir=/var/tmp/drone"),
-    ("sync", SOURCE, "/home/me/drone-logs", "--watch"),
-    ("sync", SOURCE, "/home/me/drone-logs", "--watch", "--by-sysid", "--exec", "upload-log"),
 ]
 """The commands in ExecStart of older units, as they were and as their own examples changed them."""
 
@@ -191,7 +189,6 @@ def test_units_of_0_2_go_on_to_start(monkeypatch: pytest.MonkeyPatch, words: tup
         return 0
 
     monkeypatch.setattr(commands, "mount", start)
-    monkeypatch.setitem(cli._COMMANDS, "sync", (cli._COMMANDS["sync"][0], start))
     assert cli.main(words) == 0
     assert len(started) == 1
 

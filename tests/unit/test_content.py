@@ -94,9 +94,9 @@ async def test_a_claim_goes_before_the_delivery_that_it_cancels() -> None:
     async with trio.open_nursery() as nursery:
         nursery.start_soon(deliver)
         await trio.sleep(0.1)
-        async with file.claim(1.0):
-            order.append("claimed")
-    assert order == ["cancelled", "claimed"]
+        async with file.preempt(1.0):
+            order.append("preempted")
+    assert order == ["cancelled", "preempted"]
 
 
 # --- entries
@@ -144,10 +144,10 @@ def test_what_was_handed_out_may_not_change(change: Callable[[Content], None], a
     sending.next_chunk(3)
     content.write(3, b"XX")
     sending.on_changed(3, content.size)
-    assert not sending.overtaken
+    assert not sending.invalidated
     change(content)
     sending.on_changed(at, content.size)
-    assert sending.overtaken
+    assert sending.invalidated
     assert sending.next_chunk(9) is None, "two copies under way could land in the wrong order"
 
 

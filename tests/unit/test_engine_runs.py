@@ -26,7 +26,7 @@ Make = Callable[[], tuple[Operation, Answer, Callable[[], object]]]
 
 
 class Steady(Flow):
-    """Its window does not depend on which of the answers of a moment came first."""
+    """A flow whose window does not depend on the order of answers that arrive at one moment."""
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         return WINDOW - in_flight

@@ -102,7 +102,7 @@ def test_silence_probes_with_two_until_something_is_heard() -> None:
 def test_only_reads_of_a_lone_client_go_beyond_a_short_queue(alone: bool, paced: bool) -> None:
     path = Path(rate=100.0, base=0.1)
     path.flow.set_queue_limit(4)
-    path.flow.alone = alone
+    path.flow.sole_client = alone
     path.rounds(60)
     path.flow.begin()
     assert (path.flow.room(6, path.now, paced=paced) > 0) is (alone and paced)

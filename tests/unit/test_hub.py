@@ -78,7 +78,7 @@ def test_what_a_stream_ended_in_counts_when_it_falls_silent() -> None:
 
 
 def test_zeros_that_were_cut_from_a_heartbeat_are_no_armed_vehicle() -> None:
-    """Its last fields are zeros: base_mode too. The bytes behind are the checksum."""
+    """The heartbeat's last fields are zeros, base_mode too. The bytes behind are the checksum."""
     for custom_mode in range(256):
         head = bytes((5, 0, 0, 0, *ONE, HEARTBEAT_ID, 0, 0))
         payload = custom_mode.to_bytes(4, "little") + b"\x02"

@@ -135,7 +135,7 @@ def test_a_refused_write_is_sent_again_behind_a_listing_of_the_root() -> None:
 
 
 def test_a_listing_of_the_root_that_is_answered_late_does_not_hide_a_path() -> None:
-    """Both answers come together, and the turn of paths is over at that moment."""
+    """The two answers arrive together, and the turn of paths is over at that moment."""
     card = Card(known=False)
     card.sends(0.0)
     for request in card.out:

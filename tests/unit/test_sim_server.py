@@ -188,7 +188,7 @@ def test_fat_tells_the_size_of_a_file_only_once_it_is_closed(name: str) -> None:
 @pytest.mark.parametrize("real", [False, True])
 @pytest.mark.parametrize("name", ["px4-nuttx", "ardupilot5"])
 def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tmp_path: Path) -> None:
-    """Both FatFs and NuttX write it when another one is needed, or the file is closed."""
+    """FatFs and NuttX write that sector when they need another one, or close the file."""
     (tmp_path / "fs" / "microsd").mkdir(parents=True)
     tree = DirectoryTree(tmp_path) if real else small_tree()
     storage = Storage(tree, PROFILES[name], random.Random(3))

@@ -111,7 +111,7 @@ def test_a_server_at_work_gets_the_slowest_one_s_time() -> None:
 
 
 def test_but_a_checksum_that_most_would_have_is_asked_for_before() -> None:
-    """Nothing of it is done again: the same seq has the answer replayed."""
+    """The server does no work again: it replays its answer to the same seq."""
     timers = learned(OPEN, 0.012)
     assert waits(timers, work(6.0), 3) == pytest.approx([0.9, 1.35, 3.375])
     assert timers.wait(work(0.0), 0.0) == pytest.approx(0.3)

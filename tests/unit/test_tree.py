@@ -11,8 +11,8 @@ import trio
 
 from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
-from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.cache.temporary import Kind, TemporaryName, new_owner
 from mavftpfs.cache.tree import Stat, Tree
 from mavftpfs.protocol.payload import Opcode, Payload, crc32
 from mavftpfs.shared.errors import (
@@ -196,7 +196,7 @@ async def test_a_listing_that_is_always_raced_is_given_up_on(here: Rig, tree: Tr
 async def test_a_tree_that_is_only_read_shows_what_others_left(here: Rig) -> None:
     """Names like those of temporary files, too: there may be nothing else left of a file."""
     tree = here.mount(read_only=True)
-    left = Reserved(new_owner(Random(1)), Kind.NEW, b"sss", b"a.txt").name
+    left = TemporaryName(new_owner(Random(1)), Kind.NEW, b"sss", b"a.txt").name
     for name in (left, b".a.txt.swp"):
         here.put(b"/fs/microsd/" + name, b"left")
         assert await read_file(tree, b"/fs/microsd/" + name) == b"left"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.reserved import is_reserved
+from mavftpfs.cache.temporary import is_temporary
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import MavftpfsError
 from tests.support.matrix.operations import IN_PLACE, Call, D, Model, State, allowed, in_place
@@ -26,7 +26,7 @@ def on_card(here: Rig) -> State:
 
 def visible(here: Rig) -> State:
     """Return what is in the directory on the card under names that programs see."""
-    return {name: data for name, data in on_card(here).items() if not is_reserved(name)}
+    return {name: data for name, data in on_card(here).items() if not is_temporary(name)}
 
 
 @dataclass

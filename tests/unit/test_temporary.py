@@ -1,4 +1,4 @@
-"""Reserved names: their form, where they fit, and what is done with what an interruption left."""
+"""TemporaryName names: their form, where they fit, and what is done with what an interruption left."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.repair import NAMELESS_FOR, SAME_FOR, due_in
-from mavftpfs.cache.reserved import (
+from mavftpfs.cache.temporary import (
     Kind,
-    OwnNames,
-    Reserved,
+    TemporaryName,
+    TemporaryNames,
     fits_rename,
-    is_reserved,
+    is_temporary,
     new_owner,
     parse,
 )
@@ -26,9 +26,9 @@ names = st.binary(min_size=1, max_size=60).filter(usable_name)
 
 @given(kind=st.sampled_from(Kind), target=st.none() | names, seed=st.integers())
 def test_names_read_back(kind: Kind, target: bytes | None, seed: int) -> None:
-    reserved = Reserved(new_owner(Random(seed)), kind, b"abc", target)
-    assert parse(reserved.name) == reserved
-    assert is_reserved(reserved.name)
+    temporary = TemporaryName(new_owner(Random(seed)), kind, b"abc", target)
+    assert parse(temporary.name) == temporary
+    assert is_temporary(temporary.name)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
     parent, name = split(path)
     above = len(parent.rstrip(b"/"))
     try:
-        new, old = (OwnNames(b"abcd", Random(seed)).beside(path, kind) for kind in (Kind.NEW, Kind.OLD))
+        new, old = (TemporaryNames(b"abcd", Random(seed)).beside(path, kind) for kind in (Kind.NEW, Kind.OLD))
     except PathTooLong:
         assert above + len(path) > 218
         return
@@ -66,7 +66,7 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
 
 
 def test_names_do_not_repeat() -> None:
-    namer = OwnNames(b"abcd", Random(5))
+    namer = TemporaryNames(b"abcd", Random(5))
     assert len({namer.beside(b"/a/b", Kind.NEW) for _ in range(5000)}) == 5000
 
 
@@ -86,6 +86,6 @@ def test_names_do_not_repeat() -> None:
 def test_when_a_temporary_name_is_repaired(
     owner: bytes, kind: Kind, target_there: bool, age: float, due: bool
 ) -> None:
-    name = parse(Reserved(owner, kind, b"abc", b"file").name)
+    name = parse(TemporaryName(owner, kind, b"abc", b"file").name)
     assert name is not None
     assert (due_in(name, b"ourselv", target_there=target_there, age=age) <= 0.0) == due

@@ -34,7 +34,7 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{7}|[a-z2-7]{4})([no])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_TEMPORARY = re.compile(rb"\.mavftpfs-([a-z2-7]{7}|[a-z2-7]{4})([no])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
 _OWNER_LENGTH = 7
 
@@ -47,8 +47,8 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Reserved:
-    """A reserved name's parts; target: the name it belongs to, None where the name does not tell it."""
+class TemporaryName:
+    """A temporary name's parts; target: the name it belongs to, None where the name does not tell it."""
 
     owner: bytes
     kind: Kind
@@ -62,32 +62,32 @@ class Reserved:
         return short if self.target is None else short + b"-" + self.target
 
 
-def is_reserved(name: bytes) -> bool:
-    """Return whether a name is reserved, so that no program sees it."""
-    return _RESERVED.fullmatch(name) is not None
+def is_temporary(name: bytes) -> bool:
+    """Return whether a name is temporary, so that no program sees it."""
+    return _TEMPORARY.fullmatch(name) is not None
 
 
 def require_not_ours(path: bytes) -> None:
-    """Raise NotSupported for a path whose name is reserved."""
-    if is_reserved(split(path)[1]):
+    """Raise NotSupported for a path whose name is temporary."""
+    if is_temporary(split(path)[1]):
         raise NotSupported(f"names that begin like {path!r} are for replacing files")
 
 
 def require_writable(path: bytes) -> None:
-    """Raise NotSupported for a reserved name, PathTooLong where none fits beside the path."""
+    """Raise NotSupported for a temporary name, PathTooLong where none fits beside the path."""
     require_not_ours(path)
-    shortest = Reserved(b"o" * _OWNER_LENGTH, Kind.NEW, b"sss").name
+    shortest = TemporaryName(b"o" * _OWNER_LENGTH, Kind.NEW, b"sss").name
     if not fits_rename(join(split(path)[0], shortest), path):
         raise PathTooLong(f"{path!r} is too long for a temporary name beside it")
 
 
-def parse(name: bytes) -> Reserved | None:
-    """Return the parts of a reserved name, None for any other name."""
-    match = _RESERVED.fullmatch(name)
+def parse(name: bytes) -> TemporaryName | None:
+    """Return the parts of a temporary name, None for any other name."""
+    match = _TEMPORARY.fullmatch(name)
     if match is None:
         return None
     owner, kind, serial, target = match.groups()
-    return Reserved(owner, Kind(kind), serial, target)
+    return TemporaryName(owner, Kind(kind), serial, target)
 
 
 def new_owner(rng: Random) -> bytes:
@@ -100,7 +100,7 @@ def fits_rename(old: bytes, new: bytes) -> bool:
     return len(wire_path(old)) + 1 + len(wire_path(new)) <= RENAME_ROOM
 
 
-class OwnNames:
+class TemporaryNames:
     """The temporary names of this mount. None repeats before it made 32,768 of them.
 
     Attributes:
@@ -131,7 +131,7 @@ class OwnNames:
         """Return whether repair is to leave a name alone."""
         return self.needed.get(path, -inf) > now
 
-    def target_of(self, path: bytes, name: Reserved) -> bytes | None:
+    def target_of(self, path: bytes, name: TemporaryName) -> bytes | None:
         """Return the path of which an old file is, None if that is not known."""
         if path in self.targets:
             return self.targets[path]
@@ -148,7 +148,7 @@ class OwnNames:
         serial = bytes((_ALPHABET[number >> 10], _ALPHABET[number >> 5 & 31], _ALPHABET[number & 31]))
         parent, name = split(target)
         for told in (name, None) if kind is Kind.OLD else (None,):
-            ours = Reserved(self.owner, kind, serial, told).name
+            ours = TemporaryName(self.owner, kind, serial, told).name
             path = join(parent, ours)
             if len(ours) <= MAX_NAME and len(path) <= MAX_WIRE_PATH and fits_rename(path, target):
                 return path
