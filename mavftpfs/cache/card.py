@@ -20,8 +20,8 @@ import trio
 from mavftpfs.cache.attributes import SECOND
 from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.directories import Directories, Directory
-from mavftpfs.cache.entries import Entry, Folder
 from mavftpfs.cache.file import File
+from mavftpfs.cache.items import Folder, Item
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
@@ -133,7 +133,7 @@ class Card:
     def files_below(self, path: bytes) -> Iterator[File]:
         """Yield the file of a path, or all files below it."""
         entry = self.root.find(path)
-        below: list[Entry] = [] if entry is None else [entry]
+        below: list[Item] = [] if entry is None else [entry]
         if isinstance(entry, Folder):
             below += entry.walk()
         for one in below:

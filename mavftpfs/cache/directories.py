@@ -34,9 +34,9 @@ from math import inf
 import trio
 
 from mavftpfs.cache.attributes import tidy
-from mavftpfs.cache.entries import Directory as Directory
-from mavftpfs.cache.entries import Folder
-from mavftpfs.cache.entries import Sweep as Sweep
+from mavftpfs.cache.items import Directory as Directory
+from mavftpfs.cache.items import Folder
+from mavftpfs.cache.items import Sweep as Sweep
 from mavftpfs.cache.options import DIR_TIMEOUT, CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight

@@ -30,7 +30,7 @@ import trio
 
 from mavftpfs.cache.blocks import NEVER, BlockCache, Blocks
 from mavftpfs.cache.content import Content
-from mavftpfs.cache.entries import Entry, Folder
+from mavftpfs.cache.items import Folder, Item
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import FileBusy, FileChanged, LocalProtocolError, MavftpfsError, WriteFailed
@@ -105,7 +105,7 @@ class Attempt:
         return not self.sending.invalidated and in_place == self.in_place
 
 
-class File(Entry):
+class File(Item):
     """One file.
 
     Attributes:

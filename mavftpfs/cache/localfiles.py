@@ -13,7 +13,7 @@ from fnmatch import translate
 from re import compile as compile_pattern
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.cache.entries import Entry, Folder
+from mavftpfs.cache.items import Folder, Item
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.source import Opening, Source
 from mavftpfs.shared.errors import AlreadyExists, NoSpace, NotADirectory, NotFound, NotSupported
@@ -31,7 +31,7 @@ learn whether the disk cuts names short."""
 _PATTERN = compile_pattern("|".join(map(translate, NAMES)).encode())
 
 
-class LocalFile(Entry):
+class LocalFile(Item):
     """A file in memory.
 
     Attributes:

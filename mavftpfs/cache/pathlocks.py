@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import trio
 
-from mavftpfs.cache.entries import Entry
+from mavftpfs.cache.items import Item
 from mavftpfs.shared.errors import RequestTimeout
 
 SLACK = 5.0
@@ -72,7 +72,7 @@ class PathLocks:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
 
     @asynccontextmanager
-    async def steady(self, file: Entry, *, lasting: bool = False) -> AsyncIterator[bytes]:
+    async def steady(self, file: Item, *, lasting: bool = False) -> AsyncIterator[bytes]:
         """Keep the path of a file, and those above it, unchanged for a body that opens or delivers the file.
 
         Yields the path, which may have changed before the body begins. lasting: see hold.

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.entries import Directory, Folder, Sweep
+from mavftpfs.cache.items import Directory, Folder, Sweep
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join

@@ -12,8 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from mavftpfs.cache.blocks import BlockCache, Blocks
 from mavftpfs.cache.content import Content
-from mavftpfs.cache.entries import Folder
 from mavftpfs.cache.file import TRANSITIONS, Event, File, State
+from mavftpfs.cache.items import Folder
 from mavftpfs.cache.spool import Spool
 from mavftpfs.shared.errors import FileChanged, LocalProtocolError, WriteFailed
 from mavftpfs.shared.sending import AHEAD, SendBuffer

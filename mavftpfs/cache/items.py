@@ -1,7 +1,7 @@
 """The vehicle's directories and files as a tree of objects. Layer: cache; pure.
 
-An entry knows its folder and its name, and computes its path from them. A rename moves one object, and all
-that is below it moves with it, so no table has to follow. An entry exists while there is something to
+An item knows its folder and its name, and computes its path from them. A rename moves one object, and all
+that is below it moves with it, so no table has to follow. An item exists while there is something to
 remember of it: a listing, an open file, cached bytes.
 
 A file that was removed, or that another one was renamed over, keeps its folder and its last name, for
@@ -76,7 +76,7 @@ class Sweep:
     void: bool = False
 
 
-class Entry:
+class Item:
     """A name in a folder: a Folder, or one of the kinds of files."""
 
     __slots__ = ("folder", "name")
@@ -87,12 +87,12 @@ class Entry:
 
     @property
     def path(self) -> bytes:
-        """The vehicle's path; the last one, if the entry lost its name."""
+        """The vehicle's path; the last one, if the item lost its name."""
         return self.name if self.folder is None else join(self.folder.path, self.name)
 
     @property
     def has_name(self) -> bool:
-        """Whether the entry is what its folder knows by this name."""
+        """Whether the item is what its folder knows by this name."""
         return self.folder is None or self.folder.children.get(self.name) is self
 
     def lose_name(self) -> None:
@@ -101,17 +101,17 @@ class Entry:
             del self.folder.children[self.name]
 
     def move(self, folder: Folder, name: bytes) -> None:
-        """Get another name; an entry that has it loses it."""
+        """Get another name; an item that has it loses it."""
         self.lose_name()
         self.folder, self.name = folder, name
         folder.children[name] = self
 
 
-class Folder(Entry):
+class Folder(Item):
     """A directory.
 
     Attributes:
-        children: the entries in it, by name. listing: what it remembered of it, None if it was not
+        children: the items in it, by name. listing: what it remembered of it, None if it was not
         listed, or that was forgotten. sweep: the listing that is under way. times: mtimes that users
         set.
     """
@@ -120,21 +120,21 @@ class Folder(Entry):
 
     def __init__(self, folder: Folder | None = None, name: bytes = b"/") -> None:
         super().__init__(folder, name)
-        self.children: dict[bytes, Entry] = {}
+        self.children: dict[bytes, Item] = {}
         self.listing: Directory | None = None
         self.sweep: Sweep | None = None
         self.times = Times()
 
-    def find(self, path: bytes) -> Entry | None:
+    def find(self, path: bytes) -> Item | None:
         """Return what a path below this folder, which is the root, names."""
-        entry: Entry = self
+        item: Item = self
         for part in path.split(b"/"):
             if part:
-                child = entry.children.get(part) if isinstance(entry, Folder) else None
+                child = item.children.get(part) if isinstance(item, Folder) else None
                 if child is None:
                     return None
-                entry = child
-        return entry
+                item = child
+        return item
 
     def find_folder(self, path: bytes) -> Folder | None:
         """As find, but None for a file."""
@@ -159,8 +159,8 @@ class Folder(Entry):
         parent, name = split(path)
         return self.need(parent), name
 
-    def walk(self) -> Iterator[Entry]:
-        """Yield all entries below this one; changing the tree meanwhile is harmless."""
+    def walk(self) -> Iterator[Item]:
+        """Yield all items below this one; changing the tree meanwhile is harmless."""
         for child in list(self.children.values()):
             yield child
             if isinstance(child, Folder):
