@@ -181,7 +181,7 @@ class Card:
         it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
         file.lose_name()
-        self.names.settle(file)  # nothing of it is to be placed
+        self.names.settle(file)  # nothing of it is to be committed
         file.content.on_unneeded()
         file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
         self.throttle.waiting.unpark_all()

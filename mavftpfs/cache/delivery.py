@@ -1,4 +1,4 @@
-"""Delivers files: sends each one, verifies it, and places it under its name. Layer: cache.
+"""Delivers files: sends each one, verifies it, and commits it under its name. Layer: cache.
 
 `deliver` returns when the vehicle has the file, verified (promise 2), or when the file is not wanted.
 Otherwise it raises the reason. Bytes that are not delivered stay held, and the next call goes on with them.
@@ -6,13 +6,13 @@ During a delivery no program changes the file (`File.lock`), so the verified byt
 
 There is one way to the card (`_send`): fetch the bytes of the old file that stay (`writing.make_whole`), send
 the whole file to a temporary file (`uploads.need_attempt`), verify it there, and check that others left the
-name alone (`_compare_and_look`), rename it into place (`_place`). If the ACK of the rename proves too little,
-the file is compared under its name (`_compare_again`). A card that cannot rename gets the file under its own
-name. If placing a file was interrupted (`File.unsure`), the delivery first finds out what has the name
-(`look`).
+name alone (`_compare_and_look`), rename it into place (`_commit`). If the ACK of the rename proves too
+little, the file is compared under its name (`_compare_again`). A card that cannot rename gets the file under
+its own name. If the commit of a file was interrupted (`File.unsure`), the delivery first finds out what has
+the name (`look`).
 
 A delivery that is cancelled or fails keeps its attempt if the error may pass (`uploads.PASSING`), so that the
-next delivery sends only the missing bytes. A placing that began is finished even if the caller is cancelled.
+next delivery sends only the missing bytes. A commit that began is finished even if the caller is cancelled.
 The comparison after it may be cancelled: then the file stays unsure.
 """
 
@@ -131,7 +131,7 @@ async def _try(card: Card, file: File) -> None:
 
 
 async def _send(card: Card, file: File) -> None:
-    """Send the whole file, compare it, and place it."""
+    """Send the whole file, compare it, and commit it."""
     uploads.require_deliverable(card, file)  # before anything is fetched for it
     await writing.make_whole(card, file)
     attempt = await uploads.need_attempt(card, file)
@@ -146,23 +146,23 @@ async def _send(card: Card, file: File) -> None:
         file.attempt = None
         await attempt.upload.end()
         if not attempt.in_place:
-            await _place(card, file, attempt, sent)
+            await _commit(card, file, attempt, sent)
     if not attempt.in_place:
         await _compare_again(card, file, attempt, sent)
         card.names.settle(file)
     on_delivered(card, file, sent)
 
 
-async def _place(card: Card, file: File, attempt: Attempt, sent: Known) -> None:
+async def _commit(card: Card, file: File, attempt: Attempt, sent: Known) -> None:
     """Rename what was sent and verified into place.
 
     Raises:
-        As Names.place.
+        As Names.commit.
     """
     card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, file.size))
     file.blocks.close_reader()
     try:
-        await card.names.place(file, attempt.path, sent)
+        await card.names.commit(file, attempt.path, sent)
     except OutcomeUnknown:
         raise
     except MavftpfsError:
@@ -209,7 +209,7 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
         elif (unproven or attempt.upload.made_twice) and await card.names.size(path) != file.size:
             raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
     except VerificationFailed:
-        # The placed file is spoilt, so the next delivery may replace it, whatever it has become.
+        # The committed file is spoilt, so the next delivery may replace it, whatever it has become.
         file.base, file.content.base_limit = Known(file.size), 0
         if unproven:
             await card.names.learn_rename_works(path)
@@ -218,7 +218,7 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
 
 
 async def look(card: Card, file: File) -> None:
-    """If the placing of a file was interrupted, find out what has its name, and give a missing name its file.
+    """If the commit of a file was interrupted, find out what has its name, and give a missing name its file.
     The caller has the file's lock.
 
     Raises:
@@ -235,7 +235,7 @@ async def look(card: Card, file: File) -> None:
 
 
 async def look_at_all(card: Card) -> float:
-    """Look at all files whose placing was interrupted, unless a delivery or a change of the name does; return
+    """Look at all files whose commit was interrupted, unless a delivery or a change of the name does; return
     in how many seconds that is to be done again, infinite if it is not."""
     again = inf
     for file in list(card.live):
@@ -264,7 +264,7 @@ def on_delivered(card: Card, file: File, sent: Known) -> None:
     crc32 = sent.crc32
     if crc32 is None and file.size <= card.options.verify_max:
         crc32 = file.crc32()
-    file.on(Event.PLACED)
+    file.on(Event.COMMITTED)
     file.base, file.unsure = Known(file.size, crc32=crc32), None
     file.fresh_at = card.clock()
     file.prove(file.fresh_at)

@@ -7,12 +7,12 @@ handles of a file share them. TRANSITIONS is the table of the states.
     DIRTY    the vehicle lacks some of the content: the changes are pending
     STALE    others replaced the vehicle's file. With pending changes the file keeps its name here until a
              program empties or removes it, but its deliveries fail; otherwise it lost the name
-    BROKEN   a program was told that a write failed, so nothing of the file is ever placed; it lost its name
+    BROKEN   a program was told that a write failed, so no byte of the file is committed; it lost its name
 
 `base` and `content.base_limit` say what may be replaced: without a base the name has to be free. Of a base no
 byte of which stays, whatever has the name by then is replaced. Any other base must still be there.
 
-Two facts stand beside the state. `unsure`: what this mount was placing under the name when an interruption
+Two facts stand beside the state. `unsure`: what this mount was committing under the name when an interruption
 hid the outcome; `looking` finds it out. `proven_at`: when the vehicle last proved that it has the base. That
 proof is void if it is older than the file's last opening on the vehicle, or than the mount's epoch (`card`).
 
@@ -51,14 +51,14 @@ class Event(Enum):
     """An event in the life of a file.
 
     CHANGED: a program made it, wrote or truncated it. EMPTIED: a program truncated it to nothing, so the base
-    does not matter. PLACED: the vehicle has all of it under its name, verified. REPLACED: others replaced the
-    vehicle's file, and bytes of that matter. FAILED: a write was answered with an error after others had been
-    taken.
+    does not matter. COMMITTED: the vehicle has all of it under its name, verified. REPLACED: others replaced
+    the vehicle's file, and bytes of that matter. FAILED: a write was answered with an error after others had
+    been taken.
     """
 
     CHANGED = "changed"
     EMPTIED = "emptied"
-    PLACED = "placed"
+    COMMITTED = "committed"
     REPLACED = "replaced"
     FAILED = "failed"
 
@@ -72,7 +72,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.DIRTY: {
         Event.CHANGED: State.DIRTY,
         Event.EMPTIED: State.DIRTY,
-        Event.PLACED: State.CLEAN,
+        Event.COMMITTED: State.CLEAN,
         Event.REPLACED: State.STALE,
         Event.FAILED: State.BROKEN,
     },
@@ -114,7 +114,7 @@ class File(Item):
         proven_at: when the vehicle was last seen to have that, by the caches' clock. fresh_at: when it was
             last opened or delivered, so that no byte here is older.
         attempt: the attempt to send it that is under way.
-        unsure: what this mount was placing under the name when it was interrupted.
+        unsure: what this mount was committing under the name when it was interrupted.
         changes: counts the changes of the content. failed_at: that count when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
         handles: how many are open; writers: how many of them may write. changers: the open handles that
@@ -252,11 +252,11 @@ class File(Item):
     @asynccontextmanager
     async def preempt(self, patience: float) -> AsyncIterator[None]:
         """Hold the lock while the body removes, renames or empties the file. A delivery that is under way is
-        cancelled first, and its caller begins it again later. Exception: a file that is being placed is
+        cancelled first, and its caller begins it again later. Exception: a file that is being committed is
         waited for.
 
         Raises:
-            FileBusy: the file was not placed within `patience` seconds.
+            FileBusy: the file was not committed within `patience` seconds.
         """
         self.preempting += 1
         try:

@@ -3,13 +3,13 @@
 The first that fits:
 1. The name is missing, and the verified temporary file is there: that gets the name; nothing is sent again.
 2. The name is missing, and the old file is aside: that gets its name back.
-3. The name has what was placed: that is what the vehicle has of the file, which is delivered if no program
+3. The name has what was committed: that is what the vehicle has of the file, which is delivered if no program
    changed it since.
 4. The name has what the file changes: the next delivery sends it again.
 5. The name has something else, and bytes of the base matter: the next delivery makes the file STALE.
 6. There was no base, and the name is taken: the next delivery says EEXIST.
 
-The last three are what each delivery finds out before it places a file. Renames of 1 and 2 are made in
+The last three are what each delivery finds out before it commits a file. Renames of 1 and 2 are made in
 flight, too; a checksum is asked for after the flight.
 """
 
@@ -28,7 +28,7 @@ log = logging.getLogger("mavftpfs.cache")
 
 async def look(card: Card, file: File) -> bool:
     """Find out what has the name of an unsure file, and give a missing name its file; return whether the
-    vehicle has what was placed (rules 1 and 3). Then the file stops being unsure. The caller holds the
+    vehicle has what was committed (rules 1 and 3). Then the file stops being unsure. The caller holds the
     file's lock.
 
     If nothing has the name, and nothing was left of it, the file has no base from now on.
@@ -44,11 +44,11 @@ async def look(card: Card, file: File) -> bool:
         there = directory.has(path) or await _give_name_back(card, unsure, path, directory.entries)
     except (NotFound, NotADirectory):
         there = None
-    placed = there is not None and await _is_sent(card, file, unsure, there)
+    committed = there is not None and await _is_sent(card, file, unsure, there)
     if there is None:
         file.base, file.content.base_limit = None, 0
     card.names.settle(file)
-    return placed
+    return committed
 
 
 async def _give_name_back(
@@ -73,7 +73,7 @@ async def _give_name_back(
 
 
 async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry) -> bool:
-    """Return whether a file on the vehicle is what was placed."""
+    """Return whether a file on the vehicle is what was committed."""
     sent = unsure.sent
     if there.kind is not EntryKind.FILE or there.size != sent.size:
         return False

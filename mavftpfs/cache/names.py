@@ -6,7 +6,7 @@ remove(3). On NuttX a rename moves into a directory. A rename may replace a file
 
 The session finds out whether a change happened. Here the remembered listings are updated.
 
-**How does a file get its name?** (`Names.place`) A new file is renamed to a free name, never over another
+**How does a file get its name?** (`Names.commit`) A new file is renamed to a free name, never over another
 file. An existing file is replaced by one rename where the server does that in one step. Otherwise (FAT
 refuses it, NuttX removes the target first) that takes three requests: the old file is moved aside, the new
 one gets the name, the old one is removed. After the first request the name has no file, so the second one is
@@ -305,15 +305,15 @@ class Names:
 
     # --- giving a verified file its name
 
-    async def place(self, file: File, temporary: bytes, sent: Known) -> None:
+    async def commit(self, file: File, temporary: bytes, sent: Known) -> None:
         """Give a file its name: rename its verified temporary file, over the file that has the name if it
         has a base. The caller holds the file's lock, and has looked at the name just before.
 
         From the first request on the file is `unsure`. It still is when this returns, so the caller can
-        compare the file under its name first; then it calls `settle`. sent: what is placed.
+        compare the file under its name first; then it calls `settle`. sent: what is committed.
 
         Raises:
-            OutcomeUnknown: the file stays unsure. Otherwise as rename and replace: the file was not placed.
+            OutcomeUnknown: the file stays unsure. Also as rename and replace: the file was not committed.
         """
         path = file.path
         with self._store.finishing():
@@ -331,7 +331,7 @@ class Names:
                 raise
 
     def settle(self, file: File) -> None:
-        """Note that it is known what has the name of a file. `repair` removes the rest of its placing."""
+        """Note that it is known what has the name of a file. `repair` removes what is left of its commit."""
         unsure, file.unsure = file.unsure, None
         if unsure is not None:
             own, now = self._own, self._clock()
@@ -341,7 +341,7 @@ class Names:
                     self._later.list_later(split(left)[0])
 
     async def replace(self, source: bytes, target: bytes, file: File | None = None) -> None:
-        """Rename over a file that exists. file: the unsure file that is placed.
+        """Rename over a file that exists. file: the unsure file that is committed.
 
         One rename is enough where the server never leaves the name without a file. NuttX removes the old file
         first (servers.md 9).

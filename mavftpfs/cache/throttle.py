@@ -106,7 +106,7 @@ class Throttle:
 
     async def while_full(self, file: File, deliver: Callable[[], Awaitable[None]]) -> None:
         """Run a delivery only for its error, and cancel it once bytes move again: the program is still
-        writing, so a completed delivery would place half a file.
+        writing, so a completed delivery would commit half a file.
 
         Raises:
             The error of the delivery.

@@ -1,6 +1,6 @@
-"""A file whose placing was interrupted. Layer: cache; pure.
+"""A file whose commit was interrupted. Layer: cache; pure.
 
-Before the first request that may change a file's name, the file notes what is placed there. It is `unsure`
+Before the first request that may change a file's name, the file notes what is committed there. It is `unsure`
 until the vehicle confirmed that, or `looking` found out what has the name.
 """
 
@@ -13,11 +13,11 @@ from mavftpfs.shared.sameness import Known
 
 @dataclass(frozen=True, slots=True)
 class Unsure:
-    """The placing of a file under its name that was interrupted, or is under way.
+    """The commit of a file under its name that was interrupted, or is under way.
 
     temporary: the verified temporary file. aside: the name that the old file has, or may have; None if it was
-    not moved. sent: the content that is placed. changes: the file's `changes` when that was sent. in_place:
-    no temporary file is placed, because the card may have bytes of the file under its own name.
+    not moved. sent: the content that is committed. changes: the file's `changes` when that was sent.
+    in_place: no temporary file is committed, because the card may have bytes of the file under its own name.
     """
 
     temporary: bytes

@@ -249,8 +249,8 @@ async def _fetch_step(card: Card, file: File, start: int, stop: int) -> bytes | 
 async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     """Break a file, because a program was told that a write failed after others had been taken.
 
-    Nothing of the file is placed, and the vehicle's file, if there is one, has the name again. The part that
-    was written is kept for the recovery directory. The caller has the file's lock, and the file is DIRTY.
+    No byte of the file is committed, and the vehicle's file, if there is one, has the name again. The part
+    that was written is kept for the recovery directory. The caller has the lock, and the file is DIRTY.
     """
     path, attempt = file.path, _detach(card, file)
     file.on(Event.FAILED)
@@ -293,7 +293,7 @@ async def drop(card: Card, file: File) -> None:
 
 
 def _detach(card: Card, file: File) -> Attempt | None:
-    """Note that nothing of a file is to be placed; return the attempt to send it, which the caller ends."""
+    """Note that a file is not to be committed; return the attempt to send it, which the caller ends."""
     attempt = file.attempt
     if attempt is not None:
         uploads.forget_attempt(card, file, attempt)
