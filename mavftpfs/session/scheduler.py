@@ -64,6 +64,9 @@ LONGEST_BARREN = 20.0
 """Seconds without progress after which a turn does not end before it brought something. That costs an
 interactive user a round trip, so it must be seldom."""
 
+LEAST_PAUSE = 0.1
+"""Seconds after a second lost session before a third is begun."""
+
 _KEPT = "the vehicle's only session is kept by another transfer"
 _UNANSWERED = "the vehicle did not answer while a file was to be opened"
 _OTHERS = "another client of the vehicle may have a file open, and opening one could end its transfer"
@@ -387,14 +390,16 @@ class Scheduler:
 
     def lose(self, user: SessionUser, lost: SessionLost) -> None:
         """Leave the session that its user found lost. The user tries again at once. After a second loss
-        without progress it pauses as long as its tries have failed, so each pause doubles that time."""
+        without progress it pauses as long as its tries have failed, at least LEAST_PAUSE: each pause doubles
+        that time."""
         self.server.lose(lost)
         now, cause, first = self.clock(), lost.__cause__, user.loss is None
         user.loss = cause if isinstance(cause, MavftpfsError) else lost
         if user.failing_since is None:
             user.failing_since = now
         failing = now - user.failing_since
-        user.retry_at = now if first else now + min(failing, max(0.0, self._op_deadline - failing))
+        pause = max(LEAST_PAUSE, min(failing, self._op_deadline - failing))
+        user.retry_at = now if first else now + pause
 
     @property
     def _answered_in_turn_at(self) -> float:
