@@ -99,7 +99,7 @@ def _held_lines(status: Status) -> Iterator[str]:
     for path, error in held.get("broken", {}).items():
         yield f"  write failed {path}: {error}; copy the file again ({_part_goes(status)})"
     if not files:
-        if not (status.get("read_only") or held.get("broken")):
+        if not (status.get("read_only") or held.get("broken") or status.get("state") == "unmounting"):
             yield "  nothing is pending: the vehicle has all that was written"
         return
     yield f"  pending: {count_files(files)}, {readable_size(held['bytes'])}{_waits_for(status)}"

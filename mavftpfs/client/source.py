@@ -71,5 +71,5 @@ def target_of(source: str, options: Options) -> Target:
     place = source.partition("#")[0]
     no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
     if no_device or os.path.isdir(place):
-        raise UsageError(f"no vehicle is mounted on {place}")
+        raise UsageError(f"no vehicle is mounted on {place}: mount one there, or give its link as SOURCE")
     return Target(*at_source(parse_source(source), options))
