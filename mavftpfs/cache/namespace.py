@@ -11,7 +11,7 @@ here; to read any other byte of it is ESTALE.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, nullcontext, suppress
 
 import trio
 
@@ -27,6 +27,7 @@ from mavftpfs.shared.errors import (
     FileChanged,
     InvalidMove,
     IsADirectory,
+    MavftpfsError,
     NotADirectory,
     NotFound,
     NotSupported,
@@ -147,8 +148,10 @@ def _is_only_here(card: Card, file: File | None) -> bool:
 async def _unlink(card: Card, path: bytes) -> None:
     file = card.find(path)
     if file is not None and _is_only_here(card, file):
+        with suppress(MavftpfsError):  # its temporary file is removed later then
+            await uploads.abandon(card, file)
         card.forget_broken(path)
-        await uploads.drop(card, file)
+        card.lose_name(file)
         return
     card.require_changeable()
     if file is not None:

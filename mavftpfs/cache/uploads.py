@@ -150,21 +150,11 @@ async def abandon(card: Card, file: File) -> None:
     finally:
         if attempt.in_place or not attempt.upload.may_exist:
             card.own.on_gone(attempt.path)
+        elif card.blocked:
+            card.own.release(attempt.path)
+            card.repair.list_later(split(attempt.path)[0])
         else:
             await card.names.discard(attempt.path)
-
-
-async def drop(card: Card, file: File) -> None:
-    """Take the name from a file that the vehicle never had, without a request: the repair removes its
-    temporary file. The caller has the file's lock, or holds its path alone."""
-    attempt = file.attempt
-    if attempt is not None:
-        forget_attempt(card, file, attempt)
-        card.own.release(attempt.path)
-        card.repair.list_later(split(attempt.path)[0])
-    card.lose_name(file)
-    if attempt is not None:
-        await attempt.upload.end()
 
 
 def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:

@@ -14,7 +14,7 @@ from mavftpfs.cache.texts import MAX_PROGRAM_READS, MAX_READS
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import parameters as client
 from mavftpfs.client.files import Session
-from mavftpfs.client.progress import Progress
+from mavftpfs.client.progress import Progress, followed
 from mavftpfs.client.status import Facts, snapshot
 from mavftpfs.parameters.packed import pack_upload
 from mavftpfs.parameters.text import Line, parse
@@ -626,7 +626,8 @@ async def test_300_values_over_57600_baud() -> None:
 
         async with trio.open_nursery() as nursery:
             nursery.start_soon(look)
-            await client.set_values(session, wish.changes, bar)
+            async with followed(session, bar):
+                await client.set_values(session, wish.changes, bar)
             nursery.cancel_scope.cancel()
         took = trio.current_time() - began
         assert number(here, "GAIN_299") == 299.5

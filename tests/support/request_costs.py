@@ -107,7 +107,7 @@ FIRST = Case("first append", "echo x >> f", f"{REWRITE}, crc 3, rename 1; 602 B"
 the rename did what its ACK says."""
 
 SHORT = "create 1, write 1, close 1, crc 1, rename 1; 2 B"
-LOCK = "list 2, create 1, close 1, remove 1"
+LOCK = "create 1, close 1, remove 1"
 VIM = "vim -es -u NONE -i NONE -c '%s/$/x/' -c wq f"
 TEN = "open 10, create 10, write 20, close 10, crc 10, rename 10; 3000 B"
 TWICE = f"{GIT} status --short; {GIT} status --short"
@@ -182,7 +182,7 @@ ELSEWHERE = {
 """Where a server needs something else."""
 
 
-SPARED = {"git status again": ["list 2", "list 2, create 1, close 2, remove 1"]}
+SPARED = {"git status again": ["0", "create 1, close 2, remove 1"]}
 """git removes the lock that it has just made, often before anything of it was sent. If its CreateFile is on
 the way just then, both sessions are closed that may be ours."""
 
