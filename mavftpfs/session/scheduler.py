@@ -69,7 +69,10 @@ LEAST_PAUSE = 0.1
 
 _KEPT = "the vehicle's only session is kept by another transfer"
 _UNANSWERED = "the vehicle did not answer while a file was to be opened"
-_OTHERS = "another client of the vehicle may have a file open, and opening one could end its transfer"
+_OTHERS = (
+    "another client of the vehicle, or another mavftpfs (see: mavftpfs hub), may have a file open, and "
+    "opening one could end its transfer"
+)
 
 
 class Future:
