@@ -12,8 +12,9 @@ its own name. If the commit of a file was interrupted (`File.unsure`), the deliv
 the name (`look`).
 
 A delivery that is cancelled or fails keeps its attempt if the error may pass (`uploads.PASSING`), so that the
-next delivery sends only the missing bytes. A commit that began is finished even if the caller is cancelled.
-The comparison after it may be cancelled: then the file stays unsure.
+next delivery sends only the missing bytes. Exception: if the rename fails, the verified temporary file is
+removed, and the next delivery sends all of it. A commit that began is finished even if the caller is
+cancelled. The comparison after it may be cancelled: then the file stays unsure.
 """
 
 from __future__ import annotations
@@ -294,7 +295,7 @@ async def withdraw(card: Card, file: File) -> bool | None:
 
     The file that has the name on the vehicle keeps it. Programs that have this file open keep it without a
     name. Returns whether the vehicle has all of it; None if that is not known, or if another handle writes
-    it, too.
+    it, too: then that handle delivers these bytes with its own.
     """
     with suppress(FileBusy):  # otherwise it is just getting its name
         async with file.preempt(card.options.op_deadline), card.paths.steady(file, lasting=True):

@@ -3,6 +3,8 @@
 Servers check little before they change a name. RemoveFile removes an empty directory where the server calls
 remove(3). On NuttX a rename moves into a directory. A rename may replace a file that others made (servers.md
 9, 14.34). So the vehicle is asked what has a name before the name is changed (`Directories.ask_entry`).
+Exception: a program that empties a file and writes it anew replaces whatever has the name by then; if that is
+a directory of others, it is moved aside, and gets a name back (`repair`).
 
 The session finds out whether a change happened. Here the remembered listings are updated.
 
@@ -307,7 +309,7 @@ class Names:
 
     async def commit(self, file: File, temporary: bytes, sent: Known) -> None:
         """Give a file its name: rename its verified temporary file, over the file that has the name if it
-        has a base. The caller holds the file's lock, and has looked at the name just before.
+        has a base. The caller holds the file's lock, and looked at the name just before if the base matters.
 
         From the first request on the file is `unsure`. It still is when this returns, so the caller can
         compare the file under its name first; then it calls `settle`. sent: what is committed.

@@ -140,7 +140,7 @@ async def _begin(card: Card, file: File, *, in_place: bool) -> Attempt:
 
 async def abandon(card: Card, file: File) -> None:
     """Cancel the attempt that is under way. Its temporary file is removed now, else by the repair. The caller
-    has the file's lock, or holds its path alone."""
+    has the file's lock, or holds its path alone: a delivery needs both."""
     attempt = file.attempt
     if attempt is None:
         return
