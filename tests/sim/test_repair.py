@@ -9,6 +9,7 @@ import pytest
 import trio
 
 from mavftpfs.cache import namespace, uploads
+from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FileBusy, MavftpfsError, RequestTimeout
@@ -24,6 +25,16 @@ QUICK = ConnectOptions(op_deadline=5.0)
 def torn(here: Rig) -> None:
     here.connection.store.traits.rename_works = True
     here.connection.store.traits.rename_replaces = False
+
+
+async def write_and_lose_the_link(here: Rig, tree: Tree, *, nth: int) -> None:
+    """Write the file anew; the nth rename of its commit is lost, and the link with it until the close failed."""
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=nth, drop=True)
+    with pytest.raises(MavftpfsError):
+        await file.release()
+    here.faults.cut_after(None)
 
 
 @pytest.mark.parametrize("nth", [1, 2])
@@ -57,12 +68,7 @@ async def test_a_file_unsure_in_a_directory_that_gets_another_name_is_delivered(
 
         async def and_then_another_program_writes(*args: Any) -> None:
             await deliver_below(*args)
-            file = await tree.open(FILE, write=True, truncate=True)
-            await file.write(0, NEW)
-            here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=2, drop=True)
-            with pytest.raises(MavftpfsError):
-                await file.release()
-            here.faults.cut_after(None)
+            await write_and_lose_the_link(here, tree, nth=2)
 
         monkeypatch.setattr(namespace, "_deliver_below", and_then_another_program_writes)
         with pytest.raises(FileBusy):
@@ -87,12 +93,7 @@ async def test_a_name_that_was_moved_away_does_not_come_back(monkeypatch: pytest
         async def and_then_another_program_writes(*args: Any) -> None:
             await deliver_below(*args)
             monkeypatch.setattr(card.repair, "look", not_yet)
-            file = await tree.open(FILE, write=True, truncate=True)
-            await file.write(0, NEW)
-            here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=1, drop=True)
-            with pytest.raises(MavftpfsError):
-                await file.release()
-            here.faults.cut_after(None)
+            await write_and_lose_the_link(here, tree, nth=1)
             here.faults.call_off()
             here.faults.at(Opcode.RENAME, now.set)
 
