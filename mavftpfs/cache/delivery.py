@@ -246,7 +246,7 @@ async def look_at_all(card: Card) -> float:
             again = min(again, LOOK_AGAIN)
             continue
         try:
-            async with file.lock, card.paths.steady(file):
+            async with file.lock, card.paths.steady(file):  # so that `repair` leaves the name alone, too
                 await look(card, file)
         except MavftpfsError as error:
             log.info("what has the name %r is not known yet: %s", file.path, error)

@@ -150,9 +150,6 @@ async def abandon(card: Card, file: File) -> None:
     finally:
         if attempt.in_place or not attempt.upload.may_exist:
             card.own.on_gone(attempt.path)
-        elif card.blocked:
-            card.own.release(attempt.path)
-            card.repair.list_later(split(attempt.path)[0])
         else:
             await card.names.discard(attempt.path)
 

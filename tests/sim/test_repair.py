@@ -28,7 +28,7 @@ def torn(here: Rig) -> None:
 
 
 async def write_and_lose_the_link(here: Rig, tree: Tree, *, nth: int) -> None:
-    """Write the file anew; the nth rename of its commit is lost, and the link with it until the close failed."""
+    """Write the file anew; the link is cut at the nth rename of its commit, until the close failed."""
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
     here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=nth, drop=True)
@@ -300,6 +300,8 @@ async def test_a_program_removes_what_the_vehicle_never_had(how: str) -> None:
         await tree.unlink(FILE)
         assert tree.undelivered() == []
         assert [name for name, _ in await tree.list(b"/d")] == [b"other"]
+        await trio.sleep(10)
+        assert here.count(Opcode.REMOVE_FILE) == 0  # nothing is changed in flight
         here.faults.cut_after(None)
         here.vehicle.disarm()
         await trio.sleep(100)
