@@ -4,8 +4,9 @@ Theory of operation. An operation supplies requests (`next_requests`) and receiv
 belongs to the request whose seq is one less. The engine believes it if it has the request's opcode and, where
 servers echo them, its session and offset. Other replies never reach an operation. A request is lost when a
 later one was answered and a little more than a round trip passed, or when its timer runs out (see `timers`).
-The engine then calls its operation's `on_lost`, and the operation supplies the request again. While burst
-packets arrive, timers stand still, because ArduPilot answers nothing else then (servers.md 4).
+The engine then calls its operation's `on_lost`, and the operation supplies the request again. Its place in
+the window is free as soon as the later one is answered. While burst packets arrive, timers stand still,
+because ArduPilot answers nothing else then (servers.md 4).
 
 **How many requests may be in flight?** `flow` decides how many, `pathgate` which kind, and an exclusive
 operation keeps all others back. **When does an operation end without an answer?** When it made no progress
@@ -186,6 +187,7 @@ class Engine:
             if was_lost:
                 self.flow.on_spurious()
                 self._timers.reordering.on_needless(now)
+                ledger.on_late(request)
             self._on_answers(request, 1, now)
         if op is ledger.ghost:
             if reply.opcode == Opcode.ACK:
@@ -227,15 +229,11 @@ class Engine:
         rtt = timers.sample(newest, now) if timed else None
         size = newest.size if newest.policy.bulk else MAX_DATA
         self.flow.on_replies(now, rtt, count, newest.order, ledger.order, size)
-        passed = []
-        for order, request in ledger.outstanding.items():
-            if order > newest.order:
-                break
-            if timed and request.policy.ordered:
-                passed.append(request)
-        wait = timers.passed_wait(now) if passed else 0.0
-        for request in passed:
-            request.passed = True
+        if not timed:
+            return
+        ledger.on_passed(newest)
+        wait = timers.passed_wait(now) if ledger.passed else 0.0
+        for request in list(ledger.passed.values()):
             request.timer = request.sent_at + wait
             if request.timer <= now:
                 self._lose(request, now)
@@ -313,7 +311,7 @@ class Engine:
             return True
         # An urgent one may use one slot more than bulk work: a full window must not make it wait.
         urgent = op.urgent
-        in_flight = self.in_flight - urgent
+        in_flight = self.in_flight - len(self._ledger.passed) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
         if room <= 0 and self.flow.limited and self._is_owed_nothing(op):
             op.progress(now)
@@ -384,7 +382,7 @@ class Engine:
         unheard = 0
         self._due = inf
         for request in list(self._ledger.outstanding.values()):
-            if request.timer <= now and not (request.passed or request.stale):
+            if request.timer <= now and not (request.order in self._ledger.passed or request.stale):
                 request.timer = self._overdue_at(request, now)
             if request.timer > now:
                 self._due = min(self._due, request.timer)

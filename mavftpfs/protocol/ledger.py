@@ -41,6 +41,8 @@ class Ledger:
 
     Attributes:
         outstanding: the requests in flight by the order of their transmission, oldest first, ghosts included.
+        passed: those of them that have no place in the window, and are soon lost: a later request was
+            answered, and servers answer in order; or an earlier request for the same bytes was answered late.
         order: number of the next transmission.
         find: returns the request that a reply with a seq may answer, or None.
     """
@@ -51,6 +53,7 @@ class Ledger:
         self._late: dict[int, Request] = {}  # of those, the ones that are not outstanding, oldest first
         self._sent: deque[tuple[int, int, float]] = deque(maxlen=MOST_REMEMBERED)
         self.outstanding: dict[int, Request] = {}
+        self.passed: dict[int, Request] = {}
         self.find = self._table.get
         self.ghost = Ghost()
         self.order = 0
@@ -117,7 +120,7 @@ class Ledger:
         than `after`, with its session and offset. That is stricter than `Request.fits`: where a server echoes
         less, its answers go through `Engine.receive`. The row ends where operation or time change.
         """
-        table, outstanding = self._table, self.outstanding
+        table, outstanding, passed = self._table, self.outstanding, self.passed
         request = table.get(replies[at][0])
         run: Run = []
         if request is None or request.sent_at <= after:
@@ -134,6 +137,7 @@ class Ledger:
             request.outstanding = False
             request.owed = 0
             del table[seq], outstanding[request.order]
+            passed.pop(request.order, None)
             run.append((request, data if size == MAX_DATA else data[:size]))
         return run
 
@@ -146,10 +150,26 @@ class Ledger:
             self._late.pop(request.seq + 1, None)
             self._table.pop(request.seq + 1, None)
 
+    def on_passed(self, answered: Request) -> None:
+        """Note that the requests before an answered one are passed."""
+        for order, request in self.outstanding.items():
+            if order > answered.order:
+                break
+            if request.policy.ordered:
+                self.passed[order] = request
+
+    def on_late(self, answered: Request) -> None:
+        """Note that a lost request was answered after all, so its repetitions are passed."""
+        op, opcode, offset = answered.op, answered.opcode, answered.offset
+        for order, request in self.outstanding.items():
+            if request.op is op and request.opcode == opcode and request.offset == offset:
+                self.passed[order] = request
+
     def lose(self, request: Request) -> None:
         """Note that a request stopped being outstanding; answers may still arrive."""
         request.outstanding = False
         del self.outstanding[request.order]
+        self.passed.pop(request.order, None)
         self._late[request.seq + 1] = request
         if len(self._late) > MOST_REMEMBERED:
             oldest = next(iter(self._late))

@@ -78,7 +78,6 @@ class Request:
         outstanding: the request is in flight: neither answered nor lost.
         owed: how many answers may still come, one for each transmission.
         repeated: the request went out more than once.
-        passed: a later request was answered, so this one is lost soon.
         stale: no answer will come under this seq, because the server replays another reply.
         seq, order, sent_at, timer: of the last transmission. first_sent: of the first one.
     """
@@ -94,7 +93,6 @@ class Request:
     outstanding: bool = False
     owed: int = 0
     repeated: bool = False
-    passed: bool = False
     stale: bool = False
     # Set by each transmission.
     seq: int = field(init=False)

@@ -252,14 +252,29 @@ def test_later_answers_prove_a_loss_a_moment_after_a_round_trip() -> None:
     out = sent(engine, 0.0)
     assert len(out) == 8
     engine.receive(chunk(out[1], bytes(SIZE)), 0.1)
-    assert out[0].offset not in [request.offset for request in sent(engine, 0.1)]
+    instead = sent(engine, 0.1)
+    assert len(instead) == 2  # one for the answered request, one for the passed one
+    assert out[0].offset not in [request.offset for request in instead]
     assert engine.next_deadline() == pytest.approx(0.1125)
-    engine.on_deadline(0.1126)
-    again = sent(engine, 0.1126)
+    engine.receive(chunk(out[2], bytes(SIZE)), 0.11)
+    engine.on_deadline(0.1238)
+    again = sent(engine, 0.1238)
     assert again[0].offset == out[0].offset
     assert again[0].seq != out[0].seq
     assert engine.stats.lost == 1
     assert not sink.have.covers(0, 1)
+
+
+def test_a_repetition_makes_room_when_the_first_request_is_answered_late() -> None:
+    """After a pause of 0.2 s repetitions that the card's buffer had lost kept the window full for 0.4 s."""
+    engine = make(limit=2)
+    reading(engine)
+    out = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    assert [request.offset for request in sent(engine, 1.0)] == [request.offset for request in out]
+    engine.receive(chunk(out[0], bytes(SIZE)), 1.1)
+    engine.receive(chunk(out[1], bytes(SIZE)), 1.1)
+    assert [request.offset for request in sent(engine, 1.1)] == [478, 717]
 
 
 def test_what_was_lost_often_does_not_wait_for_its_timer() -> None:
