@@ -23,6 +23,7 @@ Callers ask about a directory, or about one name in it, and say how good the ans
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
@@ -40,6 +41,7 @@ from mavftpfs.cache.items import Sweep as Sweep
 from mavftpfs.cache.options import DIR_TIMEOUT, CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
     NotADirectory,
@@ -387,10 +389,14 @@ class Directories:
                 listing = await self._store.list_directory(
                     path, known_end=None if known is None else known.end
                 )
-            except FtpNak:  # perhaps the directory is gone: its parent is listed again
+            except FtpNak as nak:  # perhaps the directory is gone: its parent is listed again
                 self.forget(path)
                 if path != ROOT:
                     self.expire(split(path)[0])
+                if (
+                    path == self._options.root and errno_for(nak) == errno.ENOENT
+                ):  # `_list` looked at no parent
+                    raise NotFound(f"{path!r} does not exist") from nak
                 raise
             finally:
                 self.end(sweep)
