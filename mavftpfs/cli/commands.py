@@ -16,7 +16,7 @@ from mavftpfs.cli import report
 from mavftpfs.cli.drawing import changing_line
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours, vehicles_below
-from mavftpfs.client.mounts import PATIENCE, Status, all_statuses, socket_of, statuses_at
+from mavftpfs.client.mounts import PATIENCE, Status, all_statuses, mounts_on, socket_of, statuses_at
 from mavftpfs.client.options import at_source, split_words
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon, places
@@ -55,6 +55,7 @@ def mount(args: argparse.Namespace) -> int:
     work = partial(_serve, args, options, spec, place)
     if args.member:
         return work(_report_failure)
+    mounts_on(spec)  # raises if a mount of 0.2 has the link
     if args.foreground or args.debug:
         return work(_report_in_foreground)
     for line in options.gone:  # printed, because in the background only the log would show them

@@ -388,7 +388,7 @@ async def find_mount(spec: LinkSpec, options: Options) -> Status | None:
     """
     look = partial(mounts_on, spec)
     for status in await trio.to_thread.run_sync(look, abandon_on_cancel=True):
-        if not status.get("problem") and is_wanted(status, options):
+        if is_wanted(status, options):
             require_usable(status, status["mountpoint"])
             return status
     return None

@@ -219,20 +219,29 @@ def network_namespace() -> str:
 
 def has_link(status: Status, spec: LinkSpec) -> bool:
     """Return whether the mount with this status is of one vehicle and has that link. A port belongs to a
-    network namespace."""
-    with suppress(MavftpfsError, KeyError):  # the mount does not answer, or is of an older version
-        return (
-            "members" not in status
-            and status["network_namespace"] == network_namespace()
-            and same_link(parse_source(status["source"]), spec)
+    network namespace; a mount of 0.2 does not name its own, and its socket is seen only there."""
+    if "version" not in status or "members" in status:  # the mount does not answer, or is of several
+        return False
+    here = network_namespace()
+    with suppress(MavftpfsError):
+        return status.get("network_namespace", here) == here and same_link(
+            parse_source(status["source"]), spec
         )
     return False
 
 
 def mounts_on(spec: LinkSpec) -> list[Status]:
     """Return the status of each mount of one vehicle that has a link, as far as other users' mounts show
-    it."""
-    return [status for status in _of_mounts(STATUS_PATIENCE) if has_link(status, spec)]
+    it.
+
+    Raises:
+        LinkClosed: one of them is of a version that reports too little; the text says what to do.
+    """
+    found = [status for status in _of_mounts(STATUS_PATIENCE) if has_link(status, spec)]
+    for status in found:
+        if status.get("problem"):
+            require_usable(status, status["mountpoint"])
+    return found
 
 
 def is_wanted(status: Status, options: Options) -> bool:

@@ -45,7 +45,7 @@ async def scan(target: Target, show: Callable[[Component], None]) -> list[Compon
         return _shown(await _by_mount(target.mount[0]), show)
     assert target.spec is not None
     mounted = await trio.to_thread.run_sync(mounts_on, target.spec, abandon_on_cancel=True)
-    found = _shown(_of_mounts([status for status in mounted if not status.get("problem")]), show)
+    found = _shown(_of_mounts(mounted), show)
     async with opened(target.spec, target.options) as link:
         async for entry in _others(link, target, {(one["system"], one["component"]) for one in found}):
             found += _shown([entry], show)

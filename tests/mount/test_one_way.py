@@ -57,6 +57,7 @@ SCRIPT: list[list[str]] = [
         ["ls", "SRC", "/f/x"],
         ["ls", "SRC#/d"],
         ["ls", "SRC#/f"],
+        ["ls", "SRC#/nothing"],
     ),
     *(
         ["cat", "SRC", "/d/a"],
@@ -459,3 +460,22 @@ def test_a_mount_of_another_version_is_named_in_a_line_and_asked_and_ended(
     assert "PX4 1/1" in command("status", mount.path)[0]
     command("umount", mount.path)
     mount.process = None
+
+
+def test_a_mount_of_0_2_is_named_in_a_line(field: Field, card: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its status lacks facts; its link is in use, which without this line looks like a ground station's."""
+    mount, other = field.mount(field.sim(card).source), field.local("other")
+    monkeypatch.setattr("mavftpfs.client.mounts._OF_ONE_VEHICLE", frozenset(("of a later version",)))
+    for words in (
+        ["ls", str(mount.path)],
+        ["ls", mount.source],
+        ["scan", mount.source],
+        ["-f", mount.source],
+    ):
+        with redirect_stderr(io.StringIO()) as line:
+            assert main.main([*words, *([str(other)] if words[0] == "-f" else [])]) == ExitCode.NO_VEHICLE
+        assert re.fullmatch(
+            f"mavftpfs: the mount on {mount.path}: its program is of version .*, this one of .*: "
+            "unmount it, and mount it again\n",
+            line.getvalue(),
+        )
