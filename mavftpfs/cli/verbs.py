@@ -28,7 +28,7 @@ from mavftpfs.client import download, logs, names, upload
 from mavftpfs.client.connect import open_sinks
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target
-from mavftpfs.client.progress import Progress, followed
+from mavftpfs.client.progress import Progress, followed, waits_told
 from mavftpfs.client.recover import Left, put_back
 from mavftpfs.client.selection import Selection, parse_date
 from mavftpfs.client.several import ON_COMMAND_LINE
@@ -113,12 +113,13 @@ def with_session(
 
 @asynccontextmanager
 async def one_vehicle(target: Target, *, writing: bool) -> AsyncIterator[Session]:
-    """Give the vehicle's files to a command; print a note if the user may have meant another vehicle.
+    """Give the vehicle's files to a command; print a note if the user may have meant another vehicle, and the
+    reason if it waits.
 
     Raises:
         UsageError: with `writing`, if the user may have. Also as Target.session.
     """
-    async with target.session(writing=writing) as session:
+    async with target.session(writing=writing) as session, waits_told(session, say):
         if writing:
             await session.require_changeable(ON_COMMAND_LINE)
             yield session

@@ -86,6 +86,34 @@ class Progress:
         return (self.total - self.done) / self.rate if self.rate else None
 
 
+WAIT_SHOWN = 2.0
+"""Seconds of waiting after which a person learns the reason."""
+_REASONS = {
+    "client": "waiting: another FTP client may have a file open on the vehicle",
+    "session": "waiting: the vehicle has to close a file that an earlier client left open, within 14 s",
+}
+
+
+@asynccontextmanager
+async def waits_told(session: Session, tell: Callable[[str], None]) -> AsyncIterator[None]:
+    """Print during the body, once for each reason, why requests wait."""
+
+    async def watch() -> None:
+        since: dict[str | None, float] = {}
+        reasons = dict(_REASONS)
+        while reasons:
+            with suppress(LinkError):  # if the mount is gone, the body gets the error
+                now, reason = trio.current_time(), (await session.status())["link"].get("waits_for")
+                since = {reason: since.get(reason, now)}
+                if reason in reasons and now - since[reason] >= WAIT_SHOWN:
+                    tell(reasons.pop(reason))
+            await trio.sleep(LOOK_PERIOD)
+
+    async with plain_nursery() as nursery:
+        nursery.start_soon(watch)
+        yield
+
+
 LOOK_PERIOD = 0.25
 """Seconds between two looks at the vehicle and the upload."""
 

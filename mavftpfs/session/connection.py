@@ -187,6 +187,7 @@ class Connection:
                 "rtt": self.engine.rtt,
                 "loss": round(self.engine.flow.loss, 4),
                 "other_ftp_client": self.vehicle.another_client_heard(now),
+                "waits_for": self.scheduler.waits_for,
                 "received_bytes": link.stats.received_bytes,
                 "sent_bytes": link.stats.sent_bytes,
                 "requests": stats.requests,

@@ -166,6 +166,11 @@ class Driver:
         self._silent_until = max(self._silent_until, self._clock() + seconds)
         await trio.sleep(seconds)
 
+    @property
+    def silent(self) -> bool:
+        """Whether `be_silent` holds back requests now."""
+        return self._clock() < self._silent_until
+
     def kick(self) -> None:
         """Send the requests that may go out now, and call `on_finished` of operations that ended. Call this
         after anything that may have given the engine work."""

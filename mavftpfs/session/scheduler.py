@@ -418,6 +418,14 @@ class Scheduler:
         """Assert that the caller has no turn, because it would wait for itself, or keep others waiting."""
         assert self.holder is None or self.holder.task is not trio.lowlevel.current_task(), "not in a turn"
 
+    @property
+    def waits_for(self) -> str | None:
+        """What holds requests up now: "client", another one that may have a file open; "session", which an
+        earlier client left open; None: neither."""
+        if (self._queue or self.server.held_up) and self.clock() < self.server.others_until:
+            return "client"
+        return "session" if self._driver.silent else None
+
     def waiting(self, now: float) -> list[SessionUser]:
         """Return the users that need more than readahead, and could use the session now."""
         return [user for user in self._queue if user.waiting_since is not None and self._may_use(user, now)]

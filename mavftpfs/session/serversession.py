@@ -126,6 +126,7 @@ class ServerSession:
         read before it, and not long before, may be another file's.
         quarantine: of names that were changed.
         others: other clients of this server.
+        held_up: the number of requests without a session that wait for other clients.
         on_reads_distrusted: called whenever the epoch was raised.
         changed: where tasks park until turns, open files or the wishes of users change.
     """
@@ -153,6 +154,7 @@ class ServerSession:
         self.epoch = self._distrusted_at = -inf
         self.quarantine = Quarantine()
         self.others = OtherClients(rng)
+        self.held_up = 0
         self.on_reads_distrusted: Callable[[], None] = lambda: None
         self._asked_sessions_at = -inf
         self.changed = trio.lowlevel.ParkingLot()
@@ -424,10 +426,14 @@ class ServerSession:
         Raises:
             SessionBusy: see `busy_at`.
         """
-        while (now := self.clock()) < self.others_until:
-            if now >= self.busy_at(since):
-                raise SessionBusy(_IN_USE)
-            await self.sleep(min(self.others_until, self.busy_at(since)) - now)
+        self.held_up += 1
+        try:
+            while (now := self.clock()) < self.others_until:
+                if now >= self.busy_at(since):
+                    raise SessionBusy(_IN_USE)
+                await self.sleep(min(self.others_until, self.busy_at(since)) - now)
+        finally:
+            self.held_up -= 1
 
     # --- closing
 

@@ -6,15 +6,21 @@ The clock of a reader or an upload goes on across its turns, and what others do 
 from __future__ import annotations
 
 from collections.abc import Awaitable
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import trio
 
+from mavftpfs.client.connect import Attached
+from mavftpfs.client.files import session_of
+from mavftpfs.client.progress import waits_told
+from mavftpfs.client.watcher import Watcher
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.session.scheduler import MAYBE_OPEN_CLOSE
 from mavftpfs.shared.errors import MavftpfsError, RequestTimeout
+from mavftpfs.shared.options import Options
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.latecomers import come_again
@@ -219,3 +225,34 @@ async def test_a_low_limit_does_not_hide_that_one_request_is_not_answered() -> N
         here.faults.ignore(Opcode.CREATE_DIRECTORY)
         assert await ended(here.connection.store.make_directory(b"/d/x")) < LATEST + 4.0
         reader.close()
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
+async def test_a_command_says_why_it_waits(profile: str) -> None:
+    """ArduPilot refuses even listings while another client has a file open."""
+    async with rig(
+        profile, {b"/d/f": DATA, b"/d/theirs": DATA}, options=replace(DEFAULTS, patient=True)
+    ) as here:
+        tree, connection = here.mount(), here.connection
+        session = session_of(Attached(connection, tree, Watcher(connection.status, writing=False)), Options())
+        told: list[tuple[float, str]] = []
+        here.another_asks(Opcode.OPEN_FILE_RO, path(profile, "theirs"))
+        async with trio.open_nursery() as nursery:
+
+            async def keep_it() -> None:
+                for _ in range(10):
+                    here.another_asks(Opcode.READ_FILE)
+                    await trio.sleep(1.0)
+                here.another_asks(Opcode.TERMINATE_SESSION)
+
+            nursery.start_soon(keep_it)
+            await trio.sleep(0.5)
+            began = trio.current_time()
+            async with waits_told(session, lambda line: told.append((trio.current_time() - began, line))):
+                await tree.crc32(b"/d/f")
+                file = await tree.open(b"/d/f")
+                assert bytes(await file.read(0, len(DATA))) == DATA
+        [(after, line)] = told
+        assert line == "waiting: another FTP client may have a file open on the vehicle"
+        assert 2.0 <= after < 3.0
+        assert trio.current_time() - began > 8.0
