@@ -1,9 +1,10 @@
 """Files whose names never reach the vehicle: swap files, locks. Layer: cache.
 
 Editors make such files beside the files they work on; patterns know their names. They live in memory, within
-a limit, and only this mount shows them. Directories with such names cannot be made: a trash directory would
-be lost with the mount, and a file manager that finds none offers to delete instead. A rename between a local
-name and the vehicle is EXDEV, as between two disks, so programs copy.
+a limit, and only this mount shows them. What already has such a name on the card stays the card's.
+Directories with such names cannot be made: a trash directory would be lost with the mount, and a file manager
+that finds none offers to delete instead. A rename between a local name and the vehicle is EXDEV, as between
+two disks, so programs copy.
 """
 
 from __future__ import annotations
@@ -80,6 +81,10 @@ class LocalFiles(Source):
         if not isinstance(file, LocalFile):
             raise NotFound(f"{path!r} does not exist")
         return file
+
+    def has(self, path: bytes) -> bool:
+        """Return whether a path is that of a local file."""
+        return isinstance(self._root.find(path), LocalFile)
 
     def below(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return the local files in one of the vehicle's directories."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -36,6 +37,7 @@ from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
     ListingIncomplete,
+    MavftpfsError,
     NotADirectory,
     ReadOnly,
 )
@@ -104,7 +106,11 @@ class Tree:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
         remote = self._remote(path)
-        return await self._source(remote).stat(remote)
+        return await (await self._source(remote)).stat(remote)
+
+    async def is_local(self, path: bytes) -> bool:
+        """Return whether a path is, or would be, that of a file that never reaches the vehicle."""
+        return await self._is_local(self._remote(path))
 
     def is_only_read(self, path: bytes) -> bool:
         """Return whether nothing can ever be written at a path, whatever the vehicle does: below `@`
@@ -139,7 +145,7 @@ class Tree:
                 if texts.directory == remote:
                     files += await texts.list(self._options.probe_time)
             return files
-        if self._is_local(remote) and self._local.find(remote):
+        if await self._is_local(remote) and self._local.find(remote):
             raise NotADirectory(f"{remote!r} is not a directory")
         directory, shown = await self._files.list(remote)
         if remote == ROOT:
@@ -171,7 +177,8 @@ class Tree:
         """
         remote, write = self._remote(path), write or truncate
         how = Opening(write, truncate, append, program)
-        source = self._changing(remote) if write and not self._texts_of(remote) else self._source(remote)
+        changes = write and not self._texts_of(remote)
+        source = await (self._changing(remote) if changes else self._source(remote))
         return await source.open(remote, how)
 
     async def crc32(self, path: bytes) -> int:
@@ -183,7 +190,7 @@ class Tree:
             NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
         """
         remote = self._remote(path)
-        return await self._source(remote).crc32(remote)
+        return await (await self._source(remote)).crc32(remote)
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
 
@@ -200,7 +207,7 @@ class Tree:
         for texts in self._texts:
             if split(remote)[0] == texts.directory:
                 texts.note_other_file(program())
-        return await self._changing(remote).create(remote, exclusive=exclusive)
+        return await (await self._changing(remote)).create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file, and deliver it, unless another program has it open for writing.
@@ -209,7 +216,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
         """
         remote = self._remote(path)
-        await self._changing(remote).truncate(remote, size)
+        await (await self._changing(remote)).truncate(remote, size)
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime (nanoseconds since 1970 UTC) until the file changes; no server can keep it.
@@ -219,7 +226,7 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
-        source = self._texts_of(remote) or self._changing(remote)
+        source = self._texts_of(remote) or await self._changing(remote)
         await source.set_times(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
@@ -229,7 +236,7 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, NotSupported (a local name), Armed, PathTooLong.
         """
         remote = self._remote(path)
-        await self._changing(remote).mkdir(remote)
+        await (await self._changing(remote)).mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -238,7 +245,7 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        source = self._changing(remote)
+        source = await self._changing(remote)
         if self._local.below(remote):
             raise DirectoryNotEmpty(f"{remote!r} holds local files")
         await source.rmdir(remote)
@@ -250,7 +257,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        await self._changing(remote).unlink(remote)
+        await (await self._changing(remote)).unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -260,8 +267,8 @@ class Tree:
             CrossDevice, PathTooLong, Armed, FileBusy.
         """
         source, target = self._remote(old), self._remote(new)
-        mover = self._changing(source)
-        if self._changing(target) is not mover:
+        mover = await self._changing(source)
+        if await self._changing(target) is not mover:
             raise CrossDevice(f"one of {source!r} and {target!r} is not on the vehicle")
         await mover.rename(source, target, noreplace=noreplace)
 
@@ -344,22 +351,30 @@ class Tree:
 
     # --- inside: which source
 
-    def _source(self, remote: bytes) -> Source:
+    async def _source(self, remote: bytes) -> Source:
         """Return where the file of a path comes from."""
         if is_snapshot(remote):
             return self._texts_of(remote) or self._virtual
-        return self._local if self._is_local(remote) else self._files
+        return self._local if await self._is_local(remote) else self._files
 
-    def _changing(self, remote: bytes) -> Source:
+    async def _changing(self, remote: bytes) -> Source:
         """Return the source of a path that is to be changed. Raises ReadOnly."""
         if self._options.read_only:
             raise ReadOnly(readonly.by_option(remote))
         if is_virtual(remote):
             raise ReadOnly(readonly.virtual(remote))
-        return self._source(remote)
+        return await self._source(remote)
 
-    def _is_local(self, remote: bytes) -> bool:
-        return self._options.local and not self._options.read_only and stays_local(remote)
+    async def _is_local(self, remote: bytes) -> bool:
+        """Return whether a path is, or would be, a local file's. What the card has under such a name, as from
+        a computer in which the card was, is the card's."""
+        if not self._options.local or self._options.read_only or not stays_local(remote):
+            return False
+        if not self._local.has(remote):
+            with suppress(MavftpfsError):
+                await self._files.stat(remote)
+                return False
+        return True
 
     def _texts_of(self, remote: bytes) -> Texts[Any] | None:
         return next((texts for texts in self._texts if texts.owns(remote)), None)
@@ -367,7 +382,7 @@ class Tree:
     async def _require_directory_of(self, remote: bytes) -> None:
         """Raise NotFound or NotADirectory unless the directory of a path exists, here or there."""
         parent = split(remote)[0]
-        if (await self._source(parent).stat(parent)).kind is not EntryKind.DIRECTORY:
+        if (await (await self._source(parent)).stat(parent)).kind is not EntryKind.DIRECTORY:
             raise NotADirectory(f"{parent!r} is not a directory")
 
     # --- inside

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import trio
 
-from mavftpfs.cache.localfiles import stays_local
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import wire
@@ -231,8 +230,8 @@ class _Connection:
 
     async def _rename(self, request: Message) -> Message:
         old, new = _path(request), _path(request, "new")
-        if stays_local(old) != stays_local(new):
-            _require_on_card(new)
+        if not await self._tree.is_local(old):
+            await self._require_on_card(new)
         await self._tree.rename(old, new)
         self._mount.operations.note_renamed(old, new)
         await _told(self._kernel.forget_name, old, new)
@@ -251,7 +250,7 @@ class _Connection:
         write, truncate, append = (bool(request.facts.get(name)) for name in ("write", "truncate", "append"))
         self._writes = write or truncate
         if self._writes:
-            _require_on_card(path)
+            await self._require_on_card(path)
         await _told(self._kernel.forget_pages, path)
         self.file = await self._tree.open(path, write=write, truncate=truncate, append=append)
         if truncate:
@@ -261,7 +260,7 @@ class _Connection:
     async def _create(self, request: Message) -> Message:
         path = self._begin(request)
         self._writes = True
-        _require_on_card(path)
+        await self._require_on_card(path)
         self.file = await self._tree.create(path, exclusive=bool(request.facts.get("exclusive")))
         await _told(self._kernel.forget_name, path)
         return Message({})
@@ -311,6 +310,18 @@ class _Connection:
         self.file = None
         return Message({"there": there})
 
+    async def _require_on_card(self, path: bytes) -> None:
+        """Check that a name is not one of those that a mount keeps in memory.
+
+        Raises:
+            NotSupported.
+        """
+        if await self._tree.is_local(path):
+            raise NotSupported(
+                f"{name_text(path)} would stay in the mount's memory, as editors' swap files do, and never "
+                "reach the card; choose another name, or unmount first"
+            )
+
     def _open_file(self) -> OpenFile:
         if self.file is None:
             raise LocalProtocolError("no file is open in this connection")
@@ -334,19 +345,6 @@ class _Connection:
 async def _told(tell: Callable[..., Awaitable[None]], *paths: bytes) -> None:
     with trio.move_on_after(TELLING_TIME, shield=True):  # what was opened meanwhile is not lost by a cancel
         await tell(*paths)
-
-
-def _require_on_card(path: bytes) -> None:
-    """Check that a name is not one of those that a mount keeps in memory.
-
-    Raises:
-        NotSupported.
-    """
-    if stays_local(path):
-        raise NotSupported(
-            f"{name_text(path)} would stay in the mount's memory, as editors' swap files do, and never reach "
-            "the card; choose another name, or unmount first"
-        )
 
 
 def _path(request: Message, name: str = "path") -> bytes:

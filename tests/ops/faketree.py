@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import trio
 
+from mavftpfs.cache.localfiles import stays_local
 from mavftpfs.cache.tree import Stat
 from mavftpfs.client.files import Files, Session
 from mavftpfs.protocol.payload import crc32
@@ -120,6 +121,9 @@ class FakeTree:
 
     def is_only_read(self, path: bytes) -> bool:
         return path.startswith(b"/@")
+
+    async def is_local(self, path: bytes) -> bool:
+        return stays_local(path) and path not in self.files
 
     def kind_of(self, path: bytes) -> EntryKind:
         if path in self.files:

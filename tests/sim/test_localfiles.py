@@ -14,7 +14,8 @@ from mavftpfs.shared.errors import (
     NotFound,
     NotSupported,
 )
-from tests.support.rigs import Rig, card, read_file, write_file
+from mavftpfs.shared.model import EntryKind
+from tests.support.rigs import Rig, card, read_file, rig, write_file
 
 FILE = b"/scripts/hover.lua"
 SWAP = b"/scripts/.hover.lua.swp"
@@ -52,6 +53,26 @@ async def test_names_that_look_alike_are_the_vehicles(here: Rig, tree: Tree) -> 
 async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
     await write_file(here.mount(local=False), SWAP, b"data")
     assert here.data(SWAP) == b"data"
+
+
+async def test_what_the_card_has_under_such_a_name_is_the_cards() -> None:
+    """As from a Mac, or from a file manager, in whose computer the card was."""
+    there = {b"/d/._f": b"of a Mac", b"/.Trash-1000/files/old": b"removed", b"/d/f": b"f"}
+    async with rig("ardupilot5", there) as here:
+        tree = here.mount()
+        assert await read_file(tree, b"/d/._f") == b"of a Mac"
+        assert (await tree.stat(b"/.Trash-1000")).kind is EntryKind.DIRECTORY
+        assert await read_file(tree, b"/.Trash-1000/files/old") == b"removed"
+        await write_file(tree, b"/d/._f", b"new")
+        assert here.data(b"/d/._f") == b"new"
+        await tree.rename(b"/d/._f", b"/d/g")
+        await write_file(tree, b"/d/._f", b"here")
+        assert b"/d/._f" not in here.files()
+        await tree.unlink(b"/d/._f")
+        await tree.unlink(b"/.Trash-1000/files/old")
+        await tree.rmdir(b"/.Trash-1000/files")
+        await tree.rmdir(b"/.Trash-1000")
+        assert here.files() == {b"/d/f": b"f", b"/d/g": b"new"}
 
 
 async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
