@@ -7,6 +7,8 @@ from collections.abc import Mapping
 
 import shtab
 
+from mavftpfs.shared.options import TABLE
+
 SHELLS = ("bash", "zsh", "fish")
 
 _PLACES = {
@@ -22,6 +24,8 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
         for action in each._actions:
             if action.dest in _PLACES:
                 action.complete = _PLACES[action.dest]  # type: ignore[attr-defined]  # shtab's way
+            if action.dest == "options":  # only here, because a parser that knows choices refuses `ro,uid=7`
+                action.choices = [name for row in TABLE.rows for name in row.names]
     script: str = shtab.complete(parser, shell)
     # Where shtab has no answer, files are offered: `SOURCE MOUNTPOINT` needs no command, and bash cuts a
     # SOURCE at its colons, so that shtab loses count.

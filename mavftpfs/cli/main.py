@@ -207,7 +207,7 @@ def _add_mount_arguments(parser: Parser) -> None:
     )
 
 
-def _add_options(parser: Parser) -> None:
+def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", dest="options", metavar="OPT,...", action="append", default=[], help="mount options"
     )
@@ -513,6 +513,7 @@ def whole_parser() -> argparse.ArgumentParser:
     """Return one parser of all commands, for their documentation."""
     parser = argparse.ArgumentParser("mavftpfs", description=_DESCRIPTION)
     parser.add_argument("-V", "--version", action="store_true", help="print the version")
+    _add_options(parser)
     commands_of = parser.add_subparsers(metavar="COMMAND")
     for name, (make_parser, _) in _COMMANDS.items():
         made = make_parser(name)

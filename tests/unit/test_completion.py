@@ -77,6 +77,8 @@ def by_fish(script: Path, folder: Path, line: str) -> str:
         ("mavftpfs mn", ["mnt"]),
         (f"mavftpfs sync {SOURCE} lo", ["logs one"]),
         (f"mavftpfs sync {SOURCE} --verify ", ["auto", "all", "none"]),
+        ("mavftpfs -o ", ["ro", "cache_size=", "target_system="]),
+        (f"mavftpfs ls {SOURCE} -o conn", ["connect_timeout="]),
         (f"mavftpfs put {SOURCE} no", ["note"]),
         (f"mavftpfs {SOURCE} mn", ["mnt"]),
         ("mavftpfs umount mn", ["mnt"]),
