@@ -92,7 +92,7 @@ class Background:
                 if file in card.broken:
                     card.broken.remove(file)
                 file.content.forget()
-                file.state, file.unsure = State.CLEAN, None
+                file.state, file.unsure, file.has_part = State.CLEAN, None, False
         if failed is not None and not kept:
             raise failed
         return kept

@@ -182,6 +182,7 @@ class Card:
         self.closed.pop(file, None)
         file.lose_name()
         self.names.settle(file)  # nothing of it is to be committed
+        file.has_part = False
         file.content.on_unneeded()
         file.blocks.end(FileChanged(f"what was {file.path!r} is gone from the vehicle"))
         self.throttle.waiting.unpark_all()

@@ -29,7 +29,7 @@ import trio
 
 from mavftpfs.cache import looking, uploads, verify, writing
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Attempt, Event, File, State
+from mavftpfs.cache.file import Attempt, Event, File, Replaces, State
 from mavftpfs.cache.together import together
 from mavftpfs.cache.uploads import PASSING
 from mavftpfs.shared.errors import (
@@ -100,7 +100,7 @@ async def _deliver(card: Card, file: File) -> None:
         card.require_disarmed()
         await _try(card, file)
     except MavftpfsError as error:
-        if isinstance(error, FileChanged) and file.state is State.DIRTY and file.base_matters:
+        if isinstance(error, FileChanged) and file.state is State.DIRTY and file.replaces is Replaces.BASE:
             file.on(Event.REPLACED)
         _note_failure(card, file, error)
         raise
@@ -226,7 +226,7 @@ async def look(card: Card, file: File) -> None:
         As looking.look: the file stays unsure.
     """
     unsure = file.unsure
-    if unsure is None or unsure.in_place:
+    if unsure is None:
         return
     if await looking.look(card, file):
         if file.changed_since(unsure):
@@ -240,7 +240,7 @@ async def look_at_all(card: Card) -> float:
     in how many seconds that is to be done again, infinite if it is not."""
     again = inf
     for file in list(card.live):
-        if file.unsure is None or file.unsure.in_place:
+        if file.unsure is None:
             continue
         if file.lock.locked():
             again = min(again, LOOK_AGAIN)
@@ -266,7 +266,7 @@ def on_delivered(card: Card, file: File, sent: Known) -> None:
     if crc32 is None and file.size <= card.options.verify_max:
         crc32 = file.crc32()
     file.on(Event.COMMITTED)
-    file.base, file.unsure = Known(file.size, crc32=crc32), None
+    file.base, file.unsure, file.has_part = Known(file.size, crc32=crc32), None, False
     file.fresh_at = card.clock()
     file.prove(file.fresh_at)
     file.error, file.start_after = None, float("-inf")

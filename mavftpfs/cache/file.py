@@ -9,8 +9,8 @@ handles of a file share them. TRANSITIONS is the table of the states.
              program empties or removes it, but its deliveries fail; otherwise it lost the name
     BROKEN   a program was told that a write failed, so no byte of the file is committed; it lost its name
 
-`base` and `content.base_limit` say what may be replaced: without a base the name has to be free. Of a base no
-byte of which stays, whatever has the name by then is replaced. Any other base must still be there.
+What a delivery may replace under the file's name follows from the base, and from how many bytes of it are to
+stay; see Replaces.
 
 Two facts stand beside the state. `unsure`: what this mount was committing under the name when an interruption
 hid the outcome; `looking` finds it out. `proven_at`: when the vehicle last proved that it has the base. That
@@ -85,6 +85,21 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
 """State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""
 
 
+class Replaces(Enum):
+    """What a delivery of a file may replace under its name.
+
+    NOTHING: the vehicle has no file of it, so the name has to be free. BASE: bytes of the base stay, so the
+    base has to be there still. ANYTHING: a program emptied the file, so no byte of the base stays, and
+    whatever has the name by then is replaced. PART: the card cannot rename, and may have a part of the file
+    under its own name.
+    """
+
+    NOTHING = "nothing"
+    BASE = "base"
+    ANYTHING = "anything"
+    PART = "part"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
     """One try to send a file.
@@ -115,6 +130,7 @@ class File(Item):
             last opened or delivered, so that no byte here is older.
         attempt: the attempt to send it that is under way.
         unsure: what this mount was committing under the name when it was interrupted.
+        has_part: an attempt in place ended, so the card may have a part of the file under its name.
         changes: counts the changes of the content. failed_at: that count when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
         handles: how many are open; writers: how many of them may write. changers: the open handles that
@@ -139,6 +155,7 @@ class File(Item):
         self.handles = self.writers = 0
         self.changers: set[object] = set()
         self.unsure: Unsure | None = None
+        self.has_part = False
         self.changes = 0
         self.failed_at = -1
         self.verified = ""
@@ -177,15 +194,19 @@ class File(Item):
         return self.is_local and self.base is None and not self.content.size
 
     @property
-    def base_matters(self) -> bool:
-        """Whether bytes of the vehicle's file are to stay, so that no other file may be replaced by it."""
-        return self.content.base_limit > 0
+    def replaces(self) -> Replaces:
+        """What a delivery of it may replace."""
+        if self.lies_in_place:
+            return Replaces.PART
+        if self.base is None:
+            return Replaces.NOTHING
+        return Replaces.BASE if self.content.base_limit else Replaces.ANYTHING
 
     @property
     def lies_in_place(self) -> bool:
         """Whether an upload to the file's own name (on a card that cannot rename) may have begun to write:
         the name may have a part of the new file, or an old file that this mount emptied."""
-        if self.unsure is not None and self.unsure.in_place:
+        if self.has_part:
             return True
         if self.attempt is None or not self.attempt.in_place:
             return False

@@ -315,17 +315,20 @@ class Names:
         compare the file under its name first; then it calls `settle`. sent: what is committed.
 
         Raises:
-            OutcomeUnknown: the file stays unsure. Also as rename and replace: the file was not committed.
+            OutcomeUnknown: the file stays unsure. Otherwise as rename: the old file has its name again, and
+            the file was not committed.
         """
         path = file.path
         with self._store.finishing():
-            file.unsure = Unsure(temporary, None, sent, file.changes)
+            unsure = file.unsure = Unsure(temporary, None, sent, file.changes)
             self._later.look_later()
             try:
                 if file.base is None:
                     await self.rename(temporary, path)
-                else:
-                    await self.replace(temporary, path, file)
+                elif not await self._replaces_at_once(temporary, path):
+                    aside = await self._need_aside(path)
+                    file.unsure = dataclasses.replace(unsure, aside=aside)
+                    await self._swap(temporary, path, aside)
             except OutcomeUnknown:
                 raise
             except MavftpfsError:
@@ -342,51 +345,26 @@ class Names:
                     own.release(left)
                     self._later.list_later(split(left)[0])
 
-    async def replace(self, source: bytes, target: bytes, file: File | None = None) -> None:
-        """Rename over a file that exists. file: the unsure file that is committed.
-
-        One rename is enough where the server never leaves the name without a file. NuttX removes the old file
-        first (servers.md 9).
+    async def move_over(self, source: bytes, target: bytes) -> None:
+        """Rename a file over another one, for a program.
 
         Raises:
-            NotSupported: the server does not rename. Otherwise as VehicleStore.rename. After an error the old
-            file has its name again. After OutcomeUnknown that is not known, and `repair` looks.
+            NotSupported: the server does not rename. OutcomeUnknown: the target may have no file; `repair`
+            gives it one. Otherwise as rename: the target has its file again.
         """
-        traits = self._store.traits
-        if traits.rename_replaces is not False and not is_on_nuttx(target):
-            try:
-                await self.rename(source, target, over=True)
-                traits.rename_replaces = True
-                return
-            except FtpNak as nak:
-                if errno_for(nak) in _HONEST:
-                    raise
-                if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
-                    traits.rename_replaces = False
-                log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        own, shown = self._own, self._directories.entry(target)
-        if shown is not None:  # otherwise one of them may be the only copy of the old file
-            await self._remove_asides(target)
-        aside = own.need(target, Kind.OLD)
-        if file is not None and file.unsure is not None:
-            file.unsure = dataclasses.replace(file.unsure, aside=aside)
-        with self._store.finishing():
-            try:
-                moved = await self._swap(source, target, aside)
-            except OutcomeUnknown:
-                if file is None:
-                    if shown is not None:
-                        self._directories.put(target, shown)  # programs go on seeing it
-                    own.release(aside)
-                    self._later.list_later(split(target)[0])
-                raise
-            except MavftpfsError:
-                own.on_gone(aside)
-                raise
-            if moved:
-                await self._leave_or_remove(aside)
-            else:
-                own.on_gone(aside)
+        shown = self._directories.entry(target)
+        if await self._replaces_at_once(source, target):
+            return
+        aside = await self._need_aside(target)
+        try:
+            with self._store.finishing():
+                await self._swap(source, target, aside)
+        except OutcomeUnknown:
+            if shown is not None:
+                self._directories.put(target, shown)  # programs go on seeing it
+            self._own.release(aside)
+            self._later.list_later(split(target)[0])
+            raise
 
     def on_unknown(self, *paths: bytes) -> None:
         """Note that it is not known what these names are after an interrupted change: the listings and files
@@ -397,30 +375,69 @@ class Names:
 
     # --- inside
 
-    async def _remove_asides(self, path: bytes) -> None:
-        """Remove the old files of a name that earlier changes left aside. Otherwise repair could give one of
-        them the name while the next change leaves it without a file.
+    async def _replaces_at_once(self, source: bytes, target: bytes) -> bool:
+        """Rename over a file by one request; return False where that takes three.
+
+        One is enough where the server never leaves the name without a file. NuttX removes the old file first
+        (servers.md 9).
+
+        Raises:
+            As rename.
+        """
+        traits = self._store.traits
+        if traits.rename_replaces is False or is_on_nuttx(target):
+            return False
+        try:
+            await self.rename(source, target, over=True)
+        except FtpNak as nak:
+            if errno_for(nak) in _HONEST:
+                raise
+            if nak.code == NakCode.FILE_EXISTS:  # an errno may be of an older failure
+                traits.rename_replaces = False
+            log.debug("the server does not rename %r over %r: %s", source, target, nak)
+            return False
+        traits.rename_replaces = True
+        return True
+
+    async def _need_aside(self, path: bytes) -> bytes:
+        """Return a new name for the old file of a name.
+
+        The old files that earlier changes left aside are removed first. Otherwise repair could give one of
+        them the name while the next change leaves it without a file. Exception: if nothing has the name, one
+        of them may be the only copy of the old file.
 
         Raises:
             As VehicleStore.
         """
-        for aside in [aside for aside, target in self._own.targets.items() if target == path]:
-            await self.remove_if_there(aside)
+        own = self._own
+        if self._directories.entry(path) is not None:
+            for aside in [aside for aside, target in own.targets.items() if target == path]:
+                await self.remove_if_there(aside)
+        return own.need(path, Kind.OLD)
 
-    async def _swap(self, source: bytes, target: bytes, aside: bytes) -> bool:
-        """Move the old file aside, and give the new one its name. Returns False if the old file was gone.
+    async def _swap(self, source: bytes, target: bytes, aside: bytes) -> None:
+        """Move the old file aside, give the new one its name, and remove the old one.
 
         Raises:
-            OutcomeUnknown: the target may have no file. Otherwise as replace.
+            OutcomeUnknown: the target may have no file. Otherwise as rename: it has the old one again.
         """
-        moved = await self._move_aside(target, aside)
         try:
-            await self.rename(source, target, completes=moved)
-        except MavftpfsError as error:
-            if moved and not isinstance(error, OutcomeUnknown):
-                await self._undo(aside, target)
+            moved = await self._move_aside(target, aside)
+            try:
+                await self.rename(source, target, completes=moved)
+            except MavftpfsError as error:
+                if moved and not isinstance(error, OutcomeUnknown):
+                    await self._undo(aside, target)
+                raise
+        except OutcomeUnknown:
             raise
-        return moved
+        except MavftpfsError:
+            self._own.on_gone(aside)
+            raise
+        if moved:
+            await self._leave_or_remove(aside)
+        else:
+            self._own.on_gone(aside)
 
     async def _move_aside(self, target: bytes, aside: bytes, *, again: bool = True) -> bool:
         """Move the old file aside; return False if there is none.

@@ -17,7 +17,7 @@ import trio
 
 from mavftpfs.cache import delivery, reading, uploads
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Event, File
+from mavftpfs.cache.file import Event, File, Replaces
 from mavftpfs.cache.temporary import fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -142,7 +142,8 @@ def _is_only_here(card: Card, file: File | None) -> bool:
     a card that cannot rename may."""
     if file is None or not file.is_local or card.store.traits.rename_works is False:
         return False
-    return file.base is None and file.unsure is None and (file.attempt is None or not file.attempt.in_place)
+    in_place = file.has_part or (file.attempt is not None and file.attempt.in_place)
+    return file.base is None and file.unsure is None and not in_place
 
 
 async def _unlink(card: Card, path: bytes) -> None:
@@ -161,7 +162,7 @@ async def _unlink(card: Card, path: bytes) -> None:
     there = entry is not None and entry.kind is EntryKind.FILE
     if file is not None and file.is_local:
         # A file of others under its name is not to be removed, if it holds something.
-        ours = file.base is not None or file.lies_in_place
+        ours = file.replaces is not Replaces.NOTHING
         there &= ours or (entry is not None and not entry.size)
     elif entry is None:
         card.forget_broken(path)
@@ -230,7 +231,7 @@ async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> 
     displaced = card.find(new)
     for file in list(card.files_below(old)):
         await uploads.abandon(card, file)
-        if file.unsure is not None and not file.unsure.in_place:
+        if file.unsure is not None:
             raise FileBusy(f"{file.path!r}: it is not known yet what the vehicle has there")
         if file.is_local and file.base is None:
             raise FileBusy(f"{file.path!r} is being written, and not on the vehicle yet")
@@ -243,7 +244,7 @@ async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> 
             if listed is not None and listed.kind is EntryKind.FILE:
                 if displaced is not None:
                     displaced.blocks.close_reader()
-                await card.names.replace(old, new)
+                await card.names.move_over(old, new)
             else:
                 if listed is not None:
                     await card.names.remove_directory(new)

@@ -27,7 +27,7 @@ import trio
 
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.directories import COST_FACTOR, Directory, Found
-from mavftpfs.cache.file import Event, File, State
+from mavftpfs.cache.file import Event, File, Replaces, State
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errnos import errno_for
@@ -118,7 +118,7 @@ async def _open(card: Card, file: File, entry: DirEntry) -> bool | None:
     file.in_kernel = False
     reader = await card.store.open_reader(path, blocks)
     try:
-        if reader.size < entry.size and not file.unsure:
+        if reader.size < entry.size and not file.is_local:
             entry = await _require_listed(card, path, reader.size)
     except BaseException:
         reader.close()
@@ -308,7 +308,7 @@ def _needs_proof(card: Card, file: File, *, at_end: bool) -> bool:
     between two listings. Any other read may get bytes of the next file of this name; then the read that
     reaches the end fails.
     """
-    if file.base is None or file.unsure or not file.has_name:
+    if file.base is None or not file.has_name:
         return False
     if file.proven_at >= file.blocks.opened_at and file.proven_at > card.epoch:
         return False
@@ -337,17 +337,17 @@ async def _prove(card: Card, file: File, *, at_end: bool) -> None:
         on_replaced(card, file)
     else:
         async with card.paths.steady(file) as present:
-            if present == path and not file.unsure and not _is_own(file):
+            if present == path and not _is_own(file):
                 _compare(card, file, directory)
             # else the next read compares the file under its new name
     file.require_base()
 
 
 def _is_own(file: File) -> bool:
-    """Return whether a file has pending changes and is locked, or is sent under its own name. In the first
-    case a delivery may be under way, which compares the vehicle's file itself, and may be just replacing it.
-    In the second one the vehicle has a part of the new file."""
-    return file.is_local and (file.lock.locked() or file.lies_in_place)
+    """Return whether this mount may have given the name another file: one with pending changes is locked (a
+    delivery compares the vehicle's file itself, and may be just replacing it), or its commit was interrupted,
+    or it is sent under its own name."""
+    return file.is_local and (file.lock.locked() or file.unsure is not None or file.lies_in_place)
 
 
 def _compare(card: Card, file: File, directory: Directory) -> None:
@@ -367,7 +367,7 @@ def on_listed(card: Card, path: bytes, directory: Directory) -> None:
     """Compare the open files of a directory with a new listing."""
     folder = card.root.find_folder(path)
     for file in [] if folder is None else list(folder.children.values()):
-        if not isinstance(file, File) or file not in card.live or file.base is None or file.unsure:
+        if not isinstance(file, File) or file not in card.live or file.base is None:
             continue
         is_seen = file.name in directory.entries and directory.listed_at > file.proven_at
         if is_seen and not _is_own(file):
@@ -389,7 +389,7 @@ def lose_base(card: Card, file: File) -> None:
     file.in_kernel = False
     card.tell_changed(file.path)
     file.blocks.end(FileChanged(f"{file.path!r} changed on the vehicle after it was opened"))
-    if file.state is State.DIRTY and not file.base_matters:
+    if file.state is State.DIRTY and file.replaces is not Replaces.BASE:
         return
     kept = file.undelivered
     file.on(Event.REPLACED)

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Collection
 import trio
 
 from mavftpfs.cache.blocks import RateMeter
-from mavftpfs.cache.file import File
+from mavftpfs.cache.file import File, Replaces
 from mavftpfs.cache.options import KIB, MIB
 from mavftpfs.cache.together import together
 from mavftpfs.shared.errors import FileTooLarge
@@ -71,7 +71,7 @@ class Throttle:
             FileTooLarge.
         """
         limit = self._rewritable(file)
-        if file.base_matters and size > limit:
+        if file.replaces is Replaces.BASE and size > limit:
             raise FileTooLarge(
                 f"a change of a part sends the whole file: {size} bytes, and two minutes of the link carry "
                 f"{limit}; write a new file instead"
@@ -92,7 +92,7 @@ class Throttle:
         """Return whether the writers of a file have to wait."""
         if not file.has_name or file.unacked <= LEAST:
             return False  # a file without a name is not delivered
-        if file.start_after == float("inf") or file.base_matters:
+        if file.start_after == float("inf") or file.replaces is Replaces.BASE:
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._files)
         return file.unacked > self.limit // max(streams, 1)

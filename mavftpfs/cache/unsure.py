@@ -17,11 +17,9 @@ class Unsure:
 
     temporary: the verified temporary file. aside: the name that the old file has, or may have; None if it was
     not moved. sent: the content that is committed. changes: the file's `changes` when that was sent.
-    in_place: no temporary file is committed, because the card may have bytes of the file under its own name.
     """
 
     temporary: bytes
     aside: bytes | None
     sent: Known
     changes: int
-    in_place: bool = False

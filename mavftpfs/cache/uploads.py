@@ -14,9 +14,8 @@ import trio
 
 from mavftpfs.cache import verify
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Attempt, File, State
+from mavftpfs.cache.file import Attempt, File, Replaces, State
 from mavftpfs.cache.temporary import Kind, is_temporary
-from mavftpfs.cache.unsure import Unsure
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -31,7 +30,6 @@ from mavftpfs.shared.errors import (
     SessionLost,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, split
-from mavftpfs.shared.sameness import Known
 from mavftpfs.shared.sending import SendBuffer
 
 log = logging.getLogger("mavftpfs.cache")
@@ -62,7 +60,7 @@ def require_deliverable(card: Card, file: File) -> None:
     if file.state is State.STALE:
         raise FileChanged("others replaced the file on the vehicle while it was changed here")
     in_place = card.store.traits.rename_works is False
-    if in_place and file.base is not None and not (card.options.inplace or file.lies_in_place):
+    if in_place and file.replaces in (Replaces.BASE, Replaces.ANYTHING) and not card.options.inplace:
         raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
 
 
@@ -80,8 +78,10 @@ async def push(card: Card, file: File) -> None:
             return
         file.start_after = float("inf")  # a program that changed sent bytes will do so again
     due = card.clock() >= file.start_after and not card.blocked and not file.preempting
-    if not due or file.base_matters or file.unacked < START_AT or not may_pass(file) or file.unsure:
-        return  # of a file that only changes every byte is sent again: that waits for the close
+    if not due or file.unacked < START_AT or not may_pass(file) or file.unsure:
+        return
+    if file.replaces is Replaces.BASE:  # a program changes a part, and every byte is sent: at the close
+        return
     try:
         with trio.CancelScope() as file.delivery:
             async with card.paths.steady(file, lasting=True):
@@ -160,25 +160,21 @@ def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
         # The next listing shows a part: less than this, so that nobody else seems to write it.
         card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, attempt.sending.size))
         card.directories.expire(split(attempt.path)[0])
-        file.unsure = Unsure(attempt.path, None, Known(attempt.sending.size), file.changes, in_place=True)
+        file.has_part = True
     file.attempt = None
 
 
 async def require_untouched(card: Card, file: File) -> None:
-    """Check that others left the name alone: that of a new file is free, and a base of which a part stays is
-    still the same.
+    """Check that others left the name alone, as far as that matters (`File.replaces`).
 
     Raises:
         AlreadyExists. FileChanged: others changed the base. Otherwise as Names.is_free and is_same.
     """
-    path = file.path
-    if file.lies_in_place:
-        return
-    if file.base is not None and file.base_matters:
-        if not await verify.is_same(card, path, file.base):
-            raise FileChanged(f"others changed {path!r} on the vehicle while it was changed here")
-    elif file.base is None and not await _is_free(card, path):
+    path, base = file.path, file.base
+    if file.replaces is Replaces.NOTHING and not await _is_free(card, path):
         raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
+    if file.replaces is Replaces.BASE and base is not None and not await verify.is_same(card, path, base):
+        raise FileChanged(f"others changed {path!r} on the vehicle while it was changed here")
 
 
 async def _is_free(card: Card, path: bytes) -> bool:

@@ -301,8 +301,7 @@ def _detach(card: Card, file: File) -> Attempt | None:
             card.parts.append(attempt.path)
     if file.base is None and file.lies_in_place:
         card.parts.append(file.path)
-    if not file.lies_in_place:
-        card.names.settle(file)
+    card.names.settle(file)
     return attempt
 
 
