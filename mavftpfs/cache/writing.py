@@ -282,9 +282,9 @@ async def drop(card: Card, file: File) -> None:
     The file loses its name before this waits for anything, because the caller may be cancelled.
     """
     path, attempt = file.path, _detach(card, file)
+    file.on(Event.REPLACED)
     card.lose_name(file)
     file.content.forget()
-    file.content.on_opened(0 if file.base is None else file.base.size)
     card.forget_time(path)
     card.tell_changed(path)
     card.retry_later()

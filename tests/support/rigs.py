@@ -35,6 +35,7 @@ from mavftpfs.sim.profiles import PROFILES, Family, Storage
 from mavftpfs.sim.tree import Kind, MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.faults import STATION, Faults
+from tests.support.invariants import Invariants
 from tests.support.lying import LyingServer
 from tests.support.memory import MemoryLink
 from tests.support.replies import request
@@ -90,6 +91,7 @@ class Rig:
         self.model = LinkModel(Random(seed + 1), link)
         self.link = MemoryLink(self.vehicle, self.model, is_serial=serial)
         self.invalidated: list[bytes] = []
+        self._watches: list[Invariants] = []
         self._numbers = count(30_000, 10)  # so far apart that no server takes one for the one before
         self.connection: Connection
         self.nursery: trio.Nursery
@@ -110,9 +112,16 @@ class Rig:
         killed."""
         async with connected(self.link, options, rng=Random(seed)) as self.connection:
             await self.connection.ready(30.0)
-            async with trio.open_nursery() as self.nursery:
-                yield self.connection
-                self.nursery.cancel_scope.cancel()
+            try:
+                async with trio.open_nursery() as self.nursery:
+                    yield self.connection
+                    self.nursery.cancel_scope.cancel()
+            finally:
+                watches, self._watches = self._watches, []
+                for watch in watches:
+                    trio.lowlevel.remove_instrument(watch)
+            for watch in watches:
+                watch.require_none_broken()
 
     def mount(self, *, seed: int = 1, spool: SpoolDirectory | None = None, **options: Any) -> Tree:
         """Return a tree that is told what happens to the vehicle. options: CacheOptions."""
@@ -127,6 +136,9 @@ class Rig:
             rng=Random(seed),
         )
         subscribe(self.connection, tree)
+        watch = Invariants(tree._card)
+        trio.lowlevel.add_instrument(watch)
+        self._watches.append(watch)
         return tree
 
     @asynccontextmanager
