@@ -91,7 +91,7 @@ class Background:
             else:
                 if file in card.broken:
                     card.broken.remove(file)
-                file.content.forget()
+                file.forget_content()
                 file.state, file.unsure, file.has_part = State.CLEAN, None, False
         if failed is not None and not kept:
             raise failed

@@ -152,7 +152,7 @@ class Card:
             return
         self.live.pop(file, None)
         if file.is_local or not file.has_name:
-            file.content.forget()
+            file.forget_content()
         file.blocks.close_reader()
         file.error, file.start_after = None, -inf
         if file.base is None:
@@ -166,7 +166,7 @@ class Card:
     def forget(self, file: File) -> None:
         """Forget a closed file."""
         self.closed.pop(file, None)
-        file.content.forget()
+        file.forget_content()
         file.lose_name()
         if file.folder is not None:
             file.folder.prune()
@@ -188,7 +188,7 @@ class Card:
         self.throttle.waiting.unpark_all()
         if not file.handles:
             self.live.pop(file, None)
-            file.content.forget()
+            file.forget_content()
 
     # --- broken files
 
@@ -203,7 +203,7 @@ class Card:
             self.broken.remove(file)
             file.content.on_unneeded()
             if not file.handles:
-                file.content.forget()
+                file.forget_content()
 
     @property
     def epoch(self) -> float:

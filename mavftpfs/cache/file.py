@@ -266,6 +266,12 @@ class File(Item):
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
         self.state = after
 
+    def forget_content(self) -> None:
+        """Forget every byte; an upload that is under way sends no more of them."""
+        if self.attempt is not None:
+            self.attempt.sending.on_changed(0, 0)
+        self.content.forget()
+
     def prove(self, at: float) -> None:
         """Note that the vehicle's file of this name was seen to be the base at that time."""
         self.proven_at = max(self.proven_at, at)

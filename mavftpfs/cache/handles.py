@@ -117,7 +117,7 @@ def on_closed(card: Card, file: File) -> None:
         return
     card.live.pop(file, None)
     if file not in card.broken:
-        file.content.forget()
+        file.forget_content()
 
 
 class WriteHandle(ReadHandle):

@@ -136,7 +136,7 @@ def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None
             _with_room(card, partial(file.content.write, offset, data))
         except MavftpfsError:
             if not was_local:  # otherwise later opens would not ask the vehicle
-                file.content.forget()
+                file.forget_content()
             raise
         _on_changed(card, file, offset, Event.CHANGED)
 
@@ -172,7 +172,7 @@ def _with_room(card: Card, change: Callable[[], None]) -> None:
                 raise
             file = card.broken.pop(0)
             log.warning("the part of %r is removed here, because pending changes need its room", file.path)
-            file.content.forget()
+            file.forget_content()
 
 
 def _on_changed(card: Card, file: File, start: int, event: Event) -> None:
@@ -284,7 +284,8 @@ async def drop(card: Card, file: File) -> None:
     path, attempt = file.path, _detach(card, file)
     file.on(Event.REPLACED)
     card.lose_name(file)
-    file.content.forget()
+    file.forget_content()
+    file.content.on_opened(0 if file.base is None else file.base.size)
     card.forget_time(path)
     card.tell_changed(path)
     card.retry_later()

@@ -32,6 +32,7 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     SpoolFailed,
 )
+from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, card, read_file, rig, write_file
 from tests.support.transfers import content
 
@@ -518,6 +519,20 @@ async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_
     assert tree.undelivered() == [b"/d/a"], "it stays in the spool"
     assert len(list(spool.path.glob("*.data"))) == 1
     spool.close()
+
+
+async def test_an_upload_that_is_under_way_sends_nothing_of_a_file_that_was_saved(
+    spool: SpoolDirectory, tmp_path: Path
+) -> None:
+    """A second signal ends the last delivery; the task that sends runs on until the link is closed."""
+    async with rig("px4", {FILE: OLD}, link=LinkSettings(rate=20_000.0, delay=0.01)) as here:
+        tree = here.mount(spool=spool)
+        with trio.move_on_after(3.0):
+            await write_file(tree, NEW, content(200_000))
+        assert "1 file did not reach the vehicle" in keep_the_rest(tree, tmp_path / "kept")
+        await trio.sleep(30.0)
+        assert NEW[3:] not in [entry.name for entry in here.card.entries(b"/d")]
+        spool.close()
 
 
 async def test_a_changed_file_is_made_whole_while_its_program_pauses(

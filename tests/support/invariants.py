@@ -20,8 +20,7 @@ def check_file(card: Card, file: File) -> None:
     # A file that is sent, or was, is whole, and remembered until the vehicle has it, or nobody wants it.
     if file.attempt is not None:
         assert is_live
-        assert file.is_local
-        assert content.whole or file.attempt.sending.invalidated
+        assert (file.is_local and content.whole) or not file.attempt.sending.has_more()
     if file.unsure is not None:
         assert is_live
         assert file.has_name
