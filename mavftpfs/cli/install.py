@@ -116,7 +116,7 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
     Raises:
         UsageError: a file cannot be written or removed, or users other than root could change the program
-            that all run.
+            that all run, or could not run it.
     """
     program = own_program()
     everybody = os.geteuid() == 0
@@ -150,10 +150,10 @@ def own_program() -> Path:
 
 
 def check_program(program: Path) -> None:
-    """Check that only root can change the program that root and all users run.
+    """Check that all users can run the program, and that only root can change it.
 
     Raises:
-        UsageError: another user can, or the program has no mount.mavftpfs beside it.
+        UsageError: they cannot, another user can, or the program has no mount.mavftpfs beside it.
     """
     if not program.with_name(HELPER).exists():
         raise UsageError(f"there is no {HELPER} beside {program}; run the mavftpfs of an installation")
@@ -165,6 +165,11 @@ def check_program(program: Path) -> None:
                 raise UsageError(
                     f"{path} can be changed by others than root, but root would run it; install a copy "
                     f"of its own: {FOR_ALL}"
+                )
+            if not facts.st_mode & (stat.S_IXOTH if path.is_dir() else stat.S_IROTH):
+                raise UsageError(
+                    f"{path} is closed to other users (mode {stat.S_IMODE(facts.st_mode):04o}), so they "
+                    f"could not run {program}; install a copy for all users: {FOR_ALL}"
                 )
 
 

@@ -186,3 +186,13 @@ def test_root_does_not_run_what_another_user_owns(installation: Installation, pl
     (line,) = said["error"]
     assert "can be changed by others than root" in line
     assert "PIPX_HOME" in line
+
+
+@pytest.mark.needs("namespaces", "root's Python")
+def test_root_installs_nothing_that_others_could_not_run(installation: Installation) -> None:
+    steps = ('chmod 700 "$2"', "trap 'written \"$1\" left' EXIT", '"$2/mavftpfs" install')
+    said = installation.run(*steps, code=1)
+    assert "left" not in said
+    (line,) = said["error"]
+    assert "/bin is closed to other users (mode 0700)" in line
+    assert "install a copy for all users: sudo PIPX_HOME=/opt/pipx" in line
