@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ import trio
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client.connect import Attached, attached
 from mavftpfs.client.mountpoint import is_dead, timeout_note, unmount
+from mavftpfs.client.mounts import mounts_on
 from mavftpfs.client.undelivered import recovered_directory
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.drain import drain_or_keep
@@ -28,7 +29,10 @@ from mavftpfs.mount.kernel import FuseLoop, kernel_mount, presentation
 from mavftpfs.mount.life import Life, MountRequest, State
 from mavftpfs.mount.operations import Operations
 from mavftpfs.mount.options import fuse_words
-from mavftpfs.shared.errors import ExitCode, MountFailed
+from mavftpfs.shared.errors import ExitCode, LinkClosed, MountFailed
+
+ASKING_TIME = 2.0
+"""Seconds for other mounts to report their vehicle."""
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
 """Connects to the vehicle. Its argument is called for paths whose bytes changed."""
@@ -79,15 +83,34 @@ class SingleMount(Life):
             self._status = lambda: {**vehicle.status(), "kernel": operations.counts()}
             self._files = FileServer(Served(vehicle.tree, operations, invalidator, self.facts))
             words = fuse_words(self.request.options, self.request.source)
+            others = await self._others(vehicle)
             if is_dead(self.request.mountpoint):  # below a mount of all vehicles: programs got ENOTCONN
                 unmount(self.request.mountpoint, lazy=True)
             with kernel_mount(operations, self.request.mountpoint, words, busy=lambda: invalidator.busy):
                 try:
                     self.enter(State.MOUNTED)
                     await self.start_control(nursery, self._files)
-                    await self._answer(invalidator, lambda: _together(vehicle.notice(), timeout_note()))
+                    await self._answer(
+                        invalidator, lambda: _together(vehicle.notice(), timeout_note(), others)
+                    )
                 finally:
                     invalidator.end()
+
+    async def _others(self, vehicle: Attached) -> str:
+        """Return a note that names the user's other mounts of this vehicle, or ""."""
+        own = vehicle.status()["vehicle"]
+        places = []
+        with trio.move_on_after(ASKING_TIME), suppress(LinkClosed):  # a mount may have been stopped
+            for status in await trio.to_thread.run_sync(mounts_on, self.request.spec, abandon_on_cancel=True):
+                theirs = status.get("vehicle", {})
+                if all(theirs.get(key) == own[key] for key in ("system", "component")):
+                    places.append(status["mountpoint"])
+        if not places:
+            return ""
+        return (
+            f"this vehicle is mounted on {' and '.join(places)}, too; a change through one mount may show in "
+            f"the other one 20 s later; to have only one, run: mavftpfs umount {places[0]}"
+        )
 
     @asynccontextmanager
     async def _drained(self, tree: Tree) -> AsyncIterator[None]:

@@ -55,12 +55,27 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
         abort_mount(mount.path)
 
 
-def test_a_scan_names_both_mounts_of_a_vehicle(field: Field, small_tree: Path) -> None:
+def test_a_second_mount_of_a_vehicle_and_a_scan_name_the_first(field: Field, small_tree: Path) -> None:
     source = field.sim(small_tree).source
-    first, second = field.mount(source), field.mount(source)
+    first, second = field.mount(source), field.prepare(source)
+    _, said = mavftpfs(source, second.path)
+    try:
+        _check_both_are_named(source, first.path, second.path, said)
+    finally:
+        mavftpfs("umount", second.path)
+    first.unmount()
+    assert mavftpfs(source, second.path)[1] == ""
+    mavftpfs("umount", second.path)
+
+
+def _check_both_are_named(source: str, first: Path, second: Path, said: str) -> None:
+    assert f"this vehicle is mounted on {first}, too; " in said
+    assert said.endswith(f"to have only one, run: mavftpfs umount {first}\n")
+    assert mounted_at(second)
     _, row, ftp = mavftpfs("scan", source)[0].splitlines()
     assert row.startswith("1/1 ")
-    assert all(str(mount.path) in ftp for mount in (first, second))
+    assert str(first) in ftp
+    assert str(second) in ftp
 
 
 LIMITED = """
