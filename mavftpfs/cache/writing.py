@@ -197,8 +197,9 @@ async def _fetch_when_quiet(card: Card, file: File) -> None:
         while seen != file.changes:
             seen = file.changes
             await trio.sleep(QUIET)
-        with suppress(MavftpfsError):
-            await make_whole(card, file)
+        if file.content.spooled is not None:  # otherwise it was delivered and closed meanwhile
+            with suppress(MavftpfsError):
+                await make_whole(card, file)
     finally:
         card.fetchers.discard(file)
 

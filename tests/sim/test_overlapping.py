@@ -18,6 +18,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import UNMEASURED
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.writing import QUIET
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FileChanged, FtpNak, LinkError, MavftpfsError, NotFound, RequestTimeout
@@ -66,6 +67,27 @@ async def settle(here: Rig, tree: Tree) -> None:
 
 
 # --- the release of a file
+
+
+@pytest.mark.holds("fault overlap")
+@pytest.mark.parametrize("profile", KINDS)
+async def test_a_file_that_is_read_and_changed_a_second_after_its_last_change(profile: str) -> None:
+    """The rest of a changed file is fetched when its program pauses. This one has closed it, and opened it
+    again to read."""
+    async with rig(profile, {FILE: DATA}, link=LinkSettings(delay=0.02)) as here:
+        tree = here.mount(inplace=True)
+        file = await tree.open(FILE, write=True)
+        await file.write(0, b"1")
+        changed = trio.current_time()
+        await file.flush()
+        await file.release()
+        file = await tree.open(FILE, write=True)
+        assert bytes(await file.read(0, 9)) == b"1" + DATA[1:9]
+        await trio.sleep_until(changed + QUIET + 0.01)
+        await file.write(1, b"2")
+        await file.flush()
+        await file.release()
+        assert here.data(FILE) == b"12" + DATA[2:]
 
 
 @pytest.mark.holds("fault overlap")
