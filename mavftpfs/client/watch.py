@@ -21,7 +21,7 @@ from mavftpfs.client.download import Downloads, Outcome, Reports, named
 from mavftpfs.client.fetch import Fetched, Fetcher, LocalTrouble, StillGrowing, Wanted, local_disk
 from mavftpfs.client.files import Session, Target, reading
 from mavftpfs.client.logs import SyncRequest, path_of, sync
-from mavftpfs.client.manifest import HEAD, Downloaded, Manifest
+from mavftpfs.client.manifest import HEAD, NAME, Downloaded, Manifest
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.selection import is_no_log
 from mavftpfs.client.several import ON_COMMAND_LINE
@@ -267,7 +267,9 @@ class Keeping:
             LocalTrouble: it is missing.
         """
         if not self.manifest.is_there():
-            raise LocalTrouble(f"{self.local} does not exist")
+            there = self.local.is_dir()
+            problem = f"has no {NAME}, so it is not the same disk" if there else "does not exist"
+            raise LocalTrouble(f"{self.local} {problem}")
 
     def look(self) -> None:
         """Read the manifest again, because another disk may be mounted there now.

@@ -453,7 +453,7 @@ async def test_a_disk_that_is_pulled_in_mid_transfer(tmp_path: Path) -> None:
                 await day.until("begins")
                 await trio.sleep(3.0)
                 run("umount", "-l", place)
-                await day.until("does not exist; waiting for the disk")
+                await day.until("so it is not the same disk; waiting for the disk")
                 await trio.sleep(600.0)
                 assert list(place.iterdir()) == []
                 run("mount", "--bind", disk, place)
