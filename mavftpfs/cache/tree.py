@@ -108,9 +108,9 @@ class Tree:
         remote = self._remote(path)
         return await (await self._source(remote)).stat(remote)
 
-    async def is_local(self, path: bytes) -> bool:
-        """Return whether a path is, or would be, that of a file that never reaches the vehicle."""
-        return await self._is_local(self._remote(path))
+    def is_local(self, path: bytes) -> bool:
+        """Return whether a path is that of a file in memory, which never reaches the vehicle."""
+        return self._local.has(self._remote(path))
 
     def is_only_read(self, path: bytes) -> bool:
         """Return whether nothing can ever be written at a path, whatever the vehicle does: below `@`
@@ -193,9 +193,15 @@ class Tree:
         return await (await self._source(remote)).crc32(remote)
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
+    # on_card: what is new goes to the card, whatever its name is.
 
     async def create(
-        self, path: bytes, *, exclusive: bool, program: Callable[[], Program | None] = lambda: None
+        self,
+        path: bytes,
+        *,
+        exclusive: bool,
+        program: Callable[[], Program | None] = lambda: None,
+        on_card: bool = False,
     ) -> OpenFile:
         """Make a file, or open (not empty) the one that is there, for writing. program: see open.
 
@@ -207,7 +213,7 @@ class Tree:
         for texts in self._texts:
             if split(remote)[0] == texts.directory:
                 texts.note_other_file(program())
-        return await (await self._changing(remote)).create(remote, exclusive=exclusive)
+        return await (await self._changing(remote, on_card)).create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file, and deliver it, unless another program has it open for writing.
@@ -229,14 +235,14 @@ class Tree:
         source = self._texts_of(remote) or await self._changing(remote)
         await source.set_times(remote, mtime_ns)
 
-    async def mkdir(self, path: bytes) -> None:
+    async def mkdir(self, path: bytes, *, on_card: bool = False) -> None:
         """Make a directory.
 
         Raises:
             AlreadyExists, NotFound, NotADirectory, NotSupported (a local name), Armed, PathTooLong.
         """
         remote = self._remote(path)
-        await (await self._changing(remote)).mkdir(remote)
+        await (await self._changing(remote, on_card)).mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -259,7 +265,7 @@ class Tree:
         remote = self._remote(path)
         await (await self._changing(remote)).unlink(remote)
 
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False, on_card: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
 
         Raises:
@@ -268,7 +274,7 @@ class Tree:
         """
         source, target = self._remote(old), self._remote(new)
         mover = await self._changing(source)
-        if await self._changing(target) is not mover:
+        if await self._changing(target, on_card) is not mover:
             raise CrossDevice(f"one of {source!r} and {target!r} is not on the vehicle")
         await mover.rename(source, target, noreplace=noreplace)
 
@@ -351,26 +357,28 @@ class Tree:
 
     # --- inside: which source
 
-    async def _source(self, remote: bytes) -> Source:
+    async def _source(self, remote: bytes, on_card: bool = False) -> Source:
         """Return where the file of a path comes from."""
         if is_snapshot(remote):
             return self._texts_of(remote) or self._virtual
-        return self._local if await self._is_local(remote) else self._files
+        return self._local if await self._is_local(remote, on_card) else self._files
 
-    async def _changing(self, remote: bytes) -> Source:
+    async def _changing(self, remote: bytes, on_card: bool = False) -> Source:
         """Return the source of a path that is to be changed. Raises ReadOnly."""
         if self._options.read_only:
             raise ReadOnly(readonly.by_option(remote))
         if is_virtual(remote):
             raise ReadOnly(readonly.virtual(remote))
-        return await self._source(remote)
+        return await self._source(remote, on_card)
 
-    async def _is_local(self, remote: bytes) -> bool:
+    async def _is_local(self, remote: bytes, on_card: bool = False) -> bool:
         """Return whether a path is, or would be, a local file's. What the card has under such a name, as from
         a computer in which the card was, is the card's."""
         if not self._options.local or self._options.read_only or not stays_local(remote):
             return False
         if not self._local.has(remote):
+            if on_card:
+                return False
             with suppress(MavftpfsError):
                 await self._files.stat(remote)
                 return False

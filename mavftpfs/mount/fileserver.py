@@ -216,7 +216,8 @@ class _Connection:
 
     async def _mkdir(self, request: Message) -> Message:
         path = _path(request)
-        await self._tree.mkdir(path)
+        self._require_on_card(path)
+        await self._tree.mkdir(path, on_card=True)
         await _told(self._kernel.forget_name, path)
         return Message({})
 
@@ -230,9 +231,8 @@ class _Connection:
 
     async def _rename(self, request: Message) -> Message:
         old, new = _path(request), _path(request, "new")
-        if not await self._tree.is_local(old):
-            await self._require_on_card(new)
-        await self._tree.rename(old, new)
+        self._require_on_card(new)
+        await self._tree.rename(old, new, on_card=True)
         self._mount.operations.note_renamed(old, new)
         await _told(self._kernel.forget_name, old, new)
         return Message({})
@@ -250,7 +250,7 @@ class _Connection:
         write, truncate, append = (bool(request.facts.get(name)) for name in ("write", "truncate", "append"))
         self._writes = write or truncate
         if self._writes:
-            await self._require_on_card(path)
+            self._require_on_card(path)
         await _told(self._kernel.forget_pages, path)
         self.file = await self._tree.open(path, write=write, truncate=truncate, append=append)
         if truncate:
@@ -260,8 +260,10 @@ class _Connection:
     async def _create(self, request: Message) -> Message:
         path = self._begin(request)
         self._writes = True
-        await self._require_on_card(path)
-        self.file = await self._tree.create(path, exclusive=bool(request.facts.get("exclusive")))
+        self._require_on_card(path)
+        self.file = await self._tree.create(
+            path, exclusive=bool(request.facts.get("exclusive")), on_card=True
+        )
         await _told(self._kernel.forget_name, path)
         return Message({})
 
@@ -310,16 +312,16 @@ class _Connection:
         self.file = None
         return Message({"there": there})
 
-    async def _require_on_card(self, path: bytes) -> None:
-        """Check that a name is not one of those that a mount keeps in memory.
+    def _require_on_card(self, path: bytes) -> None:
+        """Check that a program on the mount has no file in memory under that name.
 
         Raises:
             NotSupported.
         """
-        if await self._tree.is_local(path):
+        if self._tree.is_local(path):
             raise NotSupported(
-                f"{name_text(path)} would stay in the mount's memory, as editors' swap files do, and never "
-                "reach the card; choose another name, or unmount first"
+                f"{name_text(path)} is in the mount's memory, as editors' swap files are, and never reaches "
+                "the card; choose another name, or unmount first"
             )
 
     def _open_file(self) -> OpenFile:

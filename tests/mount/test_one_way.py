@@ -77,6 +77,13 @@ SCRIPT: list[list[str]] = [
     *(["put", "SRC", "IN/big", "/p"], ["put", "SRC", "IN/empty", "/p0"], ["put", "SRC", "IN/big", "/d"]),
     *(["put", "SRC", "IN/big", "/p"], ["put", "SRC", "IN/big", "/none/p"], ["put", "SRC", "IN/big", "/f/"]),
     *(["put", "-r", "SRC", "IN", "/in"], ["put", "-r", "SRC", "IN", "/in"], ["put", "SRC", "IN", "/in"]),
+    *(
+        ["put", "SRC", "IN/big", "/.x.swp"],
+        ["cat", "SRC", "/.x.swp"],
+        ["mkdir", "SRC", "/.Trash-0"],
+        ["mv", "SRC", "/.x.swp", "/.Trash-0/"],
+        ["rm", "-r", "SRC", "/.Trash-0"],
+    ),
     *(["put", "SRC", "IN/big", "/@SYS/x"], ["ls", "-l", "SRC", "/"], ["ls", "-l", "SRC", "/in"]),
     *(
         ["mkdir", "SRC", "/m"],

@@ -122,8 +122,8 @@ class FakeTree:
     def is_only_read(self, path: bytes) -> bool:
         return path.startswith(b"/@")
 
-    async def is_local(self, path: bytes) -> bool:
-        return stays_local(path) and path not in self.files
+    def is_local(self, path: bytes) -> bool:
+        return stays_local(path) and path in self.files
 
     def kind_of(self, path: bytes) -> EntryKind:
         if path in self.files:
@@ -186,7 +186,7 @@ class FakeTree:
         await self.pause("set_times", path)
         self.times[path] = mtime_ns
 
-    async def mkdir(self, path: bytes) -> None:
+    async def mkdir(self, path: bytes, *, on_card: bool = False) -> None:
         await self.pause("mkdir", path)
         self.directories.add(path)
 
@@ -198,7 +198,7 @@ class FakeTree:
         await self.pause("unlink", path)
         del self.files[path]
 
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False, on_card: bool = False) -> None:
         await self.pause("rename", old)
         if noreplace and new in self.files:
             raise AlreadyExists(f"{new!r} is there")

@@ -482,10 +482,11 @@ async def test_a_refused_change_is_no_change(tmp_path: Path) -> None:
             await files.unlink(b"/f")
         assert mount.kernel.inodes.known(b"/f") is not None
         mount.tree.error = None
-        for change in (files.create(b"/.x.swp", exclusive=True), files.rename(b"/f", b"/.f.swp")):
-            with pytest.raises(NotSupported, match="never reach the card"):
+        mount.tree.files[b"/.f.swp"] = b"of an editor on the mount"
+        for change in (files.create(b"/.f.swp", exclusive=False), files.rename(b"/f", b"/.f.swp")):
+            with pytest.raises(NotSupported, match="never reaches the card"):
                 await change
-        assert mount.tree.files == {b"/f": b"old"}
+        assert mount.tree.files == {b"/f": b"old", b"/.f.swp": b"of an editor on the mount"}
 
 
 # -- versions -------------------------------------------------------------------------------------

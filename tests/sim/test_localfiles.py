@@ -75,6 +75,16 @@ async def test_what_the_card_has_under_such_a_name_is_the_cards() -> None:
         assert here.files() == {b"/d/f": b"f", b"/d/g": b"new"}
 
 
+async def test_commands_make_files_of_such_names_on_the_card(here: Rig, tree: Tree) -> None:
+    file = await tree.create(SWAP, exclusive=True, on_card=True)
+    await file.write(0, b"put")
+    await file.release()
+    await tree.mkdir(TRASH, on_card=True)
+    await tree.rename(SWAP, TRASH + b"/f", on_card=True)
+    assert here.data(TRASH + b"/f") == b"put"
+    assert await read_file(tree, TRASH + b"/f") == b"put"
+
+
 async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
     """The two are different devices to programs, so mv(1) copies and removes."""
     await write_file(tree, SWAP, b"local")
