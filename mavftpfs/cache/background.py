@@ -10,7 +10,7 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.cache import delivery, uploads, writing
+from mavftpfs.cache import delivery, looking, uploads, writing
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import File, State
 from mavftpfs.cache.recovery import move
@@ -35,7 +35,7 @@ class Background:
         self._card = card
         self._retrying, self._news = False, trio.Event()
         card.retry_later = self.retry_later
-        card.repair.look = partial(delivery.look_at_all, card)
+        card.repair.look = partial(looking.look_at_all, card)
 
     # --- what is not on the vehicle
 
@@ -48,7 +48,7 @@ class Background:
         whole."""
         reason = LinkClosed("the mount was taken away while a program wrote it")
         for file in sorted(self._card.live, key=lambda file: file.lock.locked()):  # the wait may be cut short
-            if file.writers and file.undelivered and file.failed_at != file.changes:
+            if file.writers and file.undelivered and file.failed_changes != file.changes:
                 async with file.lock:
                     if file.undelivered and file.state is State.DIRTY:
                         await writing.break_off(self._card, file, reason)

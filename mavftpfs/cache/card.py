@@ -20,7 +20,7 @@ import trio
 from mavftpfs.cache.attributes import SECOND
 from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.directories import Directories, Directory
-from mavftpfs.cache.file import File
+from mavftpfs.cache.file import Event, File, Replaces
 from mavftpfs.cache.items import Folder, Item
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.options import CacheOptions
@@ -35,6 +35,7 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared import readonly
 from mavftpfs.shared.errors import Armed, FileBusy, FileChanged
 from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.sameness import Known
 
 PROVISIONAL = 10.0
 """Seconds for which read bytes stay provisional, because another client is noticed late: servers answer it on
@@ -107,7 +108,14 @@ class Card:
         self.counts = {"verified_by_crc": 0, "verified_by_size": 0, "checksums_unanswered": 0}
         self.parts: list[bytes] = []
         self.repair = Repair(
-            store, self.directories, self.own, self.paths, nursery, lambda: self.blocked, clock
+            store,
+            self.directories,
+            self.own,
+            self.paths,
+            nursery,
+            lambda: self.blocked,
+            self._is_used,
+            clock,
         )
         self.names = Names(store, self.directories, self.own, self.live, self.repair, clock)
         self.repair.names = self.names
@@ -145,6 +153,12 @@ class Card:
         self.closed.pop(file, None)
         self.live[file] = None
 
+    def _is_used(self, path: bytes) -> bool:
+        """Return whether a call uses a name, or a program has a file that is to get it."""
+        file = self.find(path)
+        is_new = file is not None and file.undelivered and file.replaces is Replaces.NOTHING
+        return is_new or not self.paths.is_free(path)
+
     def maybe_forget(self, file: File) -> None:
         """Let a file go that no program has open and of which the vehicle lacks nothing: the bytes read of it
         are kept as long as there is room, those written here are forgotten."""
@@ -167,7 +181,7 @@ class Card:
         """Forget a closed file."""
         self.closed.pop(file, None)
         file.forget_content()
-        file.lose_name()
+        file.leave_tree()
         if file.folder is not None:
             file.folder.prune()
 
@@ -176,11 +190,30 @@ class Card:
         for file in list(self.closed):
             self.forget(file)
 
+    def on_delivered(self, file: File, sent: Known) -> None:
+        """Note that the vehicle has all of a file, verified: update what is remembered of it."""
+        self.directories.put(file.path, DirEntry(b"", EntryKind.FILE, file.size))
+        crc32 = sent.crc32
+        if crc32 is None and file.size <= self.options.verify_max:
+            crc32 = file.crc32()
+        file.on(Event.COMMITTED)
+        file.base, file.has_part = Known(file.size, crc32=crc32), False
+        file.fresh_at = self.clock()
+        file.prove(file.fresh_at)
+        file.error, file.start_after = None, -inf
+        file.content.on_delivered()
+        file.blocks.close_reader()
+        file.blocks.drop()
+        file.blocks.size = file.size
+        file.changers.clear()
+        file.delivered_since_open = True
+        self.forget_broken(file.path)
+
     def lose_name(self, file: File) -> None:
         """Take the name from a file that was removed, renamed over, or replaced by others: open handles keep
         it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
-        file.lose_name()
+        file.leave_tree()
         self.names.settle(file)  # nothing of it is to be committed
         file.has_part = False
         file.content.on_unneeded()
@@ -241,7 +274,7 @@ class Card:
         if folder is not None:
             folder.times.forget(name)
 
-    async def entry(self, path: bytes) -> DirEntry | None:
+    async def shown_entry(self, path: bytes) -> DirEntry | None:
         """Return what a path is, pending changes included; None if it does not exist though its directory
         does.
 

@@ -136,10 +136,14 @@ class Content:
 
     # --- its end
 
+    def on_committed(self, size: int) -> None:
+        """Note that the vehicle has `size` bytes of this file: what changed since lies over them."""
+        self.base_limit, self.summed = min(size, self.size), (0, 0)
+
     def on_delivered(self) -> None:
-        """Note that the vehicle has these bytes: the next change lies over them."""
+        """Note that the vehicle has all of these bytes."""
         assert self.spooled is not None
-        self.base_limit, self.summed = self.size, (0, 0)
+        self.on_committed(self.size)
         self.spooled.mark_unneeded()
 
     def on_unneeded(self) -> None:

@@ -9,7 +9,7 @@ the whole file to a temporary file (`uploads.need_attempt`), verify it there, an
 name alone (`_compare_and_look`), rename it into place (`_commit`). If the ACK of the rename proves too
 little, the file is compared under its name (`_compare_again`). A card that cannot rename gets the file under
 its own name. If the commit of a file was interrupted (`File.unsure`), the delivery first finds out what has
-the name (`look`).
+the name (`looking.look`).
 
 A delivery that is cancelled or fails keeps its attempt if the error may pass (`uploads.PASSING`), so that the
 next delivery sends only the missing bytes. Exception: if the rename fails, the verified temporary file is
@@ -23,7 +23,6 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from math import inf
 
 import trio
 
@@ -51,10 +50,6 @@ MISMATCHES = 2
 
 RESEND_PAUSE = 1.0
 """Seconds before such a file is sent again: the cause may last a moment."""
-
-LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
-"""Seconds after which mavftpfs looks again what has a name; the second if only a checksum is
-lacking, which is asked for after the flight."""
 
 SHORT = 4096
 """Bytes of the largest file whose checksum the slowest card computes at once."""
@@ -112,7 +107,7 @@ async def _try(card: Card, file: File) -> None:
     while file.undelivered:
         in_place = store.traits.rename_works is False
         try:
-            await look(card, file)
+            await looking.look(card, file)
             if file.undelivered:
                 await _send(card, file)
         except VerificationFailed as error:
@@ -126,7 +121,8 @@ async def _try(card: Card, file: File) -> None:
             unsent = in_place and not file.lies_in_place  # others may take the name meanwhile
             if unsent or not isinstance(error, PASSING) or not file.size:
                 await uploads.abandon(card, file)
-            if in_place or store.traits.rename_works is not False:
+            cannot_rename = not in_place and store.traits.rename_works is False
+            if not cannot_rename:  # as this try has shown
                 raise
             log.debug("%r: %s; trying another way", file.path, error)
 
@@ -151,7 +147,7 @@ async def _send(card: Card, file: File) -> None:
     if not attempt.in_place:
         await _compare_again(card, file, attempt, sent)
         card.names.settle(file)
-    on_delivered(card, file, sent)
+    card.on_delivered(file, sent)
 
 
 async def _commit(card: Card, file: File, attempt: Attempt, sent: Known) -> None:
@@ -218,70 +214,12 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
     store.traits.rename_works = True
 
 
-async def look(card: Card, file: File) -> None:
-    """If the commit of a file was interrupted, find out what has its name, and give a missing name its file.
-    The caller has the file's lock.
-
-    Raises:
-        As looking.look: the file stays unsure.
-    """
-    unsure = file.unsure
-    if unsure is None:
-        return
-    if await looking.look(card, file):
-        if file.changed_since(unsure):
-            file.base = unsure.sent
-        else:
-            on_delivered(card, file, unsure.sent)
-
-
-async def look_at_all(card: Card) -> float:
-    """Look at all files whose commit was interrupted, unless a delivery or a change of the name does; return
-    in how many seconds that is to be done again, infinite if it is not."""
-    again = inf
-    for file in list(card.live):
-        if file.unsure is None:
-            continue
-        if file.lock.locked():
-            again = min(again, LOOK_AGAIN)
-            continue
-        try:
-            async with file.lock, card.paths.steady(file):  # so that `repair` leaves the name alone, too
-                await look(card, file)
-        except MavftpfsError as error:
-            log.info("what has the name %r is not known yet: %s", file.path, error)
-            again = min(again, IN_FLIGHT if isinstance(error, Armed) else LOOK_AGAIN)
-        else:
-            card.maybe_forget(file)
-    return again
-
-
 # --- after
-
-
-def on_delivered(card: Card, file: File, sent: Known) -> None:
-    """Note that the vehicle has the file: update what is remembered of it."""
-    card.directories.put(file.path, DirEntry(b"", EntryKind.FILE, file.size))
-    crc32 = sent.crc32
-    if crc32 is None and file.size <= card.options.verify_max:
-        crc32 = file.crc32()
-    file.on(Event.COMMITTED)
-    file.base, file.unsure, file.has_part = Known(file.size, crc32=crc32), None, False
-    file.fresh_at = card.clock()
-    file.prove(file.fresh_at)
-    file.error, file.start_after = None, float("-inf")
-    file.content.on_delivered()
-    file.blocks.close_reader()
-    file.blocks.drop()
-    file.blocks.size = file.size
-    file.changers.clear()
-    file.delivered_since_open = True
-    card.forget_broken(file.path)
 
 
 def _note_failure(card: Card, file: File, error: MavftpfsError) -> None:
     """Remember the error for the next close, and make the bytes survive a loss of power."""
-    known, file.error, file.failed_at = file.error, error, file.changes
+    known, file.error, file.failed_changes = file.error, error, file.changes
     level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
     log.log(level, "%r is not delivered: %s", file.path, error)  # once: each close tries again
     writing.persist(card, file)
@@ -314,7 +252,7 @@ async def _withdraw(card: Card, file: File) -> bool | None:
         return await _withdraw_broken(card, file, there)
     path, in_place = file.path, file.lies_in_place
     try:
-        await look(card, file)
+        await looking.look(card, file)
         if not file.undelivered:
             return True
         await uploads.abandon(card, file)

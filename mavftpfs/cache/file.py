@@ -25,6 +25,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 
 import trio
 
@@ -129,9 +130,10 @@ class File(Item):
         proven_at: when the vehicle was last seen to have that, by the caches' clock. fresh_at: when it was
             last opened or delivered, so that no byte here is older.
         attempt: the attempt to send it that is under way.
-        unsure: what this mount was committing under the name when it was interrupted.
+        unsure: what this mount commits under the name, from the first request for that until it is known
+            what has the name.
         has_part: an attempt in place ended, so the card may have a part of the file under its name.
-        changes: counts the changes of the content. failed_at: that count when a delivery last failed.
+        changes: counts the changes of the content. failed_changes: what that was when a delivery last failed.
         error: why the last delivery failed, or the write that broke the file.
         handles: how many are open; writers: how many of them may write. changers: the open handles that
             wrote to the file, or truncated it, since the vehicle last had all of it.
@@ -157,10 +159,10 @@ class File(Item):
         self.unsure: Unsure | None = None
         self.has_part = False
         self.changes = 0
-        self.failed_at = -1
+        self.failed_changes = -1
         self.verified = ""
         self.delivered_since_open = False
-        self.start_after = NEVER
+        self.start_after = -inf
         self.in_kernel = False
         self.lock = trio.Lock()
         self.delivery: trio.CancelScope | None = None

@@ -95,14 +95,14 @@ class Item:
         """Whether the item is what its folder knows by this name."""
         return self.folder is None or self.folder.children.get(self.name) is self
 
-    def lose_name(self) -> None:
+    def leave_tree(self) -> None:
         """Leave the tree; twice is harmless."""
         if self.folder is not None and self.has_name:
             del self.folder.children[self.name]
 
     def move(self, folder: Folder, name: bytes) -> None:
         """Get another name; an item that has it loses it."""
-        self.lose_name()
+        self.leave_tree()
         self.folder, self.name = folder, name
         folder.children[name] = self
 
@@ -170,5 +170,5 @@ class Folder(Item):
         """Leave the tree if there is nothing to remember, and so do the folders above."""
         known = self.children or self.listing or self.sweep or self.times
         if self.folder is not None and not known:
-            self.lose_name()
+            self.leave_tree()
             self.folder.prune()

@@ -187,7 +187,7 @@ class LocalFiles(Source):
             self.used -= len(file.data)
 
     def _remove(self, file: LocalFile) -> None:
-        file.lose_name()
+        file.leave_tree()
         self._count -= 1
         self.forget_unused(file)
         if file.folder is not None:

@@ -1,50 +1,86 @@
-"""The file under a name after an interrupted replacement, by a listing and a comparison. Layer: cache.
+"""The file under a name after an interrupted commit, by a listing and a comparison. Layer: cache.
 
 The first that fits:
 1. The name is missing, and the verified temporary file is there: that gets the name; nothing is sent again.
 2. The name is missing, and the old file is aside: that gets its name back.
 3. The name has what was committed: that is what the vehicle has of the file, which is delivered if no program
    changed it since.
-4. The name has what the file changes: the next delivery sends it again.
-5. The name has something else, and bytes of the base matter: the next delivery makes the file STALE.
-6. There was no base, and the name is taken: the next delivery says EEXIST.
+4. Anything else: the next delivery sends the file again, if it may replace what has the name (see
+   `File.replaces`).
 
-The last three are what each delivery finds out before it commits a file. Renames of 1 and 2 are made in
-flight, too; a checksum is asked for after the flight.
+If a name lacks its old file, the renames of 1 and 2 are made in flight, too; a checksum is asked for after
+the flight.
 """
 
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
+from math import inf
 
 from mavftpfs.cache.card import Card
+from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.file import File
 from mavftpfs.cache.unsure import Unsure
-from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, NotVerified
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, NotADirectory, NotFound
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 log = logging.getLogger("mavftpfs.cache")
 
+LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
+"""Seconds after which mavftpfs looks again what has a name; the second while the vehicle is armed."""
 
-async def look(card: Card, file: File) -> bool:
-    """Find out what has the name of an unsure file, and give a missing name its file; return whether the
-    vehicle has what was committed (rules 1 and 3). Then the file stops being unsure. The caller holds the
-    file's lock.
 
-    If nothing has the name, and nothing was left of it, the file has no base from now on.
+async def look_at_all(card: Card) -> float:
+    """Look at all files whose commit was interrupted, unless a delivery or a change of the name does; return
+    in how many seconds that is to be done again, infinite if it is not."""
+    again = inf
+    for file in list(card.live):
+        if file.unsure is None:
+            continue
+        if file.lock.locked():
+            again = min(again, LOOK_AGAIN)
+            continue
+        try:
+            async with file.lock, card.paths.steady(file):  # so that `repair` leaves the name alone, too
+                await look(card, file)
+        except MavftpfsError as error:
+            log.info("what has the name %r is not known yet: %s", file.path, error)
+            again = min(again, IN_FLIGHT if isinstance(error, Armed) else LOOK_AGAIN)
+        else:
+            card.maybe_forget(file)
+    return again
+
+
+async def look(card: Card, file: File) -> None:
+    """If the commit of a file was interrupted, find out what has its name, and give a missing name its file.
+    The caller has the file's lock.
 
     Raises:
-        NotVerified: the vehicle sent no checksum. Armed: none is asked for in flight. Also as Directories.ask
-        and Names.rename. The file stays unsure.
+        Armed: nothing is renamed, and no checksum is computed, in flight. Also as Directories.ask and
+        Names.rename. The file stays unsure.
     """
-    unsure, path = file.unsure, file.path
-    assert unsure is not None
-    try:
+    unsure = file.unsure
+    if unsure is None:
+        return
+    if not await _is_committed(card, file, unsure):
+        return
+    if file.changed_since(unsure):
+        file.base = unsure.sent
+        file.content.on_committed(unsure.sent.size)
+    else:
+        card.on_delivered(file, unsure.sent)
+
+
+async def _is_committed(card: Card, file: File, unsure: Unsure) -> bool:
+    """Return whether the vehicle has what was committed (rules 1 and 3), after which the file is not unsure.
+    If nothing has the name, and nothing was left of it, the file has no base from now on."""
+    path, there, committed = file.path, None, False
+    with suppress(NotFound, NotADirectory):
         directory = await card.directories.ask(split(path)[0])
         there = directory.has(path) or await _give_name_back(card, unsure, path, directory.entries)
-    except (NotFound, NotADirectory):
-        there = None
-    committed = there is not None and await _is_sent(card, file, unsure, there)
+        if there is not None:
+            committed = await _is_sent(card, file, unsure, there, directory)
     if there is None:
         file.base, file.content.base_limit = None, 0
     card.names.settle(file)
@@ -62,7 +98,7 @@ async def _give_name_back(
         if left is not None and entry is not None:
             log.warning("%r was left by an interruption: renaming it to %r", left, path)
             try:
-                await card.names.rename(left, path, completes=True)
+                await card.names.rename(left, path, completes=unsure.aside is not None)
             except FtpNak as nak:
                 refused = nak
             else:
@@ -72,8 +108,9 @@ async def _give_name_back(
     return None
 
 
-async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry) -> bool:
-    """Return whether a file on the vehicle is what was committed."""
+async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry, directory: Directory) -> bool:
+    """Return whether a file on the vehicle is what was committed. Where the vehicle tells no checksum, it is
+    if it has the right size, and the temporary file is gone."""
     sent = unsure.sent
     if there.kind is not EntryKind.FILE or there.size != sent.size:
         return False
@@ -85,4 +122,5 @@ async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry) -> b
     try:
         return crc32 == await card.store.crc32(file.path, size=sent.size)
     except FtpNak as nak:
-        raise NotVerified(f"{file.path!r} is in doubt, and the vehicle told no checksum: {nak}") from nak
+        log.warning("%r: its checksum was not told: %s", file.path, nak)
+        return directory.complete and split(unsure.temporary)[1] not in directory.entries

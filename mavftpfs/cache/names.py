@@ -366,9 +366,9 @@ class Names:
             self._later.list_later(split(target)[0])
             raise
 
-    def on_unknown(self, *paths: bytes) -> None:
-        """Note that it is not known what these names are after an interrupted change: the listings and files
-        there, and below, prove nothing from now on."""
+    def _on_unknown(self, *paths: bytes) -> None:
+        """Note that it is not known what these names are after an interrupted change: what was listed there,
+        and below, proves nothing from now on."""
         for path in paths:
             self._directories.forget(path)
             self._directories.expire(split(path)[0])
@@ -481,12 +481,12 @@ class Names:
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
-        """If the outcome of the body is unknown, forget what these names were (`on_unknown`)."""
+        """If the outcome of the body is unknown, forget what these names were (`_on_unknown`)."""
         try:
             with self._directories.changing(*paths):
                 yield
         except OutcomeUnknown:
-            self.on_unknown(*paths)
+            self._on_unknown(*paths)
             raise
 
 

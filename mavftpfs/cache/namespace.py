@@ -15,7 +15,7 @@ from contextlib import asynccontextmanager, nullcontext, suppress
 
 import trio
 
-from mavftpfs.cache import delivery, reading, uploads
+from mavftpfs.cache import delivery, looking, reading, uploads
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Event, File, Replaces
 from mavftpfs.cache.temporary import fits_rename, require_not_ours
@@ -46,7 +46,7 @@ async def mkdir(card: Card, path: bytes) -> None:
     require_not_ours(path)
     require_listable(path)
     async with card.paths.hold(path):
-        if await card.entry(path) is not None:
+        if await card.shown_entry(path) is not None:
             raise AlreadyExists(f"{path!r} exists")
         await card.names.require_new(path)
         await card.names.make_directory(path)
@@ -56,7 +56,7 @@ async def rmdir(card: Card, path: bytes) -> None:
     """See Tree.rmdir."""
     card.require_changeable()
     async with card.paths.hold(path):
-        entry = await card.entry(path)
+        entry = await card.shown_entry(path)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         if entry.kind is not EntryKind.DIRECTORY:
@@ -156,7 +156,7 @@ async def _unlink(card: Card, path: bytes) -> None:
         return
     card.require_changeable()
     if file is not None:
-        await delivery.look(card, file)
+        await looking.look(card, file)
         await uploads.abandon(card, file)
     entry = await card.directories.ask_entry(path, within=RECENT)
     there = entry is not None and entry.kind is EntryKind.FILE
@@ -194,9 +194,12 @@ async def _deliver_below(card: Card, path: bytes) -> None:
 
 async def _rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> None:
     wire_path(new)
+    displaced = None if noreplace or old == new else card.find(new)
+    if displaced is not None:
+        await looking.look(card, displaced)
     listed = await card.directories.ask_entry(new, within=RECENT)
-    target = listed or await card.entry(new)
-    source = await card.entry(old)
+    target = listed or await card.shown_entry(new)
+    source = await card.shown_entry(old)
     if source is None:
         raise NotFound(f"{old!r} does not exist")
     if target is None:
@@ -229,6 +232,7 @@ async def _rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> Non
 async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> None:
     """Rename on the vehicle. listed: what it has at `new`, which is replaced."""
     displaced = card.find(new)
+    await uploads.remove_parts(card)  # they do not follow a directory
     for file in list(card.files_below(old)):
         await uploads.abandon(card, file)
         if file.unsure is not None:
@@ -236,7 +240,6 @@ async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> 
         if file.is_local and file.base is None:
             raise FileBusy(f"{file.path!r} is being written, and not on the vehicle yet")
     if displaced is not None:
-        await delivery.look(card, displaced)
         await uploads.abandon(card, displaced)
     await card.names.purge(old)
     try:

@@ -337,13 +337,13 @@ async def _prove(card: Card, file: File, *, at_end: bool) -> None:
         on_replaced(card, file)
     else:
         async with card.paths.steady(file) as present:
-            if present == path and not _is_own(file):
+            if present == path and not _may_be_replacing(file):
                 _compare(card, file, directory)
             # else the next read compares the file under its new name
     file.require_base()
 
 
-def _is_own(file: File) -> bool:
+def _may_be_replacing(file: File) -> bool:
     """Return whether this mount may have given the name another file: one with pending changes is locked (a
     delivery compares the vehicle's file itself, and may be just replacing it), or its commit was interrupted,
     or it is sent under its own name."""
@@ -370,7 +370,7 @@ def on_listed(card: Card, path: bytes, directory: Directory) -> None:
         if not isinstance(file, File) or file not in card.live or file.base is None:
             continue
         is_seen = file.name in directory.entries and directory.listed_at > file.proven_at
-        if is_seen and not _is_own(file):
+        if is_seen and not _may_be_replacing(file):
             _compare(card, file, directory)
 
 
@@ -380,7 +380,7 @@ def on_replaced(card: Card, file: File) -> None:
     Open handles get FileChanged, and never read the other file. Exception: pending changes that need no byte
     of the old file are kept, and the next delivery replaces the other file.
     """
-    if file.has_name and not _is_own(file):
+    if file.has_name and not _may_be_replacing(file):
         lose_base(card, file)
 
 

@@ -87,15 +87,18 @@ class Repair:
         paths: PathLocks,
         nursery: trio.Nursery,
         is_blocked: Callable[[], bool],
+        is_used: Callable[[bytes], bool],
         clock: Callable[[], float],
     ) -> None:
-        """is_blocked(): whether nothing may be changed, because the vehicle is armed."""
+        """is_blocked(): whether nothing may be changed, because the vehicle is armed. is_used(path): whether
+        a call of this mount uses a name, or a program of it has a new file of that name."""
         self._store = store
         self._directories = directories
         self._own = own
         self._paths = paths
         self._nursery = nursery
         self._is_blocked = is_blocked
+        self._is_used = is_used
         self._clock = clock
         self._look_at = inf
         self._due: dict[tuple[bytes, bool], float] = {}
@@ -140,7 +143,9 @@ class Repair:
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """Repair what a listing shows. Raises no MavftpfsError: the listing is valid even if this fails."""
         if directory is not self._directories.known(path):
-            return  # the listing began before an interrupted change of this mount, and proves nothing
+            # The listing began before an interrupted change of this mount, and proves nothing.
+            self.list_later(path, AGAIN_AFTER)
+            return
         found = self._see(path, directory)
         waits = [seconds for _, _, seconds in found if seconds > 0.0]
         if waits:
@@ -150,7 +155,8 @@ class Repair:
         self._busy.add(path)
         try:
             for left, name, seconds in found[:MOST_AT_ONCE]:
-                if seconds > 0.0 or self._own.is_needed(left, self._clock()):
+                is_gone = split(left)[1] not in directory.entries  # a program removed it, or moved over it
+                if seconds > 0.0 or is_gone or self._own.is_needed(left, self._clock()):
                     continue
                 again = await self._repair(left, name, directory)
                 if again:
@@ -199,7 +205,7 @@ class Repair:
             target, waits = join(split(left)[0], _recovered(name)), True
         if not waits:
             await self.names.remove_if_there(left)
-        elif not self._paths.is_free(target):
+        elif self._is_used(target):
             return AGAIN_AFTER
         else:
             async with self._paths.hold(target):  # or a delivery could give a new file the name first

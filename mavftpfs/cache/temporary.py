@@ -117,7 +117,7 @@ class TemporaryNames:
 
     def need(self, target: bytes, kind: Kind) -> bytes:
         """Return a new path in the target's directory, needed until `release`. Raises PathTooLong."""
-        path = self.beside(target, kind)
+        path = self._beside(target, kind)
         self.needed[path] = inf
         if kind is Kind.OLD:
             self.targets[path] = target
@@ -142,8 +142,7 @@ class TemporaryNames:
         self.needed.pop(path, None)
         self.targets.pop(path, None)
 
-    def beside(self, target: bytes, kind: Kind) -> bytes:
-        """Return a path in the target's directory. Raises PathTooLong."""
+    def _beside(self, target: bytes, kind: Kind) -> bytes:
         number = self._serial = (self._serial + 1) % _SERIALS
         serial = bytes((_ALPHABET[number >> 10], _ALPHABET[number >> 5 & 31], _ALPHABET[number & 31]))
         parent, name = split(target)

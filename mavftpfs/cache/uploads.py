@@ -43,7 +43,7 @@ START_PAUSE = 5.0
 """Seconds after which an upload that could not begin is tried again."""
 
 PASSING = (RequestTimeout, LinkError, SessionBusy, SessionLost, NotVerified, Armed)
-"""Errors after which the upload goes on where it stopped."""
+"""Errors after which the upload goes on where it stopped. OutcomeUnknown is a RequestTimeout."""
 
 
 def may_pass(file: File) -> bool:

@@ -60,7 +60,7 @@ async def for_writing(card: Card, path: bytes, *, truncate: bool) -> File:
     if file is not None and file.is_local:
         return file
     require_writable(path)
-    entry = await card.entry(path)
+    entry = await card.shown_entry(path)
     if entry is None:
         raise NotFound(f"{path!r} does not exist")
     if entry.kind is not EntryKind.FILE:
@@ -96,7 +96,7 @@ async def made(card: Card, path: bytes) -> File | None:
     require_writable(path)
     require_listable(path)
     file = card.find(path)
-    if (file is not None and file.is_local) or await card.entry(path) is not None:
+    if (file is not None and file.is_local) or await card.shown_entry(path) is not None:
         return None
     await card.names.require_new(path)
     file = card.find(path)
@@ -257,7 +257,7 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     file.on(Event.FAILED)
     file.error = error
     card.live.pop(file, None)
-    file.lose_name()
+    file.leave_tree()
     card.forget_broken(path)
     card.broken.append(file)
     file.blocks.end(FileChanged(f"a write to {path!r} failed"))

@@ -65,12 +65,12 @@ def test_what_may_be_read_of_a_file_that_lost_something() -> None:
     replaced = make_file()
     replaced.on(Event.REPLACED)
     replaced.require_alive()  # it has its name: its pending changes are shown
-    replaced.lose_name()
+    replaced.leave_tree()
     for require in (replaced.require_alive, replaced.require_base):
         with pytest.raises(FileChanged):
             require()
     removed = make_file()
-    removed.lose_name()
+    removed.leave_tree()
     removed.require_alive()  # what is here
     with pytest.raises(FileChanged):
         removed.require_base()
@@ -113,7 +113,7 @@ def test_a_rename_of_a_directory_moves_what_is_below_it() -> None:
     assert file.path == b"/c/d/f"
     assert root.find(b"/c/d/f") is file is other[b"f"]
     assert root.find(b"/a/b/f") is None
-    file.lose_name()
+    file.leave_tree()
     assert not file.has_name
     assert file.path == b"/c/d/f", "for messages"
     root.need(b"/c/d").prune()

@@ -52,7 +52,7 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
     parent, name = split(path)
     above = len(parent.rstrip(b"/"))
     try:
-        new, old = (TemporaryNames(b"abcd", Random(seed)).beside(path, kind) for kind in (Kind.NEW, Kind.OLD))
+        new, old = (TemporaryNames(b"abcd", Random(seed)).need(path, kind) for kind in (Kind.NEW, Kind.OLD))
     except PathTooLong:
         assert above + len(path) > 218
         return
@@ -67,7 +67,7 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
 
 def test_names_do_not_repeat() -> None:
     namer = TemporaryNames(b"abcd", Random(5))
-    assert len({namer.beside(b"/a/b", Kind.NEW) for _ in range(5000)}) == 5000
+    assert len({namer.need(b"/a/b", Kind.NEW) for _ in range(5000)}) == 5000
 
 
 @pytest.mark.parametrize(
