@@ -434,7 +434,12 @@ def _param_parser(name: str) -> Parser:
     )
     parser.add_argument("--save", metavar="FILE", help="save all, for QGroundControl if FILE ends in .params")
     parser.add_argument(
-        "--diff", metavar="FILE", help="show differences from FILE; exit code 1 if there are any"
+        "--diff",
+        metavar="FILE",
+        nargs="?",
+        const="",
+        help="show differences from FILE, or without FILE between the vehicles of a mount with -o all; exit "
+        "code 1 if there are any",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("-y", "--yes", action="store_true", help="set without asking")

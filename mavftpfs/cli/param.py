@@ -20,14 +20,18 @@ from mavftpfs.cli import verbs
 from mavftpfs.cli.commands import say
 from mavftpfs.cli.drawing import shown
 from mavftpfs.client import parameters as client
-from mavftpfs.client.files import Session, Target
+from mavftpfs.client.files import Session, Target, open_mount, vehicles_below
 from mavftpfs.client.parameters import Change, ChangePlan, Difference
 from mavftpfs.client.progress import Progress, followed
 from mavftpfs.parameters.text import Line
 from mavftpfs.parameters.values import Kind, Parameter, text_of
-from mavftpfs.shared.errors import ExitCode, InvalidText, MavftpfsError, UsageError
+from mavftpfs.shared.errors import ExitCode, InvalidText, MavftpfsError, UsageError, VehicleLost
+from mavftpfs.shared.model import ROOT
 
 Args = argparse.Namespace
+
+VEHICLES = ""
+"""The FILE of `--diff` without one."""
 
 
 def param(args: Args) -> int:
@@ -46,6 +50,8 @@ def _param(args: Args) -> int:
     _require_one_job(args, setting)
     if args.save is not None:
         return _with_session(args, partial(_save, args))
+    if args.diff == VEHICLES:
+        return verbs.run(args, partial(_diff_vehicles, args))
     if args.diff is not None:
         return _with_session(args, partial(_diff, args, client.load(_file(args.diff))))
     if args.load is not None:
@@ -163,11 +169,52 @@ def _of_others(lines: Sequence[Line]) -> str:
 
 
 def _difference_lines(found: Sequence[Difference]) -> list[str]:
-    """Return the lines of a table, no line if nothing differs."""
-    rows = [("", "VEHICLE", "FILE")] if found else []
-    rows += [(one.name, one.vehicle or "-", one.file) for one in found]
-    names, values = (max((len(row[column]) for row in rows), default=0) for column in (0, 1))
-    return [f"{name:<{names}}  {value:>{values}}  {file}" for name, value, file in rows]
+    return _table(("VEHICLE", "FILE"), [client.Row(one.name, (one.vehicle, one.file)) for one in found])
+
+
+def _table(heads: Sequence[str], found: Sequence[client.Row]) -> list[str]:
+    """Return the lines of a table with a column for each vehicle or file, no line if nothing differs."""
+    rows = [("", *heads)] if found else []
+    rows += [(row.name, *("-" if value is None else value for value in row.values)) for row in found]
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join([f"{row[0]:<{wide[0]}}", *_right(row[1:-1], wide[1:]), row[-1]]) for row in rows]
+
+
+def _right(cells: Sequence[str], wide: Sequence[int]) -> list[str]:
+    return [f"{cell:>{width}}" for cell, width in zip(cells, wide, strict=False)]
+
+
+async def _diff_vehicles(args: Args, target: Target) -> int:
+    """Compare the vehicles of a mount of several. A vehicle that cannot be read is named and left out."""
+    if target.mount is None:
+        raise UsageError("--diff needs a FILE; without one, SOURCE is the directory of a mount with -o all")
+    if target.options.target_system:
+        raise UsageError("--diff without a FILE compares all vehicles; leave out target_system=")
+    found, code = dict[str, list[Parameter]](), ExitCode.OK
+    with shown(Progress(), idle="reading the parameters"):
+        for name, place in (await vehicles_below(target.mount[0])).items():
+            try:
+                if not place:
+                    raise VehicleLost("it is not mounted now")
+                async with open_mount(place, ROOT, target.options) as session:
+                    found[name] = await client.read_parameters(session)
+            except MavftpfsError as exc:
+                say(f"vehicle {name} is left out: {exc}")
+                code = ExitCode.INCOMPLETE
+    if len(found) < 2:
+        told = f"{len(found)} of the vehicles can be compared, two are needed; see: mavftpfs status"
+        if not code:
+            raise UsageError(told)
+        say(told)
+        return code
+    rows = client.compare_vehicles(list(found.values()))
+    if args.json:
+        facts = [{"name": row.name, **dict(zip(found, row.values, strict=True))} for row in rows]
+        print(json.dumps(facts, indent=2))
+    else:
+        for line in _table(list(found), rows):
+            print(line)
+    return code or (ExitCode.USAGE if rows else ExitCode.OK)
 
 
 # -- setting --------------------------------------------------------------------------------------

@@ -394,6 +394,24 @@ async def find_mount(spec: LinkSpec, options: Options) -> Status | None:
     return None
 
 
+async def vehicles_below(mountpoint: str) -> dict[str, str]:
+    """Return the mountpoint of each vehicle of a mount of several, by name; "" for one that is not mounted
+    now.
+
+    Raises:
+        LinkClosed: the mount does not answer. UsageError: the mount has a single vehicle.
+    """
+    status = await usable_status(mountpoint)
+    if "members" not in status:
+        raise errors.UsageError(
+            f"only one vehicle is mounted on {mountpoint}; name a FILE to compare it with"
+        )
+    return {
+        member["name"]: os.path.join(mountpoint, member["name"]) if member["state"] == "mounted" else ""
+        for member in status["members"]
+    }
+
+
 def _heard_by(status: Status, spec: LinkSpec) -> Unnamed:
     """Return the vehicles that a mount hears on its link."""
     heard = heartbeats_in(status)

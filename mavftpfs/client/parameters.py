@@ -293,6 +293,23 @@ def compare(lines: Sequence[Line], current: Sequence[Parameter]) -> list[Differe
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A parameter that differs between vehicles. values: a text for each vehicle, None if it has no such
+    parameter."""
+
+    name: str
+    values: tuple[str | None, ...]
+
+
+def compare_vehicles(vehicles: Sequence[Sequence[Parameter]]) -> list[Row]:
+    """Return the parameters that differ between vehicles, except those that a vehicle sets by itself."""
+    texts = [{one.name: value_text(one) for one in found} for found in vehicles]
+    names = dict.fromkeys(name for known in texts for name in known if not is_own(name))
+    rows = (Row(name, tuple(known.get(name) for known in texts)) for name in names)
+    return [row for row in rows if len(set(row.values)) > 1]
+
+
 def _agrees(line: Line, now: Parameter) -> bool:
     try:
         return same(fit(now.kind, line.value), now.value)

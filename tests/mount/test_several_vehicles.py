@@ -141,6 +141,30 @@ def same(card: Path, local: Path) -> bool:
     return wrong == ([], []) and sorted(os.listdir(local)) == names
 
 
+def test_the_parameters_of_several_vehicles_are_compared(fleet: Fleet) -> None:
+    for system in (1, 2):
+        fleet.launch(system, profile="ardupilot5")
+    mounts = mount_all(fleet)
+    mounts.await_up("1", "2")
+    assert command("param", mounts.path, "--diff") == ("", "")
+    command("param", mounts.path / "2", "RTL_ALT=3000", "WPNAV_SPEED=750.5", "STAT_RUNTIME=77")
+    table = command("param", mounts.path, "--diff", code=1)[0].splitlines()
+    assert table == ["                1  2", "WPNAV_SPEED  1000  750.5", "RTL_ALT      1500  3000"]
+    rows = json.loads(command("param", mounts.path, "--diff", "--json", code=1)[0])
+    assert {"name": "RTL_ALT", "1": "1500", "2": "3000"} in rows
+    fleet.launch(3)
+    mounts.await_up("3")
+    out, err = command("param", mounts.path, "--diff", code=2)
+    assert out.splitlines() == table
+    assert err.startswith("mavftpfs: vehicle 3 is left out: this vehicle has no parameters")
+    fleet.vehicles[2].left_alone = True
+    fleet.vehicles[2].kill()
+    wait_until("it is lost", lambda: "LOST" in command("status", mounts.path / "2")[0])
+    assert "two are needed" in command("param", mounts.path, "--diff", code=2)[1]
+    assert "only one vehicle" in command("param", mounts.path / "1", "--diff", code=1)[1]
+    assert "needs a FILE" in command("param", fleet.source, "--diff", code=1)[1]
+
+
 def test_three_vehicles_are_copied_at_once_one_dies_and_one_is_armed(fleet: Fleet) -> None:
     for system in PROFILES:
         fleet.launch(system, *(("--armed",) if system == 3 else ()))
