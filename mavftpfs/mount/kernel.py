@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import pyfuse3
 import trio
 
-from mavftpfs.client.mountpoint import is_dead, stderr_of, unmount, why_not_mounted
+from mavftpfs.client.mountpoint import is_dead, mounts, stderr_of, unmount, why_not_mounted
 from mavftpfs.mount.handles import Presentation
 from mavftpfs.mount.options import permissions
 from mavftpfs.shared.errors import MountFailed
@@ -76,16 +76,25 @@ def kernel_mount(
             pyfuse3.init(operations, mountpoint, words)
         except RuntimeError as exc:
             raise MountFailed(why_not_mounted(mountpoint, said() or str(exc))) from exc
+    number = _number_at(mountpoint)
     try:
         yield
     finally:
+        # libfuse unmounts what is at the place: another mount, if this one was taken away by `umount -l`.
+        is_there = _number_at(mountpoint) == number
         if busy():
             # Freeing the library's session would pull it away from that thread.
-            unmount(mountpoint, lazy=True)
-        else:
-            pyfuse3.close(unmount=True)
-            if is_dead(mountpoint):  # libfuse leaves it if the kernel aborted it: `umount -f` of one in use
+            if is_there:
                 unmount(mountpoint, lazy=True)
+        else:
+            pyfuse3.close(unmount=is_there)
+            if is_there and is_dead(mountpoint):  # libfuse leaves it if the kernel aborted it: `umount -f`
+                unmount(mountpoint, lazy=True)
+
+
+def _number_at(mountpoint: str) -> str | None:
+    mounted = mounts().get(mountpoint)
+    return None if mounted is None else mounted.number
 
 
 def presentation(options: Options) -> Presentation:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -162,3 +164,20 @@ def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
         _, errors = copy.communicate(timeout=120)
     assert (copy.returncode, errors) == (0, "")
     assert (tmp_path / "copy").read_bytes() == data
+
+
+def test_the_end_of_a_mount_leaves_a_newer_one_at_its_place(field: Field, small_tree: Path) -> None:
+    """`umount -l` leaves the first one to the program that has a file open there."""
+    first, second = (field.prepare(field.sim(small_tree).source) for _ in range(2))
+    second.path = first.path
+    first.start()
+    opened = os.open(next(path for path in first.path.iterdir() if path.is_file()), os.O_RDONLY)
+    try:
+        subprocess.run(["fusermount3", "-uz", str(first.path)], check=True)
+        second.start()
+        assert first.end_by(signal.SIGTERM) == 0
+        assert second.serves()
+        assert second.unmount() == 0
+    finally:
+        with suppress(OSError):  # its mount has ended
+            os.close(opened)
