@@ -226,7 +226,9 @@ class ServerSession:
             name, _, _ = request.data.partition(b"\0")
             if not self.quarantine.left(name, self.clock()):
                 self.on_unexplained(reply, late)
-        elif request.first_sent >= self.newest_open_at:
+        elif request.first_sent >= self.newest_open_at and (
+            self.maybe_open or reply.req_opcode not in OPENING
+        ):
             return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
         elif reply.req_opcode in OPENING:
             if self.session is None or self.session.seq != reply.seq:
@@ -379,8 +381,9 @@ class ServerSession:
         tried.resent |= nak.retransmitted
         alone = not self.vehicle.another_client_heard(self.clock())
         # An earlier try may have opened a file (its refusal may have hidden that), or a late duplicate of an
-        # older open.
-        orphan = (tried.resent or (self.in_doubt() and alone)) and not tried.closed
+        # older open. An ArduPilot says so itself.
+        told = nak.code == NakCode.FAIL and self.engine.traits.ack_carries_own_session is True
+        orphan = (tried.resent or (self.in_doubt() and alone) or told) and not tried.closed
         ours = tried.opens and (nak.retransmitted or orphan)
         taken = nak.code in (_OPEN_TAKEN if tried.opens else _TAKEN)
         if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under the same id
@@ -463,7 +466,10 @@ class ServerSession:
             if nak.code not in _NOT_OPEN:
                 raise
             # The file was in use when the first transmission went out.
-            return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
+            closed = nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
+            if not closed:  # another client may have had the session
+                self.distrust("the server had closed a file before it was told to", reads=True)
+            return closed
         raise RequestTimeout("no answer to TerminateSession")
 
     async def close_quietly(self) -> None:

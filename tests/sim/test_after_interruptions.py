@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
+from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, NoSpace, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.rigs import Rig, open_to_copy, rig, write_file
+from tests.support.faults import STATION
+from tests.support.replies import request
+from tests.support.rigs import Rig, open_to_copy, read_file, rig, write_file
 
 FAT = "ardupilot5"
 OLD, NEW = b"old" * 10, b"new!" * 20
@@ -154,3 +159,58 @@ async def test_a_new_file_gets_no_name_in_flight() -> None:
         here.vehicle.disarm()
         await trio.sleep(20.0)
         assert here.files() == {b"/file": OLD, b"/learnt": b"2", b"/new": NEW}
+
+
+async def late_open(here: Rig, tree: Tree) -> None:
+    """Read a file; the network delivers its open once more after it was closed, and loses that answer."""
+    here.faults.orphans = True
+    held: list[tuple[bytes, Address]] = []
+    handle = here.server.handle
+
+    def hold(wire: bytes, source: Address, now: float) -> None:
+        if wire[3] == Opcode.OPEN_FILE_RO and not held:
+            held.append((wire, source))
+        handle(wire, source, now)
+
+    here.server.handle = hold  # type: ignore[method-assign]
+    await read_file(tree, b"/file")
+    await trio.sleep(3.0)
+    here.faults.lose_reply_to(Opcode.OPEN_FILE_RO)
+    here.server.handle(*held[0], trio.current_time())
+    here.link.kick()
+    await trio.sleep(0.5)
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5"])
+async def test_a_file_that_a_late_open_left_open_keeps_no_upload_from_the_card(profile: str) -> None:
+    """ArduPilot refuses to create a file while one is open under the same id, which nobody had noticed."""
+    async with rig(profile, {b"/file": OLD}) as here:
+        tree = here.mount()
+        await tree.list(b"/")
+        await late_open(here, tree)
+        await write_file(tree, b"/new", NEW)
+        assert here.files() == {b"/file": OLD, b"/new": NEW}
+
+
+async def test_bytes_are_not_kept_of_a_file_that_the_server_had_closed_before_it_was_told_to() -> None:
+    """A client that is not heard here takes the session of a read, and closes it before the read is over."""
+    async with rig("px4", {b"/file": OLD * 1000, b"/other": NEW * 1000}) as here:
+        outgoing = here.server.outgoing
+        here.server.outgoing = lambda now: [one for one in outgoing(now) if one[0] != STATION]  # type: ignore
+        seq = count(30_000, 10)
+
+        def other(opcode: Opcode, data: bytes = b"") -> None:
+            wire = request(next(seq), opcode, session=0, data=data).encode()
+            here.server.handle(wire, STATION, trio.current_time())
+
+        def take() -> None:
+            other(Opcode.RESET_SESSIONS)
+            other(Opcode.OPEN_FILE_RO, b"/other")
+
+        tree = here.mount()
+        await tree.list(b"/")
+        here.faults.at(Opcode.READ_FILE, take, nth=60)
+        here.faults.at(Opcode.TERMINATE_SESSION, lambda: other(Opcode.TERMINATE_SESSION))
+        await read_file(tree, b"/file")
+        await trio.sleep(5.0)
+        assert await read_file(tree, b"/file") == OLD * 1000
