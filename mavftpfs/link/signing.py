@@ -1,8 +1,8 @@
 """Checks MAVLink 2 signatures of incoming frames. Layer: link; pure (the clock is passed in).
 
 Rules of the MAVLink guide ("Message Signing"): a stream is (link id, system, component); its timestamps,
-in units of 10 µs since 2015-01-01, only grow; a new stream may be at most one minute old. Unlike
-pymavlink's check differs: here a frame leaves a trace only after its signature proved right, because a forged
+in units of 10 µs since 2015-01-01, only grow; a new stream may be at most one minute old. Other
+than in pymavlink's check, a frame leaves a trace only after its signature proved right, because a forged
 timestamp must neither lock out the true sender nor grow the table.
 """
 

@@ -118,7 +118,7 @@ BOLDER = 0.06
 """Only a share is used of what the window has beyond the path, and of the reserve for pauses. Each round adds
 so much to the share. A round that lost more than usual takes a STEP of it away: a short queue overflowed."""
 
-OVERHEAD, FULL = 58, 58 + MAX_DATA
+OVERHEAD, CHUNK_COST = 58, 58 + MAX_DATA
 """Bytes that a request and its answer take on the link besides the data that one of them carries."""
 
 
@@ -180,9 +180,9 @@ class Flow:
         self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
         self.window = min(FIRST, self.cap)
-        self._bucket = Bucket((DEPTH_SERIAL if serial else DEPTH) * FULL, TICK)
+        self._bucket = Bucket((DEPTH_SERIAL if serial else DEPTH) * CHUNK_COST, TICK)
         self._bucket.rate = self._bwlimit
-        self._cost = float(FULL)  # bytes that a usual request and its answer take on the link
+        self._cost = float(CHUNK_COST)  # bytes that a usual request and its answer take on the link
         self._hurried, self._ready_at, self.sent_at = False, inf, -inf
         self._lacks = -inf  # bytes that the bucket has to hold before one more request goes out
         self._starting, self._flat = True, 0
@@ -205,8 +205,7 @@ class Flow:
 
     @property
     def pause(self) -> float:
-        """Seconds without an answer that prove no loss, because the server pauses. Not while application-
-        limited."""
+        """Seconds without an answer that prove no loss, because the server pauses."""
         return self._pauses.length
 
     def set_queue_limit(self, limit: int | None) -> None:
@@ -260,7 +259,7 @@ class Flow:
     def _held_back(self, room: int, now: float, urgent: bool) -> int:
         """Return for how many of so many requests there are tokens. What is urgent may overdraw: a little of
         it is no load."""
-        cost, overdraft = (FULL, DEPTH * FULL) if urgent else (self._cost, 0)
+        cost, overdraft = (CHUNK_COST, DEPTH * CHUNK_COST) if urgent else (self._cost, 0)
         level = self._bucket.level(now) + overdraft
         if level >= room * cost:
             return room

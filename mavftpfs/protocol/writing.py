@@ -163,7 +163,7 @@ class WriteTransfer(Operation):
         chunk = self.chunks.next_size(now)
         if self._in_flight is not None:
             most = min(most, self._in_flight - -(-self._source.ranges.out.total // chunk))
-        if self.paused or most <= 0 or self.done:
+        if self.paused or most <= 0:
             return []
         if self._needs_listing:
             return self._list_root()

@@ -89,8 +89,7 @@ class Store:
 
     If a change of the card fails with FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or Armed,
     the change had not happened when the store looked. After OutcomeUnknown it may have. Only create_empty
-    does
-    not look: after its RequestTimeout an empty file may exist.
+    does not look: after its RequestTimeout an empty file may exist.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:

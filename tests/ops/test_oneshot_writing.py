@@ -42,7 +42,7 @@ class Card(FakeTree):
 
     renames = True
 
-    async def mkdir(self, path: bytes) -> None:
+    async def mkdir(self, path: bytes, *, on_card: bool = False) -> None:
         try:
             self.kind_of(path)
         except NotFound:
@@ -56,7 +56,7 @@ class Card(FakeTree):
             raise DirectoryNotEmpty(f"{path!r} is not empty")
         await super().rmdir(path)
 
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False, on_card: bool = False) -> None:
         if not self.renames:
             raise CrossDevice("this server cannot rename")
         await super().rename(old, new, noreplace=noreplace)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.protocol.bucket import Bucket
-from mavftpfs.protocol.flow import FULL, OVERHEAD, Flow
+from mavftpfs.protocol.flow import CHUNK_COST, OVERHEAD, Flow
 
 
 def test_so_much_goes_out_in_the_long_run_and_little_at_once() -> None:
@@ -30,7 +30,7 @@ def test_without_a_limit_all_goes_out_and_a_fast_path_takes_a_tick_at_once() -> 
 
 def test_short_requests_cost_less_of_a_limit() -> None:
     sizes = {}
-    for size in (FULL - OVERHEAD, 64):
+    for size in (CHUNK_COST - OVERHEAD, 64):
         flow, now, sent = Flow(bwlimit=5000.0), 10.0, 0
         while now < 70.0:
             flow.begin()
