@@ -393,9 +393,7 @@ class Directories:
                 self.forget(path)
                 if path != ROOT:
                     self.expire(split(path)[0])
-                if (
-                    path == self._options.root and errno_for(nak) == errno.ENOENT
-                ):  # `_list` looked at no parent
+                if path == self._options.root and errno_for(nak) == errno.ENOENT:  # it has no parent to list
                     raise NotFound(f"{path!r} does not exist") from nak
                 raise
             finally:

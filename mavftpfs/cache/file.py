@@ -87,7 +87,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
 
 
 class Replaces(Enum):
-    """What a delivery of a file may replace under its name.
+    """The thing that a delivery of a file may replace under its name.
 
     NOTHING: the vehicle has no file of it, so the name has to be free. BASE: bytes of the base stay, so the
     base has to be there still. ANYTHING: a program emptied the file, so no byte of the base stays, and
@@ -197,7 +197,7 @@ class File(Item):
 
     @property
     def replaces(self) -> Replaces:
-        """What a delivery of it may replace."""
+        """The thing that a delivery of it may replace now."""
         if self.lies_in_place:
             return Replaces.PART
         if self.base is None:

@@ -420,8 +420,8 @@ class Scheduler:
 
     @property
     def waits_for(self) -> str | None:
-        """What holds requests up now: "client", another one that may have a file open; "session", which an
-        earlier client left open; None: neither."""
+        """The cause that holds requests up now: "client", another one that may have a file open; "session",
+        one that an earlier client left open; None: neither."""
         if (self._queue or self.server.held_up) and self.clock() < self.server.others_until:
             return "client"
         return "session" if self._driver.silent else None
