@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from functools import partial
 
 import trio
@@ -14,7 +15,7 @@ from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES, Family, Storage
 from tests.support.faults import STATION
 from tests.support.matrix.operations import FILE, NAME, D, keeping, making, read, rewriting, taking
-from tests.support.matrix.scene import Others, Scene
+from tests.support.matrix.scene import Gone, Others, Scene
 from tests.support.replies import decode_reply, request
 from tests.support.rigs import Rig
 from tests.support.transfers import content
@@ -28,10 +29,6 @@ PIECE = 75
 (`session.others.LEFT_OPEN`)."""
 
 PATIENCE = 60
-
-
-class Gone(MavftpfsError):
-    """The file was not there."""
 
 
 class Interrupted(MavftpfsError):
@@ -87,11 +84,12 @@ class OtherClient:
         return await self.ask(Opcode.TERMINATE_SESSION) and done
 
     async def remove(self, path: bytes) -> None:
-        """Remove a file, unless it is gone."""
+        """Remove a file. Raises Gone if it is not there."""
 
         async def attempt() -> bool:
-            there = path[len(self._here.root) :] in self._here.files()
-            return not there or await self.ask(Opcode.REMOVE_FILE, path)
+            if path[len(self._here.root) :] not in self._here.files():
+                raise Gone
+            return await self.ask(Opcode.REMOVE_FILE, path)
 
         await self.insist(attempt)
 
@@ -122,7 +120,8 @@ def replacing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
 
         async def attempt() -> bool:
             if PROFILES[here.profile].storage is not Storage.POSIX:
-                await client.remove(here.root + FILE)
+                with suppress(Gone):
+                    await client.remove(here.root + FILE)
             return await client.ask(Opcode.RENAME, here.root + temporary + b"\0" + here.root + FILE)
 
         await client.insist(attempt)
@@ -136,13 +135,12 @@ def removing(heard: bool) -> Callable[[Scene], Awaitable[None]]:
 
     async def act(scene: Scene) -> None:
         here = scene.here
-        if FILE not in here.files():
-            raise Gone
         if heard:
-            client = OtherClient(here, heard)
-            await client.remove(here.root + FILE)
-        else:
+            await OtherClient(here, heard).remove(here.root + FILE)
+        elif FILE in here.files():
             here.take(FILE)
+        else:
+            raise Gone
         scene.effect()
 
     return act

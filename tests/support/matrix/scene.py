@@ -29,13 +29,17 @@ def visible(here: Rig) -> State:
     return {name: data for name, data in on_card(here).items() if not is_temporary(name)}
 
 
+class Gone(MavftpfsError):
+    """The file was not there, so others did nothing."""
+
+
 @dataclass
 class Scene:
     """The things that an event may touch.
 
     Attributes:
         at_end: called when the operation ended.
-        others: those who change the directory, None until they begin.
+        others: those who change the directory; None until they begin, and if they did nothing.
         succeeded: whether they did what they began. over: set when they end.
         effect: to be called when their change happened on the card.
         saw: what another program read.
@@ -83,9 +87,13 @@ class Scene:
 
         async def act() -> None:
             began = trio.current_time()
-            with suppress(MavftpfsError):
+            try:
                 await others.act(self)
                 self.succeeded = True
+            except Gone:
+                self.others = None
+            except MavftpfsError:
+                pass
             assert others.outside or trio.current_time() - began <= IN_TIME
             self.over.set()
 
@@ -101,7 +109,8 @@ class Others:
     """An event: others change the directory.
 
     Attributes:
-        model: what that does to the directory. act: does it; a MavftpfsError says that nothing was done.
+        model: what that does to the directory. act: does it; Gone says that nothing was done, another
+            MavftpfsError that all or nothing was.
         outside: the change does not go through this mount.
     """
 
