@@ -534,6 +534,11 @@ def _install(args: argparse.Namespace) -> int:
     return run(args, whole_parser())
 
 
+def _scan(args: argparse.Namespace) -> int:
+    commands.say(f"scanning {args.source}, which takes some seconds")  # before the modules are loaded
+    return _later("cli.scanning", "scan")(args)
+
+
 def _later(module: str, name: str) -> Run:
     """Return a command that imports its module when it runs."""
 
@@ -550,7 +555,7 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "status": (_status_parser, commands.status),
     "param": (_param_parser, _later("cli.param", "param")),
     "sync": (_sync_parser, _later("cli.verbs", "sync")),
-    "scan": (_scan_parser, _later("cli.scanning", "scan")),
+    "scan": (_scan_parser, _scan),
     "ls": (_ls_parser, _later("cli.verbs", "ls")),
     "get": (_get_parser, _later("cli.verbs", "get")),
     "cat": (_cat_parser, _later("cli.verbs", "cat")),

@@ -71,7 +71,6 @@ async def _others(link: Link, target: Target, known: Collection[tuple[int, int]]
     """Yield the other components that are heard, with their answers to MAVLink FTP."""
     assert target.spec is not None
     options, tell = target.options, target.sinks.tell
-    tell(f"listening on {target.spec.description} for {LISTEN_TIME:g} s")
     patience = min(PROBE_TIME, options.connect_timeout)
 
     def on_heard(heartbeat: Heartbeat) -> None:

@@ -63,7 +63,7 @@ def test_scan_tells_each_vehicle_as_it_comes(two: tuple[SimVehicle, SimVehicle])
     source = two[0].source
     out, said = command("scan", source)
     first, *heard = said.splitlines()
-    assert first == f"mavftpfs: listening on {source} for 3 s"
+    assert first == f"mavftpfs: scanning {source}, which takes some seconds"
     assert sorted(heard) == [f"mavftpfs: heard {n}/1 (PX4 quadrotor, disarmed)" for n in (1, 2)]
     header, *rows = out.splitlines()
     assert header == "SYSTEM/COMPONENT  WHAT, FIRMWARE, UNIQUE ID, FTP"

@@ -434,6 +434,6 @@ def test_who_waits_for_a_vehicle_is_told_so(command: str, tmp_path: Path) -> Non
     local = [] if command == "scan" else [tmp_path]
     said = mavftpfs(command, "-o", "connect_timeout=2", source, *local, code=2)[1]
     *before, first, last = said.splitlines()
-    assert before == [f"mavftpfs: listening on {source} for 3 s"] * (command == "scan")
+    assert before == [f"mavftpfs: scanning {source}, which takes some seconds"] * (command == "scan")
     assert first == f"mavftpfs: waiting for a heartbeat on {source} (2 s)"
     assert last.startswith(f"mavftpfs: no vehicle on {source} within 2 s")
