@@ -58,7 +58,6 @@ class Card:
         blocked: nothing may be changed, because the vehicle is armed.
         opening, fetching: work on a file that all who need it share. fetchers: the files that are
             fetched once their programs pause.
-        parts: what broken files left on the card: temporary files, or parts under their own names.
         counts: comparisons by CRC32 and by size alone, and requests for a CRC32 that were not answered.
         retry_later(): is called when something was not delivered; it is tried again.
         tell_changed(path): is called when the copies that callers keep of a file are wrong.
@@ -106,7 +105,6 @@ class Card:
         self.fetchers: set[File] = set()
         self.throttle = Throttle(self.live, self.cache.meter, options.link_rate, clock)
         self.counts = {"verified_by_crc": 0, "verified_by_size": 0, "checksums_unanswered": 0}
-        self.parts: list[bytes] = []
         self.repair = Repair(
             store,
             self.directories,
@@ -228,6 +226,11 @@ class Card:
     def find_broken(self, path: bytes) -> File | None:
         """Return the last broken file of a path."""
         return next((file for file in self.broken if file.path == path), None)
+
+    @property
+    def parts(self) -> list[File]:
+        """The broken files of which the card, which cannot rename, may have a part under their own names."""
+        return [file for file in self.broken if file.has_part and file.base is None]
 
     def forget_broken(self, path: bytes) -> None:
         """Forget what was written to a path before a write failed. Programs that have it open read on."""

@@ -273,8 +273,7 @@ async def _withdraw(card: Card, file: File) -> bool | None:
 async def _withdraw_broken(card: Card, file: File, there: bool | None) -> bool | None:
     """Forget a broken file; arguments and result as in `withdraw`."""
     with suppress(MavftpfsError):
-        await uploads.remove_parts(card)
+        await uploads.remove_part(card, file)
     if file in card.broken:
         card.forget_broken(file.path)
-    emptied = file.lies_in_place and file.base is not None
-    return None if emptied or file.path in card.parts else there
+    return None if file.has_part else there

@@ -225,14 +225,12 @@ async def _rename(card: Card, old: bytes, new: bytes, *, noreplace: bool) -> Non
     _follow(card, old, new)
     for path in (old, new):
         card.forget_broken(path)
-    for directory in card.own.follow_rename(old, new):
-        card.repair.list_later(directory)
+    card.repair.follow_rename(old, new)
 
 
 async def _move(card: Card, old: bytes, new: bytes, listed: DirEntry | None) -> None:
     """Rename on the vehicle. listed: what it has at `new`, which is replaced."""
     displaced = card.find(new)
-    await uploads.remove_parts(card)  # they do not follow a directory
     for file in list(card.files_below(old)):
         await uploads.abandon(card, file)
         if file.unsure is not None:

@@ -31,7 +31,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.temporary import Kind, TemporaryName, TemporaryNames, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, join, renamed, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -115,6 +115,12 @@ class Repair:
         else:
             self._due[key] = min(at, self._due.get(key, at))
         self._start()
+
+    def follow_rename(self, old: bytes, new: bytes) -> None:
+        """Note that a directory has another name: what is to be listed, and the old files of this mount."""
+        self._due = {(renamed(path, old, new), doubt): at for (path, doubt), at in self._due.items()}
+        for directory in self._own.follow_rename(old, new):
+            self.list_later(directory)
 
     def look_later(self) -> None:
         """Have unsure files looked at as soon as the vehicle is heard."""

@@ -15,7 +15,7 @@ import trio
 from mavftpfs.cache import verify
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import Attempt, File, Replaces, State
-from mavftpfs.cache.temporary import Kind, is_temporary
+from mavftpfs.cache.temporary import Kind
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -154,6 +154,17 @@ async def abandon(card: Card, file: File) -> None:
             await card.names.discard(attempt.path)
 
 
+async def leave_to_repair(card: Card, attempt: Attempt) -> None:
+    """End an attempt that its file forgot, without waiting for a request: `repair` removes its temporary
+    file."""
+    try:
+        await attempt.upload.end()
+    finally:
+        card.own.release(attempt.path)
+        if not attempt.in_place and attempt.upload.may_exist:
+            card.repair.list_later(split(attempt.path)[0])
+
+
 def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
     """Note that an attempt ended without success. Bytes under the file's own name belong to the file."""
     if file.lies_in_place:
@@ -188,35 +199,43 @@ async def is_empty_in_place(card: Card, path: bytes) -> bool:
 
 
 async def remove_parts(card: Card, path: bytes | None = None) -> None:
-    """Remove from the card what broken files left there. path: only of this one.
-
-    If the vehicle refuses, or if a part under its own name may be another client's file, it stays on the
-    card, and the log names it.
+    """Remove from the card the parts of broken files that lie under their own names. path: only of this one.
 
     Raises:
         As VehicleStore, but no FtpNak: what is left is tried again later.
     """
-    for part in [part for part in card.parts if path in (None, part)]:
-        try:
-            if not (is_temporary(split(part)[1]) or await _is_part(card, part)):
-                log.warning("%r stays on the card: it may be a part of a failed copy, or another file", part)
-            else:
-                await card.names.remove_if_there(part)
-        except FtpNak as nak:
-            log.info("%r stays on the card: %s", part, nak)
-        if part in card.parts:  # else another call was faster
-            card.parts.remove(part)
-        card.own.release(part)
+    for file in card.parts:
+        if path in (None, file.path):
+            async with file.lock:
+                await remove_part(card, file)
 
 
-async def _is_part(card: Card, path: bytes) -> bool:
-    """Return whether the vehicle's file of this name is, or may be, the beginning of the last broken file.
+async def remove_part(card: Card, file: File) -> None:
+    """As remove_parts, of one file. The caller has its lock.
+
+    If the vehicle refuses, or if the part may be another client's file, it stays on the card, and the log
+    names it.
+    """
+    if file not in card.parts:  # another call was faster
+        return
+    try:
+        if await _is_part(card, file):
+            await card.names.remove_if_there(file.path)
+        else:
+            log.warning("%r stays on the card: it may be a part of a failed copy, or another file", file.path)
+    except FtpNak as nak:
+        log.info("%r stays on the card: %s", file.path, nak)
+    file.has_part = False
+
+
+async def _is_part(card: Card, file: File) -> bool:
+    """Return whether the vehicle's file of this name is, or may be, the beginning of a broken file.
 
     Others may have put a file of theirs there while the link was cut.
     """
-    size, broken = await card.names.size(path), card.find_broken(path)
+    size = await card.names.size(file.path)
     if not size:
         return True
-    if broken is None or size > broken.size:
+    if size > file.size:
         return False
-    return await card.store.crc32(path, size=size) == broken.content.crc32(size)
+    return await card.store.crc32(file.path, size=size) == file.content.crc32(size)

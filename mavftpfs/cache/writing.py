@@ -273,7 +273,7 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     )
     persist(card, file)
     if attempt is not None:
-        await attempt.upload.end()
+        await uploads.leave_to_repair(card, attempt)
 
 
 async def drop(card: Card, file: File) -> None:
@@ -289,9 +289,8 @@ async def drop(card: Card, file: File) -> None:
     file.content.on_opened(0 if file.base is None else file.base.size)
     card.forget_time(path)
     card.tell_changed(path)
-    card.retry_later()
     if attempt is not None:
-        await attempt.upload.end()
+        await uploads.leave_to_repair(card, attempt)
 
 
 def _detach(card: Card, file: File) -> Attempt | None:
@@ -299,10 +298,6 @@ def _detach(card: Card, file: File) -> Attempt | None:
     attempt = file.attempt
     if attempt is not None:
         uploads.forget_attempt(card, file, attempt)
-        if not attempt.in_place and attempt.upload.may_exist:
-            card.parts.append(attempt.path)
-    if file.base is None and file.lies_in_place:
-        card.parts.append(file.path)
     card.names.settle(file)
     return attempt
 

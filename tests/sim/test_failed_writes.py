@@ -387,6 +387,7 @@ async def test_what_is_taken_back_leaves_nothing_here_either(each: Rig, path: by
     file = await break_it(tree, path)
     assert await file.take_back() is False
     assert (tree.broken(), tree.status()["bytes_held"]) == ([], 0)
+    await tree.tidy_up()
     assert each.files() == {FILE: OLD}
 
 
