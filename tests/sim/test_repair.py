@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from contextlib import suppress
 from typing import Any
 
@@ -10,9 +11,9 @@ import trio
 
 from mavftpfs.cache import namespace, uploads
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FileBusy, MavftpfsError, RequestTimeout
+from mavftpfs.shared.errors import FileBusy, FileTooLarge, MavftpfsError, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig, rig, write_file
 from tests.support.transfers import content
@@ -307,3 +308,38 @@ async def test_a_program_removes_what_the_vehicle_never_had(how: str) -> None:
         await trio.sleep(100)
         assert here.files() == {OTHER: OLD}
         assert here.litter() == []
+
+
+async def leave_a_temporary_file(here: Rig, tree: Tree) -> None:
+    """Have the card refuse to remove the temporary file of a failed write, so that it is tried again soon."""
+    here.faults.refuse(Opcode.REMOVE_FILE, NakCode.FAIL_ERRNO, errno.EACCES, times=10)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, bytes(200_000))
+    await trio.sleep(1.0)
+    with pytest.raises(FileTooLarge):
+        await file.write(1 << 32, b"x")
+    file.close()
+    await trio.sleep(1.0)
+    assert here.litter()
+    here.faults.call_off()
+
+
+async def test_a_repair_whose_listing_became_void_is_made_up_for() -> None:
+    async with rig("px4", {OTHER: OLD}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        await leave_a_temporary_file(here, tree)
+        here.faults.at(Opcode.LIST_DIRECTORY, tree.forget_caches)
+        here.faults.at(Opcode.LIST_DIRECTORY_WITH_TIME, tree.forget_caches)
+        await trio.sleep(60.0)
+        assert here.files() == {OTHER: OLD}
+
+
+async def test_a_repair_follows_a_directory_that_gets_another_name() -> None:
+    async with rig("px4", {OTHER: OLD}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        await leave_a_temporary_file(here, tree)
+        await tree.rename(b"/d", b"/e")
+        await trio.sleep(60.0)
+        assert here.files() == {b"/e/other": OLD}
