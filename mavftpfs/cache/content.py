@@ -3,7 +3,7 @@
 Each byte below `size` is one of two:
 - *held*: a program wrote it, or it was fetched beside written bytes, or it is a zero of a gap before a write
   beyond the old end; the local spool file has it;
-- *base*: not held, and below `base_limit`: it is the vehicle's, and in memory (`blocks`) if it was read.
+- *base*: not held: it is the vehicle's, and in memory (`blocks`) if it was read.
 
 A file that nobody changed holds nothing: all of it is base. A file that is sent to the vehicle is *whole*:
 no byte of it is base. After the delivery the spool file serves reads until the last program closes the file.
@@ -26,8 +26,8 @@ class Content:
     Attributes:
         blocks: what was read of the vehicle's file.
         size: bytes, as programs see it.
-        base_limit: below this, bytes that are not held are the vehicle's. 0: none is, so the file is replaced
-            whatever the vehicle has under its name by then.
+        keeps_base: whether the content starts from the vehicle's file, so that a delivery replaces only that.
+            False for a file that a program made or emptied.
         spooled: the local file; None while nobody changed the file.
         summed: how many bytes of the base went into a checksum so far, from its beginning, and their CRC32.
     """
@@ -35,7 +35,7 @@ class Content:
     def __init__(self, blocks: Blocks) -> None:
         self.blocks = blocks
         self.size = 0
-        self.base_limit = 0
+        self.keeps_base = False
         self.spooled: SpoolContent | None = None
         self.summed = 0, 0
 
@@ -49,11 +49,11 @@ class Content:
     @property
     def whole(self) -> bool:
         """Whether no byte of it is the vehicle's."""
-        return self.held.covers(0, min(self.base_limit, self.size))
+        return self.held.covers(0, self.size)
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the parts of [start, stop) of which only the vehicle has the bytes, ascending."""
-        return self.held.missing(start, min(stop, self.base_limit, self.size))
+        return self.held.missing(start, min(stop, self.size))
 
     def get(self, start: int, stop: int) -> bytes:
         """Return [start, stop), cut at the file's size, no byte of which may be the base's.
@@ -85,7 +85,7 @@ class Content:
             self.blocks.drop()
             self.blocks.size = size
         if self.spooled is None:
-            self.size = self.base_limit = size
+            self.size, self.keeps_base = size, size > 0
 
     # --- what programs do
 
@@ -114,10 +114,9 @@ class Content:
         assert self.spooled is not None
         if size < self.size:
             self.spooled.cut(size)
-            self.base_limit = min(self.base_limit, size)
         elif size > self.size:
             self.spooled.put(size, b"", zeros=size - self.size)
-        self.size = size
+        self.size, self.keeps_base = size, self.keeps_base and size > 0
 
     def sum_up(self, data: bytes | memoryview) -> None:
         """Note the next bytes of the base for its checksum."""
@@ -138,7 +137,7 @@ class Content:
 
     def on_committed(self, size: int) -> None:
         """Note that the vehicle has `size` bytes of this file: what changed since lies over them."""
-        self.base_limit, self.summed = min(size, self.size), (0, 0)
+        self.keeps_base, self.summed = min(size, self.size) > 0, (0, 0)
 
     def on_delivered(self) -> None:
         """Note that the vehicle has all of these bytes."""
@@ -162,5 +161,5 @@ class Content:
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self.held.end <= self.size
-        assert self.base_limit <= self.size
-        assert self.held.covers(self.base_limit, self.size)
+        assert self.keeps_base or self.whole
+        assert self.size or not self.keeps_base

@@ -207,7 +207,7 @@ async def _compare_again(card: Card, file: File, attempt: Attempt, sent: Known) 
             raise VerificationFailed(f"{path!r} is not what was sent: it is gone, or was emptied")
     except VerificationFailed:
         # The committed file is spoilt, so the next delivery may replace it, whatever it has become.
-        file.base, file.content.base_limit = Known(file.size), 0
+        file.base, file.content.keeps_base = Known(file.size), False
         if unproven:
             await card.names.learn_rename_works(path)
         raise

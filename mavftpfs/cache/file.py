@@ -202,7 +202,7 @@ class File(Item):
             return Replaces.PART
         if self.base is None:
             return Replaces.NOTHING
-        return Replaces.BASE if self.content.base_limit else Replaces.ANYTHING
+        return Replaces.BASE if self.content.keeps_base else Replaces.ANYTHING
 
     @property
     def lies_in_place(self) -> bool:

@@ -82,7 +82,7 @@ async def _is_committed(card: Card, file: File, unsure: Unsure) -> bool:
         if there is not None:
             committed = await _is_sent(card, file, unsure, there, directory)
     if there is None:
-        file.base, file.content.base_limit = None, 0
+        file.base, file.content.keeps_base = None, False
     card.names.settle(file)
     return committed
 

@@ -35,8 +35,10 @@ def check_file(card: Card, file: File) -> None:
     if file.state is State.BROKEN:
         assert not file.has_name
         assert file.attempt is None
-    if file.base is None and file.is_local:
-        assert content.base_limit == 0
+    if file.is_local:  # bytes that are not here are the base's
+        end = 0 if file.base is None else min(file.base.size, content.size)
+        assert content.held.covers(end, content.size)
+        assert file.base is not None or not content.keeps_base
     assert file.writers <= file.handles
     assert not file.handles or is_live or file.state is State.BROKEN
 
