@@ -254,10 +254,10 @@ class ServerSession:
         else:
             self.leave()
 
-    def _forget(self, session: int) -> None:
-        """Note that this connection has no file open under this id."""
-        self.maybe_open = {(other, path) for other, path in self.maybe_open if other != session}
-        self.changed.unpark_all()
+    def _forget(self, closed: set[tuple[int, bytes]]) -> None:
+        """Note that these files are closed. A late open may have opened another one behind the Terminate."""
+        self.maybe_open -= closed
+        self.wake()
 
     # --- waiting
 
@@ -455,14 +455,14 @@ class ServerSession:
         if session is None:
             return True
         self.leave()
-        asked_at = self.clock()
+        left, asked_at = {(session.id, session.path)}, self.clock()
         try:
             with trio.move_on_after(limit):
                 await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session.id))
-                self._forget(session.id)
+                self._forget(left)
                 return True
         except FtpNak as nak:
-            self._forget(session.id)
+            self._forget(left)
             if nak.code not in _NOT_OPEN:
                 raise
             # The file was in use when the first transmission went out.
@@ -491,11 +491,12 @@ class ServerSession:
         """
         closed = False
         for session in {session for session, _ in self.maybe_open}:
+            left = {one for one in self.maybe_open if one[0] == session}
             # MAVSDK ends the session of another client, whatever id is asked for.
             if self.engine.traits.ack_carries_own_session or self.clock() >= self.others_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
-            self._forget(session)
+            self._forget(left)
         return closed
 
     def require_open(self, session: OpenSession) -> None:

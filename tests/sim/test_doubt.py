@@ -21,6 +21,7 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.quarantine import LASTS, LEAST_IF_REPEATED, MOST, UNKNOWN_LATENESS, Quarantine
+from mavftpfs.session.scheduler import MAYBE_OPEN_CLOSE
 from mavftpfs.shared.errors import MavftpfsError, NotVerified, RequestTimeout, SessionLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -242,6 +243,19 @@ async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str) -> 
         began = trio.current_time()
         assert await read_file(connection, path(profile, "two")) == content(1500, 2)
         assert trio.current_time() - began < 1
+
+
+@pytest.mark.holds("fault leaving")
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_a_late_open_left_open_is_closed_although_nobody_asks_for_a_file(profile: str) -> None:
+    """Its ACK comes together with that of the Terminate before, which closed the file of an earlier open."""
+    here = Rig(profile, {b"/d/one": content(1500, 1)}, CLEAN)
+    async with here.connected() as connection:
+        copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.TERMINATE_SESSION)
+        await read_file(connection, path(profile, "one"))
+        await trio.sleep(3 + MAYBE_OPEN_CLOSE)
+        assert copy.late is not None
+        assert here.server.open_sessions == 0
 
 
 async def test_who_waits_for_a_turn_is_not_timed_out() -> None:
