@@ -13,7 +13,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from math import inf, nextafter
 from typing import TypeVar
@@ -33,6 +33,15 @@ from mavftpfs.session.others import (
     took_session,
 )
 from mavftpfs.session.quarantine import LASTS, Quarantine
+from mavftpfs.session.remedies import (
+    SILENCE_ARDUPILOT,
+    SILENCE_PX4,
+    TAKEN,
+    Holder,
+    Tried,
+    holder,
+    left_open,
+)
 from mavftpfs.shared.errors import (
     FtpNak,
     MavftpfsError,
@@ -42,12 +51,6 @@ from mavftpfs.shared.errors import (
     SessionTaken,
 )
 from mavftpfs.shared.model import wire_path
-
-SILENCE_ARDUPILOT = 3.5
-"""Seconds. ArduPilot lets a session be taken over after 3 s without any reply."""
-
-SILENCE_PX4 = 10.5
-"""Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
 
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for the answer to a Terminate if no caller waits for its result."""
@@ -61,10 +64,6 @@ _OFTEN = 0.25
 
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
-
-_TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
-_OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
-"""NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
 
 _NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
 """Refusals of a Terminate if no such session exists; 8 is PX4's sticky errno."""
@@ -89,24 +88,6 @@ class OpenSession:
     writing: bool = False
     seq: int = -1
     resent: bool = False
-
-
-@dataclass
-class _Tried:
-    """Remedies that were tried, since `began`, while one request is refused because the session is taken.
-
-    opens: the request opens a file. resent: one of the tries was sent more than once. listed: a listing
-    cleared PX4's sticky errno. closed: a file that an open of this connection may have left was closed.
-    silences: those that are left, in seconds. reset: ResetSessions was sent.
-    """
-
-    began: float
-    opens: bool
-    resent: bool = False
-    listed: bool = False
-    closed: bool = False
-    silences: Iterator[float] = field(default_factory=partial(iter, (SILENCE_ARDUPILOT, SILENCE_PX4)))
-    reset: bool = False
 
 
 class ServerSession:
@@ -309,7 +290,7 @@ class ServerSession:
         """
         await self.close_quietly()
         await self._close_maybe_open()
-        tried = _Tried(self.clock(), opens=True)
+        tried = Tried(self.clock(), opens=True)
         try:
             while not await self._opens(path, opcode, tried):
                 pass
@@ -325,26 +306,28 @@ class ServerSession:
             raise _lost()
         return self.session
 
-    async def _opens(self, path: bytes, opcode: Opcode, tried: _Tried) -> bool:
+    async def _opens(self, path: bytes, opcode: Opcode, tried: Tried) -> bool:
         """Ask to open a file once; return False if that is to be tried again."""
         asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
         operation = OpenRequest(opcode, wire_path(path), session=asked)
         operation.on_opened = partial(self._on_opened, path, tried)
         # After a time-out or a cancellation these stay: the server may have opened the file. PX4 and MAVSDK
         # answer with id 0, whatever was asked for; until an ACK tells which, the file may have either id.
-        if echoes is not False:
-            self.maybe_open.add((asked, path))
-        if not echoes:
-            self.maybe_open.add((0, path))
+        ids = {True: {asked}, False: {0}, None: {asked, 0}}[echoes]
+        opening = {(session, path) for session in ids} - self.maybe_open  # an earlier try may have opened it
+        self.maybe_open |= opening
         self.newest_open_at = self.clock()
         try:
             await self.driver.run(operation)
         except FtpNak as nak:
+            tried.resent |= nak.retransmitted
+            if not left_open(nak, tried, echoes=bool(echoes)):
+                self.maybe_open -= opening
             await self._remedy(nak, tried)
             return False
         return True
 
-    def _on_opened(self, path: bytes, tried: _Tried, operation: OpenRequest) -> None:
+    def _on_opened(self, path: bytes, tried: Tried, operation: OpenRequest) -> None:
         """Note the ACK of an open at once, because an answer right behind it may show that another file is
         open, before the task that asked runs again."""
         self.maybe_open.clear()
@@ -362,55 +345,38 @@ class ServerSession:
 
     # --- when the session is taken
 
-    async def _remedy(self, nak: FtpNak, tried: _Tried) -> None:
-        """Apply the next remedy for a refusal, and return if the request may be sent again.
-
-        | who has the session | NAK | what is done |
-        |---|---|---|
-        | this connection: an open whose ACK was lost | 4, 5, 8; of an ArduPilot 1 | close it |
-        | nobody: PX4's sticky errno hides another code | 8 | list a directory to its end, once |
-        | another client that was heard | 4, 5 | the caller waits for that client |
-        | a client that is gone | 4, 5 | be silent for 3.5 s, then 10.5 s; then reset if no client is heard |
-
-        Asking sooner keeps a stale session alive (docs/servers.md 1).
+    async def _remedy(self, nak: FtpNak, tried: Tried) -> None:
+        """Apply the next remedy for a refusal (the table in `remedies`), and return if the request may be
+        sent again.
 
         Raises:
             FtpNak: the refusal has another reason. SessionTaken: another client has a file open.
             SessionBusy: nothing is left that could help. RequestTimeout: a remedy was not answered.
         """
-        tried.resent |= nak.retransmitted
-        alone = not self.vehicle.another_client_heard(self.clock())
-        # An earlier try may have opened a file (its refusal may have hidden that), or a late duplicate of an
-        # older open. An ArduPilot says so itself.
-        told = nak.code == NakCode.FAIL and self.engine.traits.ack_carries_own_session is True
-        orphan = (tried.resent or (self.in_doubt() and alone) or told) and not tried.closed
-        ours = tried.opens and (nak.retransmitted or orphan)
-        taken = nak.code in (_OPEN_TAKEN if tried.opens else _TAKEN)
-        if nak.code == NakCode.FAIL:  # ArduPilot says so if the session is open under the same id
-            taken = ours and self.engine.traits.ack_carries_own_session is not False
-        if tried.opens and not (taken and ours):
-            self.maybe_open.clear()
-        if not taken:
-            raise nak
-        if nak.code == NakCode.FILE_EXISTS and not tried.listed:
-            tried.listed = True
-            await self._try(ListDirectory(b"/", False))
-            return
-        in_time = self.clock() - tried.began < self.op_deadline
-        if ours and in_time and await self._close_maybe_open():
-            tried.closed = True
-            return
-        if nak.code == NakCode.FAIL:
-            raise nak
-        if self.clock() < self.others_until:
-            raise SessionTaken(_IN_USE) from nak
-        for seconds in tried.silences:
-            await self.driver.be_silent(seconds)
-            return
-        if not tried.opens or tried.reset or not alone:
-            raise SessionBusy(_IN_USE) from nak
-        tried.reset = True
-        await self._try(Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session))
+        now = self.clock()
+        another = now < self.others_until
+        closable = self.maybe_open and (self.engine.traits.ack_carries_own_session or not another)
+        ours = tried.opens and bool(closable) and now - tried.began < self.op_deadline
+        who = holder(nak, tried, ours=ours, another=another)
+        tries = tried.remedies[who]
+        tried.remedies[who] += 1
+        match who, tries:
+            case Holder.NOBODY, _:
+                raise nak
+            case Holder.HIDDEN, _:
+                await self._try(ListDirectory(b"/", False))
+            case Holder.OURS, _:
+                await self._close_maybe_open()
+            case Holder.ANOTHER, _:
+                raise SessionTaken(_IN_USE) from nak
+            case Holder.GONE, 0:
+                await self.driver.be_silent(SILENCE_ARDUPILOT)
+            case Holder.GONE, 1:
+                await self.driver.be_silent(SILENCE_PX4)
+            case Holder.GONE, 2 if tried.opens and not self.vehicle.another_client_heard(now):
+                await self._try(Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session))
+            case _:
+                raise SessionBusy(_IN_USE) from nak
 
     def busy_at(self, since: float) -> float:
         """Return when a caller that waits for other clients since then gets SessionBusy: `op_deadline` after
@@ -482,22 +448,19 @@ class ServerSession:
         with trio.move_on_after(TERMINATE_LIMIT), suppress(MavftpfsError):
             await self._close_maybe_open()
 
-    async def _close_maybe_open(self) -> bool:
+    async def _close_maybe_open(self) -> None:
         """Close the files in `maybe_open`, and forget those in whose place another client may have a file
-        open; return whether a Terminate was answered.
+        open.
 
         Raises:
             RequestTimeout: no answer; the files stay in `maybe_open`.
         """
-        closed = False
         for session in {session for session, _ in self.maybe_open}:
             left = {one for one in self.maybe_open if one[0] == session}
             # MAVSDK ends the session of another client, whatever id is asked for.
             if self.engine.traits.ack_carries_own_session or self.clock() >= self.others_until:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
-                closed = True
             self._forget(left)
-        return closed
 
     def require_open(self, session: OpenSession) -> None:
         """Raise SessionLost unless this session is still open."""
@@ -530,7 +493,7 @@ class ServerSession:
         Raises:
             VehicleLost. SessionBusy: the other client kept its session. The errors of the request.
         """
-        tried = _Tried(self.clock(), opens=False)
+        tried = Tried(self.clock(), opens=False)
         while True:
             operation = make()
             self.vehicle.require(self.clock())
@@ -561,7 +524,7 @@ class ServerSession:
                 await self.driver.run(Simple(Opcode.LIST_DIRECTORY, b"/", offset=BEYOND))
                 refused = False
             except FtpNak as nak:
-                refused = nak.code in _TAKEN
+                refused = nak.code in TAKEN
         traits.several_sessions = not refused and self.others.has_session(now, self.clock())
         self.wake()
 
