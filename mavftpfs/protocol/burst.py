@@ -18,7 +18,7 @@ from math import inf
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer, Wants
+from mavftpfs.protocol.reading import DataSink, ReadTransfer, Wants
 from mavftpfs.protocol.requests import READ_POLICY, RETRY_POLICIES, Request
 from mavftpfs.shared.errors import SessionLost
 
@@ -27,6 +27,9 @@ _MIN_QUIET = 1.0
 _SLOW_PACKET = 0.03
 _SLOW_QUIET = 2.0
 _INTERVALS = 8
+_SESSION_CODES = (NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND)
+"""Refusals of a burst that mean "no file is open" (servers.md 1). After another one, ReadFile tells."""
+
 _BARREN_BURSTS = 2
 """After so many bursts without data the rest is read by requests."""
 
@@ -218,7 +221,7 @@ class BurstTransfer(ReadTransfer):
             return
         # Lost, refused, or the session is gone. ReadFile answers more clearly.
         self._barren_bursts += 1
-        if burst.nak in SESSION_CODES:
+        if burst.nak in _SESSION_CODES:
             self.fail(SessionLost(f"a burst was refused with NAK {burst.nak}", by_server=True))
         elif burst.nak is not None or self._barren_bursts >= _BARREN_BURSTS:
             self._gave_up = True

@@ -142,7 +142,7 @@ class Engine:
         if op.started:
             raise LocalProtocolError("an operation runs once")
         op.started, op.port = True, self
-        op.waits(now)
+        op.update_patience(now)
         if op.patience == inf:
             op.patience = self._op_deadline
         self._ops.append(op)
@@ -181,10 +181,10 @@ class Engine:
 
     def _on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a believed reply."""
-        ledger, op, was_lost = self._ledger, request.op, not request.outstanding
+        ledger, op, late = self._ledger, request.op, not request.outstanding
         ledger.on_answered(request)
-        if not was_lost or op is not ledger.ghost:
-            if was_lost:
+        if not late or op is not ledger.ghost:
+            if late:
                 self.flow.on_spurious()
                 self._timers.reordering.on_needless(now)
                 ledger.on_late(request)
@@ -259,7 +259,7 @@ class Engine:
         """Declare a request lost. Its operation asks again, unless that has ended."""
         op = request.op
         self.flow.on_loss()
-        self._ledger.lose(request)
+        self._ledger.retire(request)
         if op is not self._ledger.ghost:
             self.stats.lost += 1
             op.on_lost(request, now)
@@ -298,11 +298,11 @@ class Engine:
     def hold(self, now: float) -> None:
         """Send nothing now. The patience of operations runs all the same, unless they are idle."""
         for op in self._ops:
-            op.waits(now)
+            op.update_patience(now)
 
     def _serve(self, op: Operation, now: float, wires: list[bytes]) -> bool:
         """Send what `op` has; return False when the window is full."""
-        if op.done or not op.waits(now):
+        if op.done or not op.update_patience(now):
             return True
         if self._gate.keeps(op):
             op.progress(now)  # the vehicle owes no answer

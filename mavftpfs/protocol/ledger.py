@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import islice
 
-from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
+from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode
 from mavftpfs.protocol.requests import Operation, Request, Run
 
 LAST_SEQ = 65534
@@ -28,14 +28,6 @@ MOST_REMEMBERED = 1024
 _ACK = int(Opcode.ACK)
 
 
-class Ghost(Operation):
-    """Owns the requests of operations that ended, until they are answered or lost. The engine never asks a
-    ghost for requests."""
-
-    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nothing to do: nobody waits for the answer."""
-
-
 class Ledger:
     """The requests of one engine. next_seq: the first seq to use.
 
@@ -45,6 +37,8 @@ class Ledger:
             answered, and servers answer in order; or an earlier request for the same bytes was answered late.
         order: number of the next transmission.
         find: returns the request that a reply with a seq may answer, or None.
+        ghost: owns the requests of operations that ended, until they are answered or lost. The engine never
+            asks it for requests, nor gives it replies.
     """
 
     def __init__(self, next_seq: int) -> None:
@@ -55,7 +49,7 @@ class Ledger:
         self.outstanding: dict[int, Request] = {}
         self.passed: dict[int, Request] = {}
         self.find = self._table.get
-        self.ghost = Ghost()
+        self.ghost = Operation()
         self.order = 0
 
     # --- going out
@@ -145,7 +139,7 @@ class Ledger:
         """Note an answer to a request."""
         request.owed -= 1
         if request.outstanding:
-            self.lose(request)
+            self.retire(request)
         if not request.owed:
             self._late.pop(request.seq + 1, None)
             self._table.pop(request.seq + 1, None)
@@ -165,7 +159,7 @@ class Ledger:
             if request.op is op and request.opcode == opcode and request.offset == offset:
                 self.passed[order] = request
 
-    def lose(self, request: Request) -> None:
+    def retire(self, request: Request) -> None:
         """Note that a request stopped being outstanding; answers may still arrive."""
         request.outstanding = False
         del self.outstanding[request.order]

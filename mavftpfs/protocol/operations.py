@@ -16,8 +16,6 @@ from mavftpfs.protocol.requests import RETRY_POLICIES, WORK_FLOOR, Operation, Re
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
-__all__ = ["ListDirectory", "OpenRequest", "Operation", "Simple"]
-
 BEYOND = 100_000
 """Offset of a listing that is beyond the end of any directory."""
 

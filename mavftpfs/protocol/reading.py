@@ -10,7 +10,7 @@ from typing import Protocol
 
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import READ_POLICY, Operation, Request, Run, nak_of
+from mavftpfs.protocol.requests import NO_FILE_CODES, READ_POLICY, Operation, Request, Run, nak_of
 from mavftpfs.shared.errors import (
     DataUnproven,
     LocalProtocolError,
@@ -19,12 +19,10 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.ranges import Ranges
 
-SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
-"""Refusals that mean "no file is open" (servers.md 1)."""
-
-_LOST_CODES = SESSION_CODES | {NakCode.FAIL, NakCode.FILE_EXISTS, NakCode.EOF}
-"""Refusals of a read within the file's size that may mean it, too. MAVSDK says 1, or EOF when another client
-closed the file; PX4 says 8 for everything after one "file exists" (servers.md 1, 12). Reopening tells."""
+_LOST_CODES = NO_FILE_CODES | {NakCode.FILE_EXISTS, NakCode.EOF}
+"""Refusals of a read within the file's size that may mean "no file is open". MAVSDK says EOF when another
+client closed the file; PX4 says 8 for everything after one "file exists" (servers.md 1, 12). Reopening
+tells."""
 
 _READ = int(Opcode.READ_FILE)
 _NAK = int(Opcode.NAK)
@@ -296,7 +294,7 @@ class ReadToEof(Operation):
             ended = nak.code == NakCode.FILE_EXISTS and self._ends_short(index)
             if nak.code == NakCode.EOF or ended:
                 self._on_end(index)
-            elif nak.code in (NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND, NakCode.FAIL):
+            elif nak.code in NO_FILE_CODES:
                 self.fail(SessionLost(str(nak), by_server=True))
             else:
                 self.fail(nak)

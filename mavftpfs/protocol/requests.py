@@ -142,6 +142,10 @@ def encode(requests: Sequence[Request], *, waits: float) -> list[bytes]:
     return wires
 
 
+NO_FILE_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
+"""Refusals of a read or a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md
+1)."""
+
 Run: TypeAlias = list[tuple[Request, bytes]]
 """Requests of one operation and opcode that went out together, with the data of their ACKs."""
 
@@ -157,7 +161,6 @@ def nak_of(request: Request, reply: Payload, *, retransmitted: bool = False) -> 
 class Port(Protocol):
     """The part of the engine that an operation may know."""
 
-    session: int
     traits: Traits
 
     def timeout(self, policy: RetryPolicy) -> float:
@@ -210,9 +213,9 @@ class Operation:
         """Whether the operation needs nothing from the server, so that silence is no failure."""
         return False
 
-    def waits(self, now: float) -> bool:
-        """Return whether the operation needs something from the server. If it was idle before, its patience
-        starts now."""
+    def update_patience(self, now: float) -> bool:
+        """Stop the patience of an idle operation, and start that of one that needs the server again; return
+        whether it runs."""
         if self.idle:
             self.progress_at = inf
             return False

@@ -14,11 +14,17 @@ from typing import Protocol
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.operations import BEYOND
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import RETRY_POLICIES, WRITE_POLICY, Operation, Request, Run, nak_of
+from mavftpfs.protocol.requests import (
+    NO_FILE_CODES,
+    RETRY_POLICIES,
+    WRITE_POLICY,
+    Operation,
+    Request,
+    Run,
+    nak_of,
+)
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError, SessionLost
 from mavftpfs.shared.ranges import Ranges
-
-__all__ = ["ChunkSource", "Pieces", "WriteTransfer"]
 
 MAX_OFFSET = 1 << 32
 """Offsets are 32 bits on the wire; the end of a file must fit too (servers.md 14.27)."""
@@ -32,11 +38,6 @@ _ROW = 64
 
 _NO_FILE_ERRNOS = frozenset((0, 9))
 """PX4 says errno 0, or EBADF, to a write in a session that another client reset."""
-
-_SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
-"""Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
-MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting further."""
-
 
 _MOST_LISTINGS = 3
 """After so many listings of the root, with nothing ACKed between them, a refusal means what it says. A late
@@ -278,7 +279,9 @@ class WriteTransfer(Operation):
         return count if count <= request.size else 0
 
     def _meaning(self, nak: FtpNak) -> MavftpfsError:
-        if nak.code in _SESSION_CODES or nak.server_errno in _NO_FILE_ERRNOS:
+        # On MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting
+        # further.
+        if nak.code in NO_FILE_CODES or nak.server_errno in _NO_FILE_ERRNOS:
             lost = SessionLost(str(nak), by_server=True)
             lost.__cause__ = nak
             return lost

@@ -18,7 +18,7 @@ from mavftpfs.link.base import Link, Piece
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message
 from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.operations import Operation
+from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import RequestTimeout
 

@@ -13,7 +13,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Operation, Simple, parse_page
+from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple, parse_page
 from mavftpfs.protocol.payload import (
     MAX_DATA,
     PAYLOAD_SIZE,
@@ -21,6 +21,7 @@ from mavftpfs.protocol.payload import (
     Payload,
 )
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
+from mavftpfs.protocol.requests import Operation
 from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import usable_name

@@ -9,9 +9,9 @@ import pytest
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
+from mavftpfs.protocol.requests import Operation
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.shared.model import Traits

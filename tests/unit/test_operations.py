@@ -12,11 +12,11 @@ from mavftpfs.protocol.operations import (
     MAX_ENTRIES,
     ListDirectory,
     OpenRequest,
-    Operation,
     Simple,
     parse_page,
 )
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import Operation
 from mavftpfs.shared.errors import FtpNak, PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind
 from tests.support.replies import ack, nak, sent
