@@ -163,7 +163,7 @@ class Connection:
     def status(self) -> dict[str, dict[str, Any]]:
         """Return JSON-able facts: `vehicle` and `link` (docs/json.md, `status --json`), and details."""
         now, stats, link = self.clock(), self.engine.stats, self.link
-        heartbeat, server = self.vehicle.heartbeat, self.scheduler.server.session
+        heartbeat, server = self.vehicle.heartbeat, self.scheduler.server.opened
         details = {
             "autopilot": None if heartbeat is None else heartbeat.autopilot,
             "type": None if heartbeat is None else heartbeat.vehicle_type,

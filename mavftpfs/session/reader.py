@@ -25,8 +25,8 @@ class FileStream(SessionUser):
     expected_size: in bytes, if it is known without opening the file.
 
     Attributes:
-        size: by the first open ACK, in bytes; 0 before that. opened: ends when that ACK arrives, or with the
-            error of the open.
+        size: by the first open ACK, in bytes; 0 before that. first_open: ends when that ACK arrives, or with
+            the error of the open.
         closed: the sink is called no more.
     """
 
@@ -37,14 +37,14 @@ class FileStream(SessionUser):
         self._sink = sink
         self._scheduler = scheduler
         self._server = scheduler.server
-        self.opened = Future()
+        self.first_open = Future()
         self._wants = Wants()
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # bytes of that transfer
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
-            self.opened.end()
+            self.first_open.end()
         else:
             self.waiting_since = scheduler.clock()
 
@@ -59,7 +59,7 @@ class FileStream(SessionUser):
             self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
         if self._wants.idle:
-            self.failing_since, self.retry_at = None, -inf
+            self.barren_since, self.retry_at = None, -inf
         if self._transfer is not None:  # which knows what is in flight
             self._transfer.want(start, stop, demand)
         else:
@@ -73,7 +73,7 @@ class FileStream(SessionUser):
         """Drop all pending ranges; demand: False: only readahead. Requests in flight still bring their
         bytes."""
         self._wants.drop(demand=demand)
-        if self._transfer is None and self._wants.demand.todo.empty and self.opened.ended:
+        if self._transfer is None and self._wants.demand.todo.empty and self.first_open.ended:
             self.waiting_since = None
 
     def close(self) -> None:
@@ -90,11 +90,11 @@ class FileStream(SessionUser):
     @property
     def idle(self) -> bool:
         """See SessionUser."""
-        return self.closed or (self.opened.ended and self._wants.idle)
+        return self.closed or (self.first_open.ended and self._wants.idle)
 
     def goes_on(self, session: OpenSession) -> bool:
         """See SessionUser."""
-        return session.path == self.path and not session.writing and self.opened.ended
+        return session.path == self.path and not session.writing and self.first_open.ended
 
     def on_queued(self) -> None:
         """See SessionUser."""
@@ -108,9 +108,9 @@ class FileStream(SessionUser):
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in the reads that wait, and drop their ranges."""
         self.drop()
-        self.waiting_since = self.failing_since = None
-        if not self.opened.ended:
-            self.opened.end(error)
+        self.waiting_since = self.barren_since = None
+        if not self.first_open.ended:
+            self.first_open.end(error)
         elif not self.closed:
             self._sink.on_failed(error)
 
@@ -137,7 +137,7 @@ class FileStream(SessionUser):
                 self._scheduler.lose(self, error)
             except MavftpfsError as error:
                 self._fail(error)
-            if not self._wants.demand.todo.empty or not self.opened.ended:
+            if not self._wants.demand.todo.empty or not self.first_open.ended:
                 self.waiting_since = server.clock()
 
     async def _open(self, turn: Turn) -> None:
@@ -148,7 +148,7 @@ class FileStream(SessionUser):
             FileChanged: the file is smaller than at its first open. A larger one only grew, and is served at
                 its first size.
         """
-        server, session, first = self._server, self._server.session, not self.opened.ended
+        server, session, first = self._server, self._server.opened, not self.first_open.ended
         if session is None or not self.goes_on(session):
             session = await turn.open()
         if session.size is None:
@@ -159,7 +159,7 @@ class FileStream(SessionUser):
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
         if first:
             self.size = session.size
-            self.opened.end()
+            self.first_open.end()
         if not self.closed:
             self._sink.on_opened(session.opened_at)
         if first:
@@ -168,7 +168,7 @@ class FileStream(SessionUser):
                     await server.sleep(FIRST_WANT)
 
     async def _read(self, turn: Turn) -> None:
-        server, session = self._server, self._server.session
+        server, session = self._server, self._server.opened
         if session is None or self.idle:
             return  # `distrust` left the session meanwhile, or nothing is pending
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
@@ -179,7 +179,7 @@ class FileStream(SessionUser):
             transfer.by_requests = engine.in_flight > 0
         try:
             with server.running(transfer, self._on_batch):
-                while not (transfer.done or transfer.idle or self.closed or server.session is None):
+                while not (transfer.done or transfer.idle or self.closed or server.opened is None):
                     if turn.is_over() or (turn.contended and not transfer.demanded):
                         break
                     if isinstance(transfer, BurstTransfer):
@@ -199,7 +199,7 @@ class FileStream(SessionUser):
             return
         count = transfer.received_bytes - self._received
         if count:
-            self._received, self.failing_since = transfer.received_bytes, None
+            self._received, self.barren_since = transfer.received_bytes, None
             if not self.closed:
                 self._sink.on_batch(count)
         if transfer.idle or transfer.done:

@@ -108,7 +108,7 @@ class SessionUser:
         waiting_since: when it began to need a turn for more than readahead; None if it needs none. The user
             sets it; `Scheduler.turn` clears it at its end.
         writing: its turns are refused while nothing may be written.
-        failing_since: when its first turn without progress began; None after a progress, which is bytes that
+        barren_since: when its first turn without progress began; None after a progress, which is bytes that
         were read or ACKed. The user clears it. retry_at: the user waits for no turn before.
         loss: how its session was lost since then.
     """
@@ -117,7 +117,7 @@ class SessionUser:
         self.path = path
         self.waiting_since = waiting_since
         self.writing = writing
-        self.failing_since: float | None = None
+        self.barren_since: float | None = None
         self.retry_at = -inf
         self.loss: MavftpfsError | None = None
         self._used = 0.0
@@ -228,7 +228,7 @@ class Turn:
         if scheduler.is_excluded(user.path):
             return True
         lasted = now - self.began
-        barren = user.failing_since is not None and now - user.failing_since >= LONGEST_BARREN
+        barren = user.barren_since is not None and now - user.barren_since >= LONGEST_BARREN
         if barren and lasted < scheduler.server.longest_silence:
             return False
         used, rivals = user.used(self.began) + lasted, scheduler.waiting(now)
@@ -336,8 +336,8 @@ class Scheduler:
             turn = Turn(self, user)
             self._set_holder(turn)
             self.server.vehicle.require(self.clock(), writing=user.writing)
-            if user.failing_since is None:
-                user.failing_since, user.loss = turn.granted_at, None
+            if user.barren_since is None:
+                user.barren_since, user.loss = turn.granted_at, None
             yield turn
         finally:
             if turn is not None and self.holder is turn:
@@ -386,9 +386,9 @@ class Scheduler:
 
     def failure(self, user: SessionUser) -> MavftpfsError | None:
         """Return the error if a user made no progress for `op_deadline`, and let it begin anew."""
-        if user.failing_since is None or self.clock() - user.failing_since < self._op_deadline:
+        if user.barren_since is None or self.clock() - user.barren_since < self._op_deadline:
             return None
-        loss, user.loss, user.failing_since = user.loss, None, None
+        loss, user.loss, user.barren_since = user.loss, None, None
         return loss or RequestTimeout(f"no progress for {self._op_deadline:g} s")
 
     def lose(self, user: SessionUser, lost: SessionLost) -> None:
@@ -398,9 +398,9 @@ class Scheduler:
         self.server.lose(lost)
         now, cause, first = self.clock(), lost.__cause__, user.loss is None
         user.loss = cause if isinstance(cause, MavftpfsError) else lost
-        if user.failing_since is None:
-            user.failing_since = now
-        failing = now - user.failing_since
+        if user.barren_since is None:
+            user.barren_since = now
+        failing = now - user.barren_since
         pause = max(LEAST_PAUSE, min(failing, self._op_deadline - failing))
         user.retry_at = now if first else now + pause
 
@@ -432,7 +432,7 @@ class Scheduler:
 
     def _is_next(self, user: SessionUser) -> bool:
         """Return whether a user's turn begins now: it is next, nobody has a turn, no other file is open."""
-        session = self.server.session
+        session = self.server.opened
         closed = session is None or session.path == user.path
         return closed and self.holder is None and not self._tidying and self.next_user() is user
 
@@ -442,7 +442,7 @@ class Scheduler:
         now = self.clock()
         if waiting := self.waiting(now):
             return min(waiting, key=lambda user: user.score(now))
-        session = self.server.session
+        session = self.server.opened
         first = None
         for user in self._queue:
             if not user.idle and self._may_use(user, now):
@@ -456,7 +456,7 @@ class Scheduler:
         it."""
         if self._queue.get(user) is not None or self.is_excluded(user.path):
             return False
-        session = self.server.session
+        session = self.server.opened
         return now >= self.server.others_until or (session is not None and user.goes_on(session))
 
     # --- paths that are about to change
@@ -490,8 +490,8 @@ class Scheduler:
     def _used_paths(self) -> list[bytes]:
         """Return the paths of files that are open, may be open, or may be opened at any time."""
         used = [path for _, path in self.server.maybe_open]
-        if self.server.session is not None:
-            used.append(self.server.session.path)
+        if self.server.opened is not None:
+            used.append(self.server.opened.path)
         if self.holder is not None:
             used.append(self.holder.user.path)
         return used
@@ -545,7 +545,7 @@ class Scheduler:
         server = self.server
         self._tidying = True
         try:
-            if server.session is not None:
+            if server.opened is not None:
                 await server.close_quietly()
             else:
                 await server.close_maybe_open()
@@ -560,7 +560,7 @@ class Scheduler:
         is counted from the last turn, not from the last wake-up: wake-ups may never cease, and an orphaned
         session keeps other clients out.
         """
-        server, session = self.server, self.server.session
+        server, session = self.server, self.server.opened
         if self.holder is not None:
             return inf
         if session is not None:

@@ -1,6 +1,6 @@
 """The server's one session: what is open there, and what to do when it is taken. Layer: session.
 
-Two facts say what this connection opened: `session` is the file that is open, and `maybe_open` holds the
+Two facts say what this connection opened: `opened` is the file that is open, and `maybe_open` holds the
 files of which that is not known. One of them is always empty. The task that has the turn opens, uses and
 closes a file. Between turns the scheduler's janitor closes it. At any time `distrust` may move the open file
 to `maybe_open`, because another file may be open in its place.
@@ -78,7 +78,7 @@ class OpenSession:
     """A file that the server has open for this connection.
 
     size: in bytes, as the open ACK said; None where it said nothing. opened_at: when that ACK came. writing:
-    opened by OpenFileWO or CreateFile. seq: of that ACK. resent: its request was sent more than once.
+    opened by OpenFileWO or CreateFile. ack_seq: of that ACK. resent: its request was sent more than once.
     """
 
     path: bytes
@@ -86,7 +86,7 @@ class OpenSession:
     size: int | None
     opened_at: float
     writing: bool = False
-    seq: int = -1
+    ack_seq: int = -1
     resent: bool = False
 
 
@@ -97,7 +97,7 @@ class ServerSession:
     patient: see ConnectOptions.
 
     Attributes:
-        session: the open file; None if none is open, or if it was moved to `maybe_open`. transfer: the
+        opened: the open file; None if none is open, or if it was moved to `maybe_open`. transfer: the
         operation that reads or writes it now.
         maybe_open: (session id, path) of each file that this connection may have open: its open or its
         Terminate is not answered (yet), or `distrust` moved it here. The path is b"" if that is not known.
@@ -128,7 +128,7 @@ class ServerSession:
         self.clock = clock
         self.op_deadline = op_deadline
         self.patient = patient
-        self.session: OpenSession | None = None
+        self.opened: OpenSession | None = None
         self.transfer: Operation | None = None
         self.maybe_open: set[tuple[int, bytes]] = set()
         self.newest_open_at = -inf
@@ -167,14 +167,14 @@ class ServerSession:
             that this connection missed. Exceptions: its request to open takes nothing before the server
             answers, and an upload goes on because its file is compared afterwards.
         """
-        traits, used, session = self.engine.traits, self.others.hear(payload, self.clock()), self.session
+        traits, used, session = self.engine.traits, self.others.hear(payload, self.clock()), self.opened
         # Where servers echo ids, each client has one of its own.
         shared = not traits.ack_carries_own_session or used == self.engine.home_session
         took = shared and took_session(payload)
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
         # If no file was opened since reads were last distrusted, no more bytes are suspect.
-        opened = session is not None or self.newest_open_at >= self.epoch
-        self.distrust("another FTP client is active", reads=(took or missed) and opened)
+        suspect = session is not None or self.newest_open_at >= self.epoch
+        self.distrust("another FTP client is active", reads=(took or missed) and suspect)
         self.wake()
 
     def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
@@ -186,10 +186,10 @@ class ServerSession:
         MAVSDK has that file open in place of the present one.
         """
         self.quarantine.saw(lateness, self.clock())
-        opened = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
-        another = opened and (self.session is None or self.session.seq != reply.seq)
+        opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
+        another = opens and (self.opened is None or self.opened.ack_seq != reply.seq)
         why = "an answer came that no request explains"
-        self.distrust(why, reads=another and self.session is not None)
+        self.distrust(why, reads=another and self.opened is not None)
         if another:
             self.maybe_open.add((reply.session, b""))
             self.wake()
@@ -212,7 +212,7 @@ class ServerSession:
         ):
             return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
         elif reply.req_opcode in OPENING:
-            if self.session is None or self.session.seq != reply.seq:
+            if self.opened is None or self.opened.ack_seq != reply.seq:
                 self.on_unexplained(reply, late)
         elif reply.req_opcode == Opcode.WRITE_FILE:
             self.distrust("a WriteFile came after its file was closed", reads=False)
@@ -222,9 +222,9 @@ class ServerSession:
         before the next open. The server may have restarted meanwhile."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
-        if self.session is not None:
-            self.maybe_open.add((self.session.id, self.session.path))
-            self.session, self.engine.session = None, self.engine.home_session
+        if self.opened is not None:
+            self.maybe_open.add((self.opened.id, self.opened.path))
+            self.opened, self.engine.session = None, self.engine.home_session
         self.wake()
 
     def lose(self, lost: SessionLost) -> None:
@@ -298,13 +298,13 @@ class ServerSession:
             if opcode == Opcode.CREATE_FILE:
                 # If a server renames nothing, the caches compare the file only once, and a duplicate of this
                 # request may empty it after that.
-                repeated = self.session is None or self.session.resent
+                repeated = self.opened is None or self.opened.resent
                 counts = repeated and self.engine.traits.rename_works is False
                 now = self.clock()
                 self.quarantine.on_changed(path, now, now - tried.began if counts else 0.0)
-        if self.session is None:
+        if self.opened is None:
             raise _lost()
-        return self.session
+        return self.opened
 
     async def _opens(self, path: bytes, opcode: Opcode, tried: Tried) -> bool:
         """Ask to open a file once; return False if that is to be tried again."""
@@ -332,16 +332,16 @@ class ServerSession:
         open, before the task that asked runs again."""
         self.maybe_open.clear()
         self.others.on_ours_opened()
-        self.session = OpenSession(
+        self.opened = OpenSession(
             path,
             operation.session,
             operation.size,
             self.clock(),
             writing=operation.opcode != Opcode.OPEN_FILE_RO,
-            seq=operation.reply.seq,
+            ack_seq=operation.reply.seq,
             resent=tried.resent or operation.retransmitted,
         )
-        self.engine.session, self.newest_open_at = self.session.id, self.session.opened_at
+        self.engine.session, self.newest_open_at = self.opened.id, self.opened.opened_at
 
     # --- when the session is taken
 
@@ -417,7 +417,7 @@ class ServerSession:
             FtpNak: the server could not close the file. RequestTimeout: no answer; the file is in
                 `maybe_open`.
         """
-        session = self.session
+        session = self.opened
         if session is None:
             return True
         self.leave()
@@ -464,7 +464,7 @@ class ServerSession:
 
     def require_open(self, session: OpenSession) -> None:
         """Raise SessionLost unless this session is still open."""
-        if self.session is not session:
+        if self.opened is not session:
             raise _lost()
 
     @property
@@ -501,7 +501,7 @@ class ServerSession:
                 await self.driver.run(operation)
                 return operation
             except FtpNak as nak:
-                if self.session is not None or (changes and nak.retransmitted):
+                if self.opened is not None or (changes and nak.retransmitted):
                     raise
                 try:
                     await self._remedy(nak, tried)

@@ -170,7 +170,7 @@ class Store:
         stream = FileStream(path, sink, expected_size, self._scheduler)
         self._scheduler.add(stream, stream.run)
         try:
-            await stream.opened.wait()
+            await stream.first_open.wait()
         except BaseException:
             stream.close()
             raise

@@ -103,7 +103,7 @@ class Upload(SessionUser):
         if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._waits_for_finish, self.failing_since, self.retry_at = False, None, -inf
+        self._waits_for_finish, self.barren_since, self.retry_at = False, None, -inf
         finisher = Future()
         if not self.awaited:
             self._awaited_since = self._clock()
@@ -245,7 +245,7 @@ class Upload(SessionUser):
         next `finish`."""
         for finisher in finishers:
             finisher.end()
-        self.failing_since = None
+        self.barren_since = None
         self._waits_for_finish = self._source.has_checkpoint and not self._may_interrupt
 
     # --- opening
@@ -337,7 +337,7 @@ class Upload(SessionUser):
         Bytes that were ACKed before the session was lost are no progress."""
         transfer = self._transfer
         if self._source.reached > self._furthest:
-            self._furthest, self.failing_since = self._source.reached, None
+            self._furthest, self.barren_since = self._source.reached, None
         if transfer is not None and (transfer.idle or transfer.done):
             self._server.wake()
 
@@ -355,7 +355,7 @@ class Upload(SessionUser):
             # otherwise the transfer's own patience ends it.
             closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
-            if stalled and self.failing_since is not None:
+            if stalled and self.barren_since is not None:
                 raise SessionLost("no answer for a while during a write", by_server=False)
             if stalled and stop is None:
                 stop = Stop.YIELD

@@ -14,8 +14,9 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenRequest, Operation, Simple
+from mavftpfs.protocol.operations import OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.serversession import ServerSession
@@ -73,7 +74,7 @@ async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):
             await _do(scheduler, act, b"/f%d" % (number % 3))
-        session = server.session
+        session = server.opened
         assert session is None or not server.maybe_open
         assert server.engine.session == (server.engine.home_session if session is None else session.id)
         if act == "close maybe open" and not answers:
@@ -106,5 +107,5 @@ async def _do(scheduler: Scheduler, act: str, path: bytes) -> None:
 
 async def _change(scheduler: Scheduler, path: bytes) -> None:
     async with scheduler.excluded(path):
-        session = scheduler.server.session
+        session = scheduler.server.opened
         assert session is None or session.path != path

@@ -186,7 +186,7 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
         file = await up.tree.open(b"/d/f", write=True)
         await file.write(0, b"changed")
         assert bytes(await file.read(50, 10)) == content(100)[50:60]
-        assert up.connection.scheduler.server.session is not None
+        assert up.connection.scheduler.server.opened is not None
 
         def restart() -> None:
             here.faults.ignore(Opcode.TERMINATE_SESSION)

@@ -228,7 +228,7 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
             await read_or_doubt(connection, path(profile, "two"), two)
         assert copy.late is not None
         await trio.sleep(8)
-        assert connection.scheduler.server.session is None
+        assert connection.scheduler.server.opened is None
 
 
 @pytest.mark.holds("fault leaving")

@@ -206,7 +206,7 @@ async def test_a_whole_read_survives_a_lost_session(profile: str) -> None:
 
         async def close_it() -> None:
             await trio.sleep(2.0)
-            session = connection.scheduler.server.session
+            session = connection.scheduler.server.opened
             assert session is not None
             wire = request(777, Opcode.TERMINATE_SESSION, session=session.id).encode()
             now, own = trio.current_time(), connection.vehicle.own

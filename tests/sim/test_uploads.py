@@ -73,7 +73,7 @@ async def take_session(here: Rig, connection: Connection) -> None:
 
 def steal(here: Rig, connection: Connection, source: Address = STATION) -> None:
     """Have the session terminated; nobody hears it."""
-    session = connection.scheduler.server.session
+    session = connection.scheduler.server.opened
     wire = request(77, Opcode.TERMINATE_SESSION, session=session.id if session else 0).encode()
     here.vehicle.foreign_request(wire, source, trio.current_time(), audible=False)
 
@@ -254,7 +254,7 @@ async def test_arming_ends_it_while_it_waits_to_give_way() -> None:
         await trio.sleep(1.0)
         here.vehicle.arm()
         await trio.sleep(0.2)
-        assert connection.scheduler.server.session is None
+        assert connection.scheduler.server.opened is None
 
 
 @pytest.mark.parametrize("more", [b"", b"more"])
@@ -269,7 +269,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(profile: s
         source = MemorySource(content(2_000))
         upload = await start(connection, profile, source)
         await trio.sleep(0.5)
-        assert connection.scheduler.server.session is not None
+        assert connection.scheduler.server.opened is not None
         assert source.todo.empty
         assert source.in_flight.empty
         here.link.cut()
@@ -343,7 +343,7 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str) 
 
         async def steal_always() -> None:
             while True:
-                if connection.scheduler.server.session is not None:
+                if connection.scheduler.server.opened is not None:
                     steal(here, connection, connection.vehicle.own)
                 await trio.sleep(0.3)
 
