@@ -65,7 +65,7 @@ class Engine:
     Attributes:
         on_unexplained: called with each reply beyond one for each transmission of its request, and with the
             seconds since the request went out (None if that is not known).
-        on_late: called with each ACK to a request whose operation has ended or was cancelled.
+        on_unawaited: called with each ACK to a request whose operation has ended or was cancelled.
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
     """
@@ -77,7 +77,7 @@ class Engine:
         self.traits = Traits()
         self.stats = EngineStats()
         self.on_unexplained: Callable[[Payload, float | None], None] = lambda reply, lateness: None
-        self.on_late: Callable[[Payload, Request], None] = lambda reply, request: None
+        self.on_unawaited: Callable[[Payload, Request], None] = lambda reply, request: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
@@ -191,7 +191,7 @@ class Engine:
             self._on_answers(request, 1, now)
         if op is ledger.ghost:
             if reply.opcode == Opcode.ACK:
-                self.on_late(reply, request)
+                self.on_unawaited(reply, request)
         elif reply.opcode == _NAK and self._session_changed(request, reply):
             request.stale = True
             op.on_lost(request, now)

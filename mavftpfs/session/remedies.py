@@ -28,8 +28,9 @@ SILENCE_PX4 = 10.5
 """Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
 
 TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
-_OPEN_TAKEN = TAKEN | {NakCode.FILE_EXISTS}
-"""NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
+MAYBE_TAKEN = TAKEN | {NakCode.FILE_EXISTS}
+"""NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open or a
+Terminate."""
 
 
 class Holder(Enum):
@@ -65,7 +66,7 @@ def left_open(nak: FtpNak, tried: Tried, *, echoes: bool) -> bool:
     """
     if nak.code == NakCode.FAIL:
         return nak.retransmitted or (echoes and not tried.remedies[Holder.OURS])
-    return nak.retransmitted and nak.code in _OPEN_TAKEN
+    return nak.retransmitted and nak.code in MAYBE_TAKEN
 
 
 def holder(nak: FtpNak, tried: Tried, *, ours: bool, another: bool) -> Holder:
@@ -73,7 +74,7 @@ def holder(nak: FtpNak, tried: Tried, *, ours: bool, another: bool) -> Holder:
     another client may have a file open."""
     if nak.code == NakCode.FAIL:
         return Holder.OURS if ours else Holder.NOBODY
-    if nak.code not in (_OPEN_TAKEN if tried.opens else TAKEN):
+    if nak.code not in (MAYBE_TAKEN if tried.opens else TAKEN):
         return Holder.NOBODY
     if nak.code == NakCode.FILE_EXISTS and not tried.remedies[Holder.HIDDEN]:
         return Holder.HIDDEN

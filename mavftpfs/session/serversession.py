@@ -21,7 +21,7 @@ from typing import TypeVar
 import trio
 
 from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Request
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import (
@@ -34,6 +34,7 @@ from mavftpfs.session.others import (
 )
 from mavftpfs.session.quarantine import LASTS, Quarantine
 from mavftpfs.session.remedies import (
+    MAYBE_TAKEN,
     SILENCE_ARDUPILOT,
     SILENCE_PX4,
     TAKEN,
@@ -64,9 +65,6 @@ _OFTEN = 0.25
 
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
-
-_NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
-"""Refusals of a Terminate if no such session exists; 8 is PX4's sticky errno."""
 
 _IN_USE = "the vehicle's only FTP session is in use by another client"
 
@@ -123,7 +121,7 @@ class ServerSession:
     ) -> None:
         self.driver = driver
         self.engine = driver.engine
-        self.engine.on_unexplained, self.engine.on_late = self.on_unexplained, self.on_late
+        self.engine.on_unexplained, self.engine.on_unawaited = self.on_unexplained, self.on_unawaited
         self.vehicle = driver.vehicle
         self.clock = clock
         self.op_deadline = op_deadline
@@ -194,7 +192,7 @@ class ServerSession:
             self.maybe_open.add((reply.session, b""))
             self.wake()
 
-    def on_late(self, reply: Payload, request: Request) -> None:
+    def on_unawaited(self, reply: Payload, request: Request) -> None:
         """Take an ACK that no operation waits for, because another transmission was answered or the operation
         was cancelled.
 
@@ -202,19 +200,16 @@ class ServerSession:
         may have put its bytes into a later file. A late RENAME or REMOVE may have taken a later file away if
         it came after the quarantine of its name.
         """
-        late = self.clock() - request.first_sent
+        late, newest = self.clock() - request.first_sent, request.first_sent >= self.newest_open_at
         if reply.req_opcode in (Opcode.RENAME, Opcode.REMOVE_FILE):
             name, _, _ = request.data.partition(b"\0")
             if not self.quarantine.left(name, self.clock()):
                 self.on_unexplained(reply, late)
-        elif request.first_sent >= self.newest_open_at and (
-            self.maybe_open or reply.req_opcode not in OPENING
-        ):
-            return  # an open whose file is in `maybe_open`, or a WriteFile to the last file
         elif reply.req_opcode in OPENING:
-            if self.opened is None or self.opened.ack_seq != reply.seq:
+            cancelled = newest and self.maybe_open  # which has its file
+            if not cancelled and (self.opened is None or self.opened.ack_seq != reply.seq):
                 self.on_unexplained(reply, late)
-        elif reply.req_opcode == Opcode.WRITE_FILE:
+        elif reply.req_opcode == Opcode.WRITE_FILE and not newest:
             self.distrust("a WriteFile came after its file was closed", reads=False)
 
     def leave(self) -> None:
@@ -354,10 +349,9 @@ class ServerSession:
             SessionBusy: nothing is left that could help. RequestTimeout: a remedy was not answered.
         """
         now = self.clock()
-        another = now < self.others_until
-        closable = self.maybe_open and (self.engine.traits.ack_carries_own_session or not another)
-        ours = tried.opens and bool(closable) and now - tried.began < self.op_deadline
-        who = holder(nak, tried, ours=ours, another=another)
+        in_time = now - tried.began < self.op_deadline
+        ours = tried.opens and bool(self.maybe_open) and self._may_terminate and in_time
+        who = holder(nak, tried, ours=ours, another=now < self.others_until)
         tries = tried.remedies[who]
         tried.remedies[who] += 1
         match who, tries:
@@ -429,7 +423,7 @@ class ServerSession:
                 return True
         except FtpNak as nak:
             self._forget(left)
-            if nak.code not in _NOT_OPEN:
+            if nak.code not in MAYBE_TAKEN:
                 raise
             # The file was in use when the first transmission went out.
             closed = nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
@@ -457,10 +451,15 @@ class ServerSession:
         """
         for session in {session for session, _ in self.maybe_open}:
             left = {one for one in self.maybe_open if one[0] == session}
-            # MAVSDK ends the session of another client, whatever id is asked for.
-            if self.engine.traits.ack_carries_own_session or self.clock() >= self.others_until:
+            if self._may_terminate:
                 await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
             self._forget(left)
+
+    @property
+    def _may_terminate(self) -> bool:
+        """Whether a Terminate ends no other client's session. Where ids are shared, it ends the session of
+        the client that has it."""
+        return bool(self.engine.traits.ack_carries_own_session) or self.clock() >= self.others_until
 
     def require_open(self, session: OpenSession) -> None:
         """Raise SessionLost unless this session is still open."""

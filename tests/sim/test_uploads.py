@@ -476,6 +476,15 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool) ->
         assert source.all_proven
 
 
+async def test_so_does_one_whose_place_other_clients_took() -> None:
+    """ArduPilot closes a session that was idle for long, and has none left for the id of the Terminate."""
+    async with uploading(content(3000), profile="ardupilot5", known=False) as (here, source, upload):
+        here.faults.refuse(Opcode.TERMINATE_SESSION, NakCode.NO_SESSIONS_AVAILABLE)
+        await upload.finish()
+        assert source.rollbacks == 1
+        assert source.all_proven
+
+
 @pytest.mark.parametrize("between", [Opcode.LIST_DIRECTORY, Opcode.CREATE_DIRECTORY])
 async def test_a_terminate_done_twice_is_done(between: Opcode) -> None:
     """The first one's reply is lost, and another request in between ends PX4's replay: NAK 4 to the second,
