@@ -20,7 +20,7 @@ import trio
 from mavftpfs.cache.attributes import SECOND
 from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.directories import Directories, Directory
-from mavftpfs.cache.file import Event, File, Replaces
+from mavftpfs.cache.file import Event, File, Replaces, State
 from mavftpfs.cache.items import Folder, Item
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.options import CacheOptions
@@ -212,6 +212,8 @@ class Card:
         it, and read only bytes that programs wrote."""
         self.closed.pop(file, None)
         file.leave_tree()
+        if file.state is State.STALE:
+            file.on(Event.DROPPED)
         self.names.settle(file)  # nothing of it is to be committed
         file.has_part = False
         file.content.on_unneeded()

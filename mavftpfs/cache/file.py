@@ -5,9 +5,13 @@ handles of a file share them. TRANSITIONS is the table of the states.
 
     CLEAN    the vehicle has the content
     DIRTY    the vehicle lacks some of the content: the changes are pending
-    STALE    others replaced the vehicle's file. With pending changes the file keeps its name here until a
-             program empties or removes it, but its deliveries fail; otherwise it lost the name
-    BROKEN   a program was told that a write failed, so no byte of the file is committed; it lost its name
+    STALE    others replaced the vehicle's file below pending changes, which cannot be delivered; the file
+             keeps its name here until a program empties or removes it
+    DEAD     the name is another file's, and nothing is pending: handles get FileChanged
+    BROKEN   a program was told that a write failed, so no byte of the file is committed
+
+A file that is DEAD or BROKEN has no name, and no event mends it. A file that is CLEAN or DIRTY has none if
+this mount removed it: its handles go on with what was written here.
 
 What a delivery may replace under the file's name follows from the base, and from how many bytes of it are to
 stay; see Replaces.
@@ -45,6 +49,7 @@ class State(Enum):
     CLEAN = "clean"
     DIRTY = "dirty"
     STALE = "stale"
+    DEAD = "dead"
     BROKEN = "broken"
 
 
@@ -53,14 +58,15 @@ class Event(Enum):
 
     CHANGED: a program made it, wrote or truncated it. EMPTIED: a program truncated it to nothing, so the base
     does not matter. COMMITTED: the vehicle has all of it under its name, verified. REPLACED: others replaced
-    the vehicle's file, and bytes of that matter. FAILED: a write was answered with an error after others had
-    been taken.
+    the vehicle's file, and bytes of that matter. DROPPED: the pending changes were forgotten. FAILED: a write
+    was answered with an error after others had been taken.
     """
 
     CHANGED = "changed"
     EMPTIED = "emptied"
     COMMITTED = "committed"
     REPLACED = "replaced"
+    DROPPED = "dropped"
     FAILED = "failed"
 
 
@@ -68,19 +74,22 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.CLEAN: {
         Event.CHANGED: State.DIRTY,
         Event.EMPTIED: State.DIRTY,
-        Event.REPLACED: State.STALE,
+        Event.REPLACED: State.DEAD,
     },
     State.DIRTY: {
         Event.CHANGED: State.DIRTY,
         Event.EMPTIED: State.DIRTY,
         Event.COMMITTED: State.CLEAN,
         Event.REPLACED: State.STALE,
+        Event.DROPPED: State.DEAD,
         Event.FAILED: State.BROKEN,
     },
     State.STALE: {
         Event.EMPTIED: State.DIRTY,
         Event.REPLACED: State.STALE,
+        Event.DROPPED: State.DEAD,
     },
+    State.DEAD: {},
     State.BROKEN: {},
 }
 """State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""
@@ -237,14 +246,19 @@ class File(Item):
         return self.changes != unsure.changes
 
     def require_alive(self) -> None:
-        """Raise FileChanged if others replaced the file: no handle reads it from then on."""
-        if self.state is State.STALE and not self.has_name:
+        """Raise FileChanged if no handle may read the file, nor empty it."""
+        if self.state is State.DEAD:
             raise FileChanged(f"{self.path!r} was replaced on the vehicle")
+
+    def require_not_stale(self) -> None:
+        """Raise FileChanged if others replaced the vehicle's file, so that no program may change this one."""
+        self.require_alive()
+        if self.state is State.STALE:
+            raise FileChanged(f"{self.path!r} is another file by now")
 
     def require_base(self) -> None:
         """Raise FileChanged unless the vehicle's file of this name is the file's own."""
-        if self.state is State.STALE:
-            raise FileChanged(f"{self.path!r} is another file by now")
+        self.require_not_stale()
         if not self.has_name:
             raise FileChanged(f"what was {self.path!r} is gone from the vehicle")
 

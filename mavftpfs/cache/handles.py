@@ -140,7 +140,7 @@ class WriteHandle(ReadHandle):
         """Take all of `data`; see OpenFile.write."""
         stop = offset + len(data)
         async with self._changing(stop) as file:
-            writing.require_not_stale(file)
+            file.require_not_stale()
             self._card.throttle.require_sendable(file, max(file.size, stop))
             writing.write(self._card, file, offset, data)
         return len(data)
@@ -148,8 +148,9 @@ class WriteHandle(ReadHandle):
     async def truncate(self, size: int) -> None:
         """Cut or extend; see OpenFile.truncate."""
         async with self._changing(size, empties=not size and self.file.size > 0) as file:
-            if not file.has_name or size:
-                writing.require_not_stale(file)
+            file.require_alive()
+            if size:
+                file.require_not_stale()
             if size == file.size and file.state is not State.STALE:
                 return
             if size:
@@ -221,7 +222,7 @@ class WriteHandle(ReadHandle):
         file = self.file
         if isinstance(error, FileTooLarge) and file.is_new_and_empty:
             return
-        if self in file.changers and file.undelivered and file.state is not State.STALE:
+        if self in file.changers and file.undelivered and file.state is State.DIRTY:
             await writing.break_off(self._card, file, error)
 
     async def _deliver(self, *, closing: bool = False, ends_write: bool = False) -> None:

@@ -10,7 +10,7 @@
 **While a program has it open** the vehicle's session is closed and opened again: after losses, restarts, and
 turns of other users. The reply to an open tells the size, and a listing that began after it the mtime, where
 listings tell any. A file that is equal, or larger, is the same, because logs grow; handles read up to the
-size that it had when a program last opened it. If another file has the name, the file is STALE: its handles
+size that it had when a program last opened it. If another file has the name, the file is DEAD: its handles
 get FileChanged, and the name gets another File. Between two comparisons (COMPARE_PAUSE) a program may get
 bytes of the next version. The comparison at the file's end finds that out, so a program that reads to the end
 gets the error.
@@ -391,9 +391,8 @@ def lose_base(card: Card, file: File) -> None:
     file.blocks.end(FileChanged(f"{file.path!r} changed on the vehicle after it was opened"))
     if file.state is State.DIRTY and file.replaces is not Replaces.BASE:
         return
-    kept = file.undelivered
     file.on(Event.REPLACED)
-    if not kept:
+    if file.state is State.DEAD:
         card.lose_name(file)
 
 

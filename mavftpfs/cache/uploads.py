@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.cache import verify
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Attempt, File, Replaces, State
+from mavftpfs.cache.file import Attempt, File, Replaces
 from mavftpfs.cache.temporary import Kind
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -57,8 +57,7 @@ def require_deliverable(card: Card, file: File) -> None:
     Raises:
         FileChanged: the vehicle has another file there now. NotSupported: that cannot be replaced safely.
     """
-    if file.state is State.STALE:
-        raise FileChanged("others replaced the file on the vehicle while it was changed here")
+    file.require_not_stale()
     in_place = card.store.traits.rename_works is False
     if in_place and file.replaces in (Replaces.BASE, Replaces.ANYTHING) and not card.options.inplace:
         raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")

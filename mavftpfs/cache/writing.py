@@ -23,7 +23,7 @@ import trio
 from mavftpfs.cache import reading, uploads
 from mavftpfs.cache.blocks import NEVER
 from mavftpfs.cache.card import Card
-from mavftpfs.cache.file import Attempt, Event, File, State
+from mavftpfs.cache.file import Attempt, Event, File
 from mavftpfs.cache.temporary import require_writable
 from mavftpfs.shared.errors import (
     FileBusy,
@@ -115,12 +115,6 @@ async def made(card: Card, path: bytes) -> File | None:
 
 
 # --- changing (the caller has the file's lock)
-
-
-def require_not_stale(file: File) -> None:
-    """Raise FileChanged if others replaced the vehicle's file below pending changes."""
-    if file.state is State.STALE:
-        raise FileChanged(f"{file.path!r} is another file by now")
 
 
 def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None:
@@ -283,7 +277,7 @@ async def drop(card: Card, file: File) -> None:
     The file loses its name before this waits for anything, because the caller may be cancelled.
     """
     path, attempt = file.path, _detach(card, file)
-    file.on(Event.REPLACED)
+    file.on(Event.DROPPED)
     card.lose_name(file)
     file.forget_content()
     file.content.on_opened(0 if file.base is None else file.base.size)

@@ -24,15 +24,17 @@ def check_file(card: Card, file: File) -> None:
     if file.unsure is not None:
         assert is_live
         assert file.has_name
-        assert file.state in (State.DIRTY, State.STALE)
+        assert file.state is State.DIRTY
         assert content.whole
     if file.has_part:
         assert file.state is not State.CLEAN
     # The states.
-    if file.state is State.DIRTY:
+    if file.state in (State.DIRTY, State.STALE):
         assert file.is_local
         assert is_live
-    if file.state is State.BROKEN:
+    if file.state is State.STALE:
+        assert file.has_name
+    if file.state in (State.DEAD, State.BROKEN):
         assert not file.has_name
         assert file.attempt is None
     if file.is_local:  # bytes that are not here are the base's

@@ -52,6 +52,7 @@ def make_file() -> File:
 def test_every_event_has_its_place_in_the_table() -> None:
     assert {event for events in TRANSITIONS.values() for event in events} == set(Event)
     assert not TRANSITIONS[State.BROKEN], "nothing mends a broken file"
+    assert not TRANSITIONS[State.DEAD]
     for state in State:
         for event in set(Event) - TRANSITIONS[state].keys():
             file = make_file()
@@ -62,11 +63,12 @@ def test_every_event_has_its_place_in_the_table() -> None:
 
 
 def test_what_may_be_read_of_a_file_that_lost_something() -> None:
-    replaced = make_file()
-    replaced.on(Event.REPLACED)
-    replaced.require_alive()  # it has its name: its pending changes are shown
-    replaced.leave_tree()
-    for require in (replaced.require_alive, replaced.require_base):
+    stale, dead = make_file(), make_file()
+    stale.on(Event.CHANGED)
+    for replaced in (stale, dead):
+        replaced.on(Event.REPLACED)
+    stale.require_alive()  # its pending changes are shown
+    for require in (stale.require_base, stale.require_not_stale, dead.require_alive, dead.require_base):
         with pytest.raises(FileChanged):
             require()
     removed = make_file()
