@@ -124,14 +124,7 @@ def write(card: Card, file: File, offset: int, data: bytes | memoryview) -> None
         NoSpace, SpoolFailed: nothing changed.
     """
     if len(data):
-        was_local = file.is_local
-        file.content.spool(card.spool, file.path)
-        try:
-            _with_room(card, partial(file.content.write, offset, data))
-        except MavftpfsError:
-            if not was_local:  # otherwise later opens would not ask the vehicle
-                file.forget_content()
-            raise
+        _change(card, file, partial(file.content.write, offset, data))
         _on_changed(card, file, offset, Event.CHANGED)
 
 
@@ -142,14 +135,29 @@ def truncate(card: Card, file: File, size: int) -> None:
         NoSpace, SpoolFailed: nothing changed.
     """
     before = file.size
-    file.content.spool(card.spool, file.path)
-    _with_room(card, partial(file.content.truncate, size))
+    _change(card, file, partial(file.content.truncate, size))
     _on_changed(card, file, min(before, size), Event.CHANGED if size else Event.EMPTIED)
     if not size:  # what was written before is gone, and so is the error that kept it from the vehicle
         file.changers.clear()
         file.error = None
         if file.has_name:
             card.forget_broken(file.path)
+
+
+def _change(card: Card, file: File, change: Callable[[], None]) -> None:
+    """Change a file's content, from now on in the spool.
+
+    Raises:
+        NoSpace, SpoolFailed: nothing changed.
+    """
+    was_local = file.is_local
+    file.content.spool(card.spool, file.path)
+    try:
+        _with_room(card, change)
+    except MavftpfsError:
+        if not was_local:  # otherwise later opens would not ask the vehicle
+            file.forget_content()
+        raise
 
 
 def _with_room(card: Card, change: Callable[[], None]) -> None:

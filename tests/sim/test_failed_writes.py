@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trio
@@ -205,18 +206,23 @@ async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
     assert here.data(FRESH) == PART
 
 
+@pytest.mark.parametrize(
+    "change",
+    [lambda file: file.write(0, b"new"), lambda file: file.truncate(len(OLD) + 1)],
+    ids=["write", "truncate"],
+)
 @pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
-async def test_a_first_write_that_the_local_disk_refused_leaves_a_file_that_is_read_as_before(
-    profile: str, monkeypatch: pytest.MonkeyPatch
+async def test_a_first_change_for_which_there_is_no_room_leaves_a_file_that_is_read_as_before(
+    profile: str, change: Callable[[OpenFile], Awaitable[Any]]
 ) -> None:
     """Whoever opens the file later gets the one that others put there since."""
     async with rig(profile, {FILE: OLD}) as here:
         tree = await mount(here)
         assert await read_file(tree, FILE) == OLD
         file = await tree.open(FILE, write=True)
-        await failing_disk(errno.ENOSPC)(here, monkeypatch)
+        tree._card.spool.spool_max = 0
         with pytest.raises(NoSpace):
-            await file.write(0, b"new")
+            await change(file)
         assert not list(tree.undelivered())
         here.replace(FILE, OLD[::-1], 1_700_000_000)
         await trio.sleep(60.0)

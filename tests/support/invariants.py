@@ -32,6 +32,8 @@ def check_file(card: Card, file: File) -> None:
     if file.state in (State.DIRTY, State.STALE):
         assert file.is_local
         assert is_live
+    if file.state is State.CLEAN and file.is_local:
+        assert content.whole
     if file.state is State.STALE:
         assert file.has_name
     if file.state in (State.DEAD, State.BROKEN):
