@@ -185,7 +185,7 @@ class Engine:
         ledger.on_answered(request)
         if not late or op is not ledger.ghost:
             if late:
-                self.flow.on_spurious()
+                self.flow.path.on_spurious()
                 self._timers.reordering.on_needless(now)
                 ledger.on_late(request)
             self._on_answers(request, 1, now)
@@ -258,7 +258,7 @@ class Engine:
     def _lose(self, request: Request, now: float) -> None:
         """Declare a request lost. Its operation asks again, unless that has ended."""
         op = request.op
-        self.flow.on_loss()
+        self.flow.path.on_loss()
         self._ledger.retire(request)
         if op is not self._ledger.ghost:
             self.stats.lost += 1
@@ -292,7 +292,7 @@ class Engine:
             if op.done:
                 self.remove(op)
         if unused:
-            self.flow.on_app_limited()
+            self.flow.path.on_app_limited()
         return wires
 
     def hold(self, now: float) -> None:
@@ -396,9 +396,9 @@ class Engine:
         """Return when a request's timer runs out, by the round trips known now, because they may have grown
         since it went out. ArduPilot answers nothing else during a burst, so silence proves nothing then
         (servers.md 4)."""
-        policy, op, flow = request.policy, request.op, self.flow
+        policy, op, path = request.policy, request.op, self.flow.path
         quiet = max(0.0, request.sent_at - op.progress_at)
         due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(policy, quiet)
-        paused = policy.ordered and not flow.app_limited and self.in_flight > _FEW
+        paused = policy.ordered and not path.app_limited and self.in_flight > _FEW
         # A stream of other answers is no pause.
-        return max(due, min(due, self._heard_at) + (flow.pause if paused else 0.0))
+        return max(due, min(due, self._heard_at) + (path.pauses.length if paused else 0.0))

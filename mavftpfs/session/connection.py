@@ -185,7 +185,7 @@ class Connection:
             "link": {
                 "state": self._link_state(now),
                 "rtt": self.engine.rtt,
-                "loss": round(self.engine.flow.loss, 4),
+                "loss": round(self.engine.flow.path.loss, 4),
                 "other_ftp_client": self.vehicle.another_client_heard(now),
                 "waits_for": self.scheduler.waits_for,
                 "received_bytes": link.stats.received_bytes,
@@ -208,7 +208,7 @@ class Connection:
         silent = self.vehicle.heartbeat_at is not None and self.vehicle.silence(now) > SILENCE_LIMIT
         if silent or self.vehicle.lost(now):
             return "lost"
-        return "lossy" if self.engine.flow.loss >= LOSSY else "fine"
+        return "lossy" if self.engine.flow.path.loss >= LOSSY else "fine"
 
     # --- what the vehicle tells
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.protocol.bucket import Bucket
-from mavftpfs.protocol.flow import CHUNK_COST, OVERHEAD, Flow
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.networkpath import CHUNK_COST, OVERHEAD
 
 
 def test_so_much_goes_out_in_the_long_run_and_little_at_once() -> None:

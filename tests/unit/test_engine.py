@@ -417,11 +417,11 @@ def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does
     for request in first:
         engine.receive(chunk(request, bytes(SIZE)), 0.05)
     engine.flow.window = 1 + others
-    engine.flow._pauses.length = 0.3
+    engine.flow.path.pauses.length = 0.3
     waiting = sent(engine, 0.05)
     assert len(waiting) == 1 + others
     engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
-    engine.flow._pauses.length = 0.3
+    engine.flow.path.pauses.length = 0.3
     sent(engine, 0.1)
     engine.on_deadline(0.35)
     assert (engine.stats.lost == 0) is patient

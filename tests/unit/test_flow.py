@@ -1,4 +1,4 @@
-"""The in-flight window: what it does on paths whose every round trip is known.
+"""The in-flight window, and what is known of the network path: on paths whose every round trip is known.
 
 What it brings over whole links, with servers that pause or queue little: tests/sim/test_shares.py and
 test_latency.py.
@@ -10,7 +10,7 @@ import random
 
 import pytest
 
-from mavftpfs.protocol.flow import MOST_SERIAL, Flow
+from mavftpfs.protocol.flow import MOST_SERIAL, SILENT, Flow
 
 
 class Path:
@@ -19,6 +19,7 @@ class Path:
 
     def __init__(self, *, rate: float, base: float, rounds: int = 0, serial: bool = False) -> None:
         self.flow = Flow(serial=serial)
+        self.known = self.flow.path
         self.rate = rate
         self.base = base
         self.now = 0.0
@@ -37,7 +38,7 @@ class Path:
         for index in range(window):
             self.now += rtt / window
             if index < lost:
-                self.flow.on_loss()
+                self.known.on_loss()
             else:
                 self.flow.on_replies(self.now, rtt, 1, first + index, self.order)
 
@@ -50,7 +51,7 @@ def test_random_loss_does_not_shrink_it() -> None:
     path = Path(rate=1000.0, base=0.1, rounds=20)
     path.rounds(150, lost=10)
     assert path.window >= 80
-    assert path.flow.loss == pytest.approx(10 / path.window, rel=0.2)
+    assert path.known.loss == pytest.approx(10 / path.window, rel=0.2)
 
 
 def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
@@ -80,7 +81,7 @@ def test_an_application_limited_round_proves_nothing() -> None:
     path = Path(rate=1000.0, base=0.1, rounds=20)
     before = path.window
     for _ in range(30):
-        path.flow.on_app_limited()
+        path.known.on_app_limited()
         path.flow.on_replies(path.now + 1.0, 0.1, 1, path.order, path.order + 1)
         path.order += 1
         path.now += 1.0
@@ -90,8 +91,8 @@ def test_an_application_limited_round_proves_nothing() -> None:
 def test_silence_probes_with_two_until_something_is_heard() -> None:
     path = Path(rate=1000.0, base=0.1, rounds=20)
     before = path.window
-    path.flow.on_silence()
-    path.flow.on_silence()
+    path.flow.on_silence(SILENT)
+    path.flow.on_silence(SILENT)
     assert path.window == 2
     path.flow.on_replies(path.now + 5.0, None, 1, 0, path.order)
     assert path.window == before // 2
@@ -165,18 +166,18 @@ def beyond(path: Path, after: float) -> int:
 def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
     path = paused()
     path.rounds(30)
-    usual = path.flow._reserve()
+    usual = path.known.reserve
     path.rounds(5, lost=10)
-    assert path.flow._reserve() < 0.5 * usual
+    assert path.known.reserve < 0.5 * usual
 
 
 def test_what_overflows_while_a_card_pauses_is_no_loss_of_the_link() -> None:
     path = paused()
     path.rounds(1, lost=path.window // 2)
-    assert path.flow.loss == 0.0
+    assert path.known.loss == 0.0
     path.rounds(10)
     path.rounds(60, lost=path.window // 10)
-    assert 0.03 < path.flow.loss < 0.15
+    assert 0.03 < path.known.loss < 0.15
 
 
 def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
