@@ -344,8 +344,10 @@ class Directories:
         """
         if path == self._options.root:
             await self._walk_to_root()
-        elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{path!r} is not a directory")
+        elif path != ROOT:
+            found, item = await self.find(path), self.root.find(path)
+            if found.entry.kind is not EntryKind.DIRECTORY or (item is not None and item.is_local):
+                raise NotADirectory(f"{path!r} is not a directory")
         while True:
             with trio.move_on_after(LOOK if until_lost else inf):
                 directory = await self._swept(path)

@@ -186,7 +186,7 @@ class File(Item):
 
     @property
     def is_local(self) -> bool:
-        """Whether programs are answered from here, whatever a listing says."""
+        """See Item."""
         return self.content.spooled is not None
 
     @property

@@ -95,6 +95,11 @@ class Item:
         """Whether the item is what its folder knows by this name."""
         return self.folder is None or self.folder.children.get(self.name) is self
 
+    @property
+    def is_local(self) -> bool:
+        """Whether programs are answered from here, whatever a listing says."""
+        return False
+
     def leave_tree(self) -> None:
         """Leave the tree; twice is harmless."""
         if self.folder is not None and self.has_name:

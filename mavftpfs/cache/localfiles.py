@@ -47,6 +47,11 @@ class LocalFile(Item):
         self.data = bytearray()
         self.handles = 0
 
+    @property
+    def is_local(self) -> bool:
+        """See Item."""
+        return True
+
 
 def stays_local(path: bytes) -> bool:
     """Return whether a name in a path is one of those that never reach the vehicle."""

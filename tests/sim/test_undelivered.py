@@ -27,6 +27,7 @@ from mavftpfs.shared.errors import (
     FileChanged,
     MavftpfsError,
     NoSpace,
+    NotADirectory,
     NotDeliveredYet,
     OutcomeUnknown,
     RequestTimeout,
@@ -559,3 +560,25 @@ async def test_a_program_that_overwrites_every_byte_makes_nothing_be_fetched(her
     await file.release()
     assert here.data(FILE) == OLD[::-1]
     assert here.count(Opcode.READ_FILE, Opcode.BURST_READ_FILE) == 0
+
+
+@pytest.mark.parametrize("truncate", [True, False])
+@pytest.mark.parametrize("asked", [b"/d/file.txt", b"/d/file.txt/below"])
+async def test_a_directory_that_others_put_in_the_place_of_a_file_that_is_written(
+    here: Rig, tree: Tree, truncate: bool, asked: bytes
+) -> None:
+    """A program that looks into it is told that it is a file, and takes nothing from the one that writes."""
+    file = await tree.open(FILE, write=True, truncate=truncate)
+    await file.write(0, BIG)
+    here.take(FILE)
+    here.put_directory(FILE)
+    tree.forget_caches()
+    with pytest.raises(NotADirectory):
+        await tree.list(asked)
+    if truncate:
+        await file.release()
+        assert here.data(FILE) == BIG
+    else:
+        with pytest.raises(FileChanged):
+            await file.release()
+        assert tree.undelivered() == [FILE]
