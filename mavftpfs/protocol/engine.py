@@ -183,16 +183,18 @@ class Engine:
         """Take a believed reply."""
         ledger, op, late = self._ledger, request.op, not request.outstanding
         ledger.on_answered(request)
-        if not late or op is not ledger.ghost:
-            if late:
-                self.flow.path.on_spurious()
-                self._timers.reordering.on_needless(now)
-                ledger.on_late(request)
-            self._on_answers(request, 1, now)
         if op is ledger.ghost:
+            if not late:
+                self._on_answers(request, 1, now)
             if reply.opcode == Opcode.ACK:
                 self.on_unawaited(reply, request)
-        elif reply.opcode == _NAK and self._session_changed(request, reply):
+            return
+        if late:
+            self.flow.path.on_spurious()
+            self._timers.reordering.on_needless(now)
+            ledger.on_late(request)
+        self._on_answers(request, 1, now)
+        if reply.opcode == _NAK and self._session_changed(request, reply):
             request.stale = True
             op.on_lost(request, now)
         else:

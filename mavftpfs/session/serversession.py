@@ -177,11 +177,12 @@ class ServerSession:
 
     def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
         """Take an answer beyond those that the requests of this connection account for: the network doubled
-        the answer or the request, and the server executed the request twice.
+        the answer, or it doubled the request, and the server executed that twice.
 
         lateness: seconds since its request went out, None if that is not known. If the answer is the ACK of
         another open than the present file's, that file may be open now. Then reads are distrusted, because
-        MAVSDK has that file open in place of the present one.
+        MAVSDK has that file open in place of the present one. A second ACK of the present file's open shows
+        the same file; if MAVSDK emptied it by that, the comparison after the upload shows it.
         """
         self.quarantine.saw(lateness, self.clock())
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
