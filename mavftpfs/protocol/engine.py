@@ -34,8 +34,10 @@ from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
 OP_DEADLINE = 30.0
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
-_SLACK = 0.01
-"""Seconds. Timers end no more precisely, so less does not make a wait shorter than usual."""
+"""Requests: where no more are in flight, no timer waits for the end of a card's pause."""
+
+_EARLY = 0.01
+"""Seconds by which a timer may end early, so that a wait may seem shorter than it was."""
 
 _BURST = int(Opcode.BURST_READ_FILE)
 _NAK = int(Opcode.NAK)
@@ -84,7 +86,8 @@ class Engine:
         self._finished: list[Operation] = []
         self._gate = PathGate()
         self._timers = Timers()
-        self._due, self._heard_at = inf, -inf
+        self._due = inf  # no timer of a request runs out before
+        self._heard_at = -inf  # the last believed reply
         self._burst_op: Operation | None = None  # to which burst packets belong
         self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
 
@@ -232,7 +235,7 @@ class Engine:
         size = newest.size if newest.policy.bulk else MAX_DATA
         self.flow.on_replies(now, rtt, count, newest.order, ledger.order, size)
         if not timed:
-            return
+            return  # if it is not known which transmission was answered, no earlier request is passed
         ledger.on_passed(newest)
         wait = timers.passed_wait(now) if ledger.passed else 0.0
         for request in list(ledger.passed.values()):
@@ -288,12 +291,12 @@ class Engine:
         self.flow.begin()
         concerned = self._ops if self.traits.paths_block_writes else ()
         self._gate.look(concerned, self._ledger.outstanding.values(), now, self.rtt)
-        unused = True
+        has_room = True
         for op in self._ops.copy():
-            unused = unused and self._serve(op, now, wires)
+            has_room = has_room and self._serve(op, now, wires)
             if op.done:
                 self.remove(op)
-        if unused:
+        if has_room:
             self.flow.path.on_app_limited()
         return wires
 
@@ -356,7 +359,7 @@ class Engine:
             ledger.jump(op.on_burst_sent(first, now))
         else:
             self._due = min(self._due, timer)
-        return encode(requests, waits=(quiet + _SLACK) / self._timers.timeout(policy))
+        return encode(requests, waits=(quiet + _EARLY) / self._timers.timeout(policy))
 
     # --- timers
 

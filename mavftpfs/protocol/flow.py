@@ -11,9 +11,8 @@ more requests make up for it, except in rounds that *drain*, in which losses cea
 much (`CYCLE`). Loss while a queue stands is congestion, and narrows the window.
 
 At the start nothing holds back the first eight requests. Then the window grows by one with every answer,
-which doubles it each round. In a *silence*, when nothing at all is heard for a retransmission timeout, two
-requests probe until an answer comes. Then the window is half of what it was, until the end of a round shows
-what the path carries.
+which doubles it each round. In a *silence* (`SILENT`) two requests probe until an answer comes. Then the
+window is half of what it was, until the end of a round shows what the path carries.
 
 A serial port has a receive buffer of unknown size in front of a slow server. Bytes that overflow it are lost
 silently. So at a serial port the window is 16 at most, and where there is a pace, two requests go out at
@@ -52,7 +51,8 @@ MOST, MOST_SERIAL = 2048, 16
 
 SILENCE_WINDOW, SILENT = 2, 3
 """The window in a silence. A silence begins when the timers of so many requests run out at one moment, and
-nothing was heard since these went out."""
+nothing was heard since these went out. The timers of paced requests run out one by one, so on most paths the
+window stays wide until the session ends the transfer."""
 
 SLACK = 2
 """The window is wider than the path by so many, which keeps the slowest part busy between two answers."""
@@ -146,8 +146,8 @@ class Flow:
         elif self.path.pauses.length and not capped:
             room += self._beyond(now, self.path.reserve if paced else 0.0)
         if urgent and self._queues_few and in_flight >= self.cap and self.path.rate > 0.0:
-            # The queue, which is full of what was sent last, would drop it. As it comes first, nothing else
-            # goes out before.
+            # The queue is full of what was sent last, and would drop an urgent request. Nothing else goes out
+            # before this one, because the engine asks urgent operations first.
             due = self.sent_at + self.cap / self.path.rate
             if now < due:
                 self._ready_at = due
