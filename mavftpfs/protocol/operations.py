@@ -23,9 +23,9 @@ MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
 _MAX_EMPTY_PAGES = 4
 _USUAL_PACE = 0.1
-"""Usual cards read a megabyte per second and more. A checksum is asked for again when a usual card would have
-answered. That is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md
-2). MAVSDK computes it again, but it is a computer."""
+"""The share of the slowest card's time that a usual card needs for a checksum. A checksum is asked for again
+when a usual card would have answered, under the same seq: PX4 and ArduPilot, whose cards may be slower,
+replay their answer (servers.md 2). MAVSDK computes it again, but it runs on a computer."""
 
 _KINDS = {b"F": EntryKind.FILE, b"D": EntryKind.DIRECTORY}
 _MAX_DIGITS = 20
@@ -97,8 +97,7 @@ class Simple(Operation):
 
 
 class OpenRequest(Simple):
-    """OpenFileRO, OpenFileWO or CreateFile; session: the id to ask for. `sent` after a time-out: it may have
-    been executed.
+    """OpenFileRO, OpenFileWO or CreateFile; session: the id to ask for.
 
     Attributes:
         on_opened: called at once when the ACK came, before any later answer is looked at.

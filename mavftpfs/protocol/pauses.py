@@ -1,9 +1,9 @@
 """The pauses of a server's card, and what goes out meanwhile. Layer: protocol; pure.
 
 A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
-pauses some answers are kept in the link's queue, and while the card pauses, requests go on at a third of the
-pace. Otherwise the server would have nothing to do for a round trip after the pause. A loss then
-comes from its full buffer, and proves nothing of the link.
+pauses the flow keeps some answers in the link's queue, and while the card pauses, it sends on at a third of
+the pace, because otherwise the server would have nothing to do for a round trip after the pause. These
+requests may overflow the server's buffer, so a loss during a pause proves nothing of the link.
 """
 
 from __future__ import annotations

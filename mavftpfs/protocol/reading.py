@@ -199,7 +199,7 @@ class ReadTransfer(Operation):
             return
         nak = nak_of(request, reply)
         if nak.code in _LOST_CODES or nak.server_errno == _EBADF:
-            # If each client has a session id of its own, an EOF is that of this file.
+            # If each client has a session id of its own, an EOF is the end of this file, which shrank.
             at_end = nak.code == NakCode.EOF and self.port.traits.ack_carries_own_session
             self.fail(SessionLost(str(nak), by_server=not at_end))
         else:

@@ -119,8 +119,8 @@ class Timers:
     def wait(self, policy: RetryPolicy, quiet: float) -> float:
         """Return how many seconds to wait for the reply to a request that goes out.
 
-        quiet: seconds in which its operation made no progress. Under the same seq a repetition does not tell
-        the round trip. If that is not known yet, it may be long.
+        quiet: seconds in which its operation made no progress. While no round trip is known, the wait is at
+        least as long, because the way may be long, and the answer to a repetition does not measure it.
         """
         backoff = policy.backoff if self._estimator(policy).known else 1.0
         wait = max(self.timeout(policy), min(quiet * backoff, LONGEST_BACK_OFF))
