@@ -1,8 +1,8 @@
 """The pump between link and engine. Layer: session; the only task that reads the link.
 
 When a task starts an operation (`start`, `run`), its first request is sent before that task next awaits,
-unless nothing may be sent. Waiting tasks are woken once per batch of input, never
-once per packet, because a trio event and a time-out per request cost more than the rest of a chunk together.
+unless nothing may be sent. The pump wakes waiting tasks once per batch of input, never once per packet,
+because a trio event and a time-out per request cost more than the rest of a chunk together.
 """
 
 from __future__ import annotations
@@ -80,6 +80,7 @@ class Driver:
         self._scope: trio.CancelScope | None = None
         self._deadline = inf  # the next one of `pump`
         self._may_send = False
+        # Each operation with its `on_finished` and `on_batch`.
         self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
         self._silent_until = -inf
         self._gathered: list[bytes] = []

@@ -89,8 +89,8 @@ class OtherClients:
         self._has_file, self.closed_at = False, now
 
     def on_ours_opened(self) -> None:
-        """Note that this connection opened a file, so no other client has the session, or there are
-        several."""
+        """Note that this connection opened a file, so no other client has the session, or the server has
+        several sessions."""
         self._has_file = self._asks = False
 
     @property

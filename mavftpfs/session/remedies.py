@@ -3,13 +3,14 @@
 | who has the session (`Holder`) | NAK | remedy |
 |---|---|---|
 | HIDDEN: PX4's sticky errno hides every other code | 8 | list a directory to its end, once; that clears it |
-| OURS: this connection has a file open, whose ACK it missed | 4, 5, 8; of an ArduPilot 1 | close it |
+| OURS: this connection has a file open, whose ACK it missed | 4, 5, 8, 1: see `left_open` | close it |
 | ANOTHER: a client that was heard | 4, 5, 8 | the caller waits for that client |
 | GONE: a client that is not heard | 4, 5, 8 | be silent for 3.5 s, then 10.5 s; for an open, then reset |
 | NOBODY: the refusal has another reason | any other | none: an error |
 
-The first row that fits counts. `ServerSession._remedy` carries the remedies out. Asking sooner than after a
-silence keeps a stale session alive (docs/servers.md 1).
+The first row that fits counts. The reset is left out if another client was heard lately, because it might end
+that client's session. `ServerSession._remedy` carries the remedies out. Asking sooner than after a silence
+keeps a stale session alive (docs/servers.md 1).
 """
 
 from __future__ import annotations

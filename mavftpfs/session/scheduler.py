@@ -217,11 +217,11 @@ class Turn:
     def is_over(self) -> bool:
         """Return whether another user is next now, or the path is about to change.
 
-        A user whose turns brought nothing for LONGEST_BARREN keeps its turn until it brought something, or
-        STALL seconds passed, because on a long way nothing would ever arrive. A turn that lasted long (ten
-        round trips, 0.5 to 2.5 s) ends for any user with a lower score; a shorter one only for an interactive
-        user. In its first half second, the time that a user waited before its turn still lowers its score.
-        Otherwise the next small file would end a copy's turn at once.
+        A user whose turns brought nothing for LONGEST_BARREN keeps its turn until it brought something, at
+        most for `longest_silence`, because over a slow link nothing would ever arrive in a shorter one. A
+        turn that lasted long (ten round trips, 0.5 to 2.5 s) ends for any user with a lower score; a shorter
+        one only for an interactive user. In the first half second of a turn, the time that its user waited
+        before still lowers its score, because otherwise the next small file would end a copy's turn at once.
         """
         scheduler, user = self._scheduler, self.user
         now, rtt = scheduler.clock(), scheduler.server.engine.rtt

@@ -215,7 +215,7 @@ class ServerSession:
 
     def leave(self) -> None:
         """Stop using the open file: cancel its transfer, and move it to `maybe_open`, so that it is closed
-        before the next open. The server may have restarted meanwhile."""
+        before the next open."""
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
         if self.opened is not None:
@@ -232,7 +232,8 @@ class ServerSession:
             self.leave()
 
     def _forget(self, closed: set[tuple[int, bytes]]) -> None:
-        """Note that these files are closed. A late open may have opened another one behind the Terminate."""
+        """Note that these files are closed. The others stay, because a late open may have opened one behind
+        the Terminate."""
         self.maybe_open -= closed
         self.wake()
 
@@ -350,7 +351,7 @@ class ServerSession:
             SessionBusy: nothing is left that could help. RequestTimeout: a remedy was not answered.
         """
         now = self.clock()
-        in_time = now - tried.began < self.op_deadline
+        in_time = now - tried.began < self.op_deadline  # no close that never helps is repeated for ever
         ours = tried.opens and bool(self.maybe_open) and self._may_terminate and in_time
         who = holder(nak, tried, ours=ours, another=now < self.others_until)
         tries = tried.remedies[who]
@@ -485,7 +486,8 @@ class ServerSession:
         """Carry out a request that carries a path and needs no session of its own.
 
         ArduPilot refuses such a request while another client has a session. Then `make` makes a new one,
-        which is sent when that client has closed its file, or after a silence.
+        which is sent when that client has closed its file, or after a silence. While this connection has a
+        file open, the refusal is raised at once, because a silence would hold up its transfer.
 
         changes: the request changes the card. If it was sent twice, a refusal is raised at once, because it
             may answer the second execution.
@@ -513,8 +515,8 @@ class ServerSession:
         one: an ArduPilot with a single session refuses a listing then. Asks at most every LEFT_OPEN seconds.
         """
         now, traits = self.clock(), self.engine.traits
-        ours = self.others.session == self.engine.home_session
-        if not traits.ack_carries_own_session or ours or now - self._asked_sessions_at < LEFT_OPEN:
+        same_id = self.others.session == self.engine.home_session
+        if not traits.ack_carries_own_session or same_id or now - self._asked_sessions_at < LEFT_OPEN:
             return
         if not self.others.has_session(now, now):
             return

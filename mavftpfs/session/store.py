@@ -101,8 +101,8 @@ class Store:
         self._clock = scheduler.clock
         self._op_deadline = scheduler.server.op_deadline
         self._longest_change = inf if scheduler.server.patient else self._op_deadline + MOST + VERIFY_LIMIT
-        self._sent = 0
-        self._under_way = 0
+        self._sent = 0  # requests to change a name so far
+        self._under_way = 0  # those without an answer yet
         self._quarantine = scheduler.server.quarantine
         self._finishing: set[trio.CancelScope] = set()
         self._hurry_until = inf

@@ -78,7 +78,7 @@ class Upload(SessionUser):
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
-        self._awaited_since = 0.0  # the first of them
+        self._awaited_since = 0.0  # when the first of them began to wait
         # Until then nothing is sent: the upload was refused (`_fail`), or more bytes would cost the whole
         # file once more (`_complete`).
         self._waits_for_finish = False

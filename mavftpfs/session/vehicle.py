@@ -149,8 +149,8 @@ class Identity:
         return True
 
     def expire(self, now: float) -> bool:
-        """If it was heard for long and does not tell its id, take it for a stranger; return whether it is one
-        since now."""
+        """Take the vehicle for a stranger if it was heard for `patience` seconds without reporting its id;
+        return whether it became one just now."""
         since = self._doubted_from
         late = self.standing is Standing.DOUBTED and since is not None and now - since > self._patience
         if late:
@@ -186,10 +186,9 @@ class Vehicle:
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
-    own: this connection's address; replies to others are another FTP client's. on_another_client: called with
-    each payload of its, and whether none was heard for a while. on_refusal: called when it refuses to be
-    armed.
-    on_double: called when somebody else uses that address. on_doubt, patience: see Identity.
+    own: this connection's address. on_another_client: called with each payload from or to another FTP client,
+    and whether none was heard for a while before. on_refusal: called when the vehicle refuses to arm.
+    on_double: called when another program uses the address `own`. on_doubt, patience: see Identity.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
