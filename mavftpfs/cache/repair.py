@@ -102,7 +102,6 @@ class Repair:
         self._clock = clock
         self._look_at = inf
         self._due: dict[tuple[bytes, bool], float] = {}
-        self._busy: set[bytes] = set()
         self._running = False
         self._news = trio.Event()
 
@@ -156,22 +155,21 @@ class Repair:
         waits = [seconds for _, _, seconds in found if seconds > 0.0]
         if waits:
             self.list_later(path, min(waits))
-        if path in self._busy:
-            return
-        self._busy.add(path)
-        try:
-            for left, name, seconds in found[:MOST_AT_ONCE]:
-                is_gone = split(left)[1] not in directory.entries  # a program removed it, or moved over it
-                if seconds > 0.0 or is_gone or self._own.is_needed(left, self._clock()):
-                    continue
+        for left, name, seconds in found[:MOST_AT_ONCE]:
+            is_gone = split(left)[1] not in directory.entries  # a program removed it, or moved over it
+            if seconds > 0.0 or is_gone or self._own.is_needed(left, self._clock()):
+                continue
+            self._own.needed[left] = inf  # by this call: those for other listings leave it alone
+            try:
                 again = await self._repair(left, name, directory)
-                if again:
-                    self.list_later(path, again)
-        except MavftpfsError as error:
-            log.info("%r is cleaned up at a later listing: %s", path, error)
-            self.list_later(path, AGAIN_AFTER)
-        finally:
-            self._busy.discard(path)
+            except MavftpfsError as error:
+                log.info("%r is cleaned up at a later listing: %s", path, error)
+                self.list_later(path, AGAIN_AFTER)
+                return
+            finally:
+                self._own.release(left)
+            if again:
+                self.list_later(path, again)
 
     # --- inside
 
@@ -202,7 +200,10 @@ class Repair:
 
     async def _repair(self, left: bytes, name: TemporaryName, directory: Directory) -> float:
         """Remove what is left, or give it its name; return 0.0, or in how many seconds that is to be tried,
-        because it waits for the end of a flight, or for a program that is using its name."""
+        because it waits for the end of a flight, or for a program that is using its name, or because a newer
+        listing was remembered: this one lacks what changed since."""
+        if directory is not self._directories.known(split(left)[0]):
+            return AGAIN_AFTER
         target, ours = self._target(left, name), name.owner == self._own.owner
         waits = name.kind is Kind.OLD and split(target)[1] not in directory.entries
         if self._is_blocked() and not (ours and waits):

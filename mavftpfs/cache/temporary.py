@@ -106,7 +106,7 @@ class TemporaryNames:
     Attributes:
         owner: the mount's token.
         needed: names that repair leaves alone, each with the time until which it does; infinite as long as
-            somebody needs it. targets: of old files, the path of which each one is.
+            somebody needs it, or repairs it just now. targets: of old files, the path of which each one is.
     """
 
     def __init__(self, owner: bytes, rng: Random) -> None:

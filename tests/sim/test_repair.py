@@ -343,3 +343,34 @@ async def test_a_repair_follows_a_directory_that_gets_another_name() -> None:
         await tree.rename(b"/d", b"/e")
         await trio.sleep(60.0)
         assert here.files() == {b"/e/other": OLD}
+
+
+async def test_a_repair_that_takes_long_goes_by_no_old_listing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a `ls` gives a first name its old file back, a program makes the second name's file anew, and
+    another `ls` lists the directory."""
+    async with rig("px4", {OTHER: OLD}) as here:
+        tree = here.mount()
+        card: Any = tree._card
+        mine = b"/d/.mavftpfs-" + card.own.owner
+        here.put(mine + b"oaaa-first", OLD)
+        here.put(mine + b"obbb-file", OLD)
+        rename, begun, go_on = card.names.rename, trio.Event(), trio.Event()
+
+        async def slow(old: bytes, new: bytes, **how: Any) -> None:
+            if new == b"/d/first":
+                begun.set()
+                await go_on.wait()
+            await rename(old, new, **how)
+
+        monkeypatch.setattr(card.names, "rename", slow)
+        here.nursery.start_soon(tree.list, b"/d")
+        await begun.wait()
+        file = await tree.create(FILE, exclusive=True)
+        await file.write(0, NEW)
+        here.put(mine + b"nccc", b"part")
+        tree.forget_caches()
+        await tree.list(b"/d")
+        await file.release()
+        go_on.set()
+        await trio.sleep(60.0)
+        assert here.files() == {OTHER: OLD, b"/d/first": OLD, FILE: NEW}
