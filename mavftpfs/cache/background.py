@@ -10,7 +10,7 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.cache import delivery, looking, uploads, writing
+from mavftpfs.cache import delivery, uploads, writing
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.file import File, State
 from mavftpfs.cache.recovery import move
@@ -35,7 +35,6 @@ class Background:
         self._card = card
         self._retrying, self._news = False, trio.Event()
         card.retry_later = self.retry_later
-        card.repair.look = partial(looking.look_at_all, card)
 
     # --- what is not on the vehicle
 

@@ -139,14 +139,18 @@ async def _send(card: Card, file: File) -> None:
     await card.store.wait_out(attempt.path)
     crc32 = await _compare_and_look(card, file, attempt)
     sent = Known(file.size, crc32=crc32)
-    with card.store.finishing():
-        file.attempt = None
-        await attempt.upload.end()
+    try:
+        with card.store.finishing():
+            file.attempt = None
+            await attempt.upload.end()
+            if not attempt.in_place:
+                await _commit(card, file, attempt, sent)
         if not attempt.in_place:
-            await _commit(card, file, attempt, sent)
-    if not attempt.in_place:
-        await _compare_again(card, file, attempt, sent)
-        card.names.settle(file)
+            await _compare_again(card, file, attempt, sent)
+            card.names.settle(file)
+    finally:
+        if file.unsure is not None:
+            card.nursery.start_soon(looking.until_known, card, file)
     card.on_delivered(file, sent)
 
 

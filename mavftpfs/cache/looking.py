@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from math import inf
+
+import trio
 
 from mavftpfs.cache.card import Card
 from mavftpfs.cache.directories import Directory
@@ -31,25 +32,21 @@ LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
 """Seconds after which mavftpfs looks again what has a name; the second while the vehicle is armed."""
 
 
-async def look_at_all(card: Card) -> float:
-    """Look at all files whose commit was interrupted, unless a delivery or a change of the name does; return
-    in how many seconds that is to be done again, infinite if it is not."""
-    again = inf
-    for file in list(card.live):
-        if file.unsure is None:
-            continue
-        if file.lock.locked():
-            again = min(again, LOOK_AGAIN)
+async def until_known(card: Card, file: File) -> None:
+    """Find out what has the name of a file whose commit was interrupted, as soon as the vehicle is heard. The
+    next delivery of the file looks, too, but it may be long in coming: a program may still write the file."""
+    pause = LOOK_AGAIN
+    while file.unsure is not None:
+        await trio.sleep(pause)
+        if card.store.why_lost() is not None:
             continue
         try:
             async with file.lock, card.paths.steady(file):  # so that `repair` leaves the name alone, too
                 await look(card, file)
         except MavftpfsError as error:
             log.info("what has the name %r is not known yet: %s", file.path, error)
-            again = min(again, IN_FLIGHT if isinstance(error, Armed) else LOOK_AGAIN)
-        else:
-            card.maybe_forget(file)
-    return again
+            pause = IN_FLIGHT if isinstance(error, Armed) else LOOK_AGAIN
+    card.maybe_forget(file)
 
 
 async def look(card: Card, file: File) -> None:

@@ -61,10 +61,9 @@ _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
 
 
 class Later(Protocol):
-    """Paths to look at after a while; see repair.Repair."""
+    """Directories to list after a while; see repair.Repair."""
 
     def list_later(self, directory: bytes, seconds: float = 0.0, *, only_in_doubt: bool = False) -> None: ...
-    def look_later(self) -> None: ...
 
 
 class Names:
@@ -321,7 +320,6 @@ class Names:
         path = file.path
         with self._store.finishing():
             unsure = file.unsure = Unsure(temporary, None, sent, file.changes)
-            self._later.look_later()
             try:
                 if file.base is None:
                     await self.rename(temporary, path)

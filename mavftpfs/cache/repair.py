@@ -20,7 +20,7 @@ The mount lists these directories by itself (`Repair.list_later`), so that no pr
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from math import inf
 
 import trio
@@ -68,16 +68,14 @@ def due_in(name: TemporaryName, owner: bytes, *, target_there: bool, age: float)
 
 
 class Repair:
-    """Looks at every listing, and repairs what is due. Lists by itself what is to be looked at, and has files
-    that are `unsure` looked at, as soon as the vehicle is heard.
+    """Repairs what is due in each listing. Lists by itself the directories in which something is to be
+    repaired, as soon as the vehicle is heard.
 
     Attributes:
-        names: changes names. look(): looks at all unsure files once; returns in how many seconds again,
-            infinite if none is left.
+        names: changes names.
     """
 
     names: Names
-    look: Callable[[], Awaitable[float]]
 
     def __init__(
         self,
@@ -100,7 +98,6 @@ class Repair:
         self._is_blocked = is_blocked
         self._is_used = is_used
         self._clock = clock
-        self._look_at = inf
         self._due: dict[tuple[bytes, bool], float] = {}
         self._running = False
         self._news = trio.Event()
@@ -121,17 +118,10 @@ class Repair:
         for directory in self._own.follow_rename(old, new):
             self.list_later(directory)
 
-    def look_later(self) -> None:
-        """Have unsure files looked at as soon as the vehicle is heard."""
-        self._look_at = self._clock()
-        self._start()
-
     def retry(self) -> None:
         """Do at once what waits for the vehicle or for the end of a flight: there is news of the vehicle."""
         now = self._clock()
         self._due = {key: at if key[1] else now for key, at in self._due.items()}
-        if self._look_at < inf:
-            self._look_at = now
         self._news.set()
 
     async def finish(self) -> None:
@@ -227,12 +217,12 @@ class Repair:
             self._nursery.start_soon(self._run)
 
     async def _run(self) -> None:
-        """Look and list, as long as there is something to."""
+        """List, as long as there is something to."""
         try:
-            while self._due or self._look_at < inf:
+            while self._due:
                 self._news, lost = trio.Event(), self._store.why_lost() is not None
-                at = min(self._look_at, *self._due.values(), inf)
-                with trio.move_on_after(LOST_FOR if lost else max(0.0, at - self._clock())):
+                left = min(self._due.values()) - self._clock()
+                with trio.move_on_after(LOST_FOR if lost else max(0.0, left)):
                     await self._news.wait()
                 if self._store.why_lost() is None:
                     await self._do_due(self._clock())
@@ -240,10 +230,6 @@ class Repair:
             self._running = False
 
     async def _do_due(self, now: float) -> None:
-        if self._look_at <= now:
-            self._look_at = inf
-            again = await self.look()
-            self._look_at = min(self._look_at, self._clock() + again)
         for key in [key for key, at in self._due.items() if at <= now]:
             directory, only_in_doubt = key
             if self._due.pop(key, None) is not None and (not only_in_doubt or self._store.in_doubt()):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs.cache import namespace, uploads
+from mavftpfs.cache import looking, namespace, uploads
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
@@ -83,35 +83,31 @@ async def test_a_name_that_was_moved_away_does_not_come_back(monkeypatch: pytest
     """The mount looks what has the name while a `mv` of it is under way."""
     async with rig("px4", {FILE: OLD}, options=QUICK, link=LinkSettings(delay=0.05)) as here:
         tree = here.mount(op_deadline=5.0)
-        card: Any = tree._card
         await write_file(tree, b"/d/first", OLD)
         await tree.list(b"/d")
-        deliver_below, look = namespace._deliver_below, card.repair.look
-
-        async def not_yet() -> float:
-            return float("inf")
+        deliver_below, until_known = namespace._deliver_below, looking.until_known
 
         async def and_then_another_program_writes(*args: Any) -> None:
             await deliver_below(*args)
-            monkeypatch.setattr(card.repair, "look", not_yet)
             await write_and_lose_the_link(here, tree, nth=1)
             here.faults.call_off()
             here.faults.at(Opcode.RENAME, now.set)
 
         now = trio.Event()
 
-        async def look_then() -> None:
+        async def look_then(*args: Any) -> None:
             await now.wait()
-            await look()
+            await until_known(*args)
 
-        here.nursery.start_soon(look_then)
+        monkeypatch.setattr(looking, "LOOK_AGAIN", 0.01)
+        monkeypatch.setattr(looking, "until_known", look_then)
         monkeypatch.setattr(namespace, "_deliver_below", and_then_another_program_writes)
         moved = b"/d/moved"
         try:
             await tree.rename(FILE, moved)
         except FileBusy:
             moved = FILE
-        monkeypatch.setattr(card.repair, "look", look)
+        now.set()
         await trio.sleep(600)
         assert tree.undelivered() == [], tree.status()["errors"]
         assert here.files() == {moved: NEW, b"/d/first": OLD}, here.files().keys()
