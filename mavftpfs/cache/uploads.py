@@ -131,10 +131,8 @@ async def _begin(card: Card, file: File, *, in_place: bool) -> Attempt:
     except MavftpfsError:
         card.own.on_gone(path)
         raise
-    attempt = file.attempt = Attempt(path, in_place, sending, upload, begun_at)
-    if in_place:
-        card.directories.put(path, DirEntry(b"", EntryKind.FILE))
-    return attempt
+    file.attempt = Attempt(path, in_place, sending, upload, begun_at)
+    return file.attempt
 
 
 async def abandon(card: Card, file: File) -> None:
@@ -167,8 +165,10 @@ async def leave_to_repair(card: Card, attempt: Attempt) -> None:
 def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
     """Note that an attempt ended without success. Bytes under the file's own name belong to the file."""
     if file.lies_in_place:
-        # The next listing shows a part: less than this, so that nobody else seems to write it.
-        card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, attempt.sending.size))
+        # The next listing shows a part, or still the old file. Neither is larger than this, or others would
+        # seem to write it.
+        most = max(attempt.sending.size, 0 if file.base is None else file.base.size)
+        card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, most))
         card.directories.expire(split(attempt.path)[0])
         file.has_part = True
     file.attempt = None

@@ -17,6 +17,7 @@ from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.scheduler import SessionUser
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
@@ -188,6 +189,37 @@ async def test_what_a_failed_write_left_in_place_is_not_being_written_by_others(
         await write_file(tree, FILE, b"again")
         assert here.data(FILE) == b"again"
         file.close()
+
+
+@pytest.mark.parametrize("begun", [True, False])
+async def test_an_old_file_that_a_write_in_place_did_not_reach_is_not_being_written_by_others(
+    begun: bool,
+) -> None:
+    """CreateFile did not arrive, or was not sent because the session was busy. The old file is the larger."""
+    async with rig("littlefs", {FILE: 3 * PART}, options=ConnectOptions(op_deadline=DEADLINE)) as here:
+        tree = here.mount(inplace=True, op_deadline=DEADLINE)
+        await write_file(tree, FRESH, PART)
+        file = await open_to_copy(tree, FILE)
+
+        async def keep_the_session(*, task_status: Any) -> None:
+            async with here.connection.store._scheduler.turn(SessionUser(FRESH)):
+                task_status.started()
+                await trio.sleep_forever()
+
+        async with trio.open_nursery() as nursery:
+            if begun:
+                here.faults.ignore(Opcode.CREATE_FILE)
+            else:
+                await nursery.start(keep_the_session)
+            await file.write(0, PART)
+            with pytest.raises(MavftpfsError):
+                await file.fsync(ends_write=True)
+            nursery.cancel_scope.cancel()
+        file.close()
+        here.faults.call_off()
+        assert await read_file(tree, FILE) == 3 * PART
+        await write_file(tree, FILE, PART)
+        assert here.data(FILE) == PART
 
 
 async def test_a_handle_that_wrote_nothing_breaks_nothing(here: Rig) -> None:
