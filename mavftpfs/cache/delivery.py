@@ -8,8 +8,8 @@ There is one way to the card (`_send`): fetch the bytes of the old file that sta
 the whole file to a temporary file (`uploads.need_attempt`), verify it there, and check that others left the
 name alone (`_compare_and_look`), rename it into place (`_commit`). If the ACK of the rename proves too
 little, the file is compared under its name (`_compare_again`). A card that cannot rename gets the file under
-its own name. If the commit of a file was interrupted (`File.unsure`), the delivery first finds out what has
-the name (`looking.look`).
+its own name. If the commit of a file was interrupted (`File.unsure`), a task finds out what has the name
+(`looking.until_known`); a delivery that begins before that finds it out itself (`looking.look`).
 
 A delivery that is cancelled or fails keeps its attempt if the error may pass (`uploads.PASSING`), so that the
 next delivery sends only the missing bytes. Exception: if the rename fails, the verified temporary file is

@@ -11,7 +11,7 @@ handles of a file share them. TRANSITIONS is the table of the states.
     BROKEN   a program was told that a write failed, so no byte of the file is committed
 
 A file that is DEAD or BROKEN has no name, and no event mends it. A file that is CLEAN or DIRTY has none if
-this mount removed it: its handles go on with what was written here.
+this mount removed it, or put another one in its place: its handles go on with what was written here.
 
 What a delivery may replace under the file's name follows from the base, and from how many bytes of it are to
 stay; see Replaces.

@@ -148,7 +148,7 @@ class Folder(Item):
 
     def need(self, path: bytes) -> Folder:
         """Return the folder of a path below this one, which is the root, made if there is none. A file in the
-        way loses its name."""
+        way loses its name, because a listing shows a directory there, or this mount made one."""
         folder = self
         for part in path.split(b"/"):
             if part:

@@ -33,8 +33,9 @@ LOOK_AGAIN, IN_FLIGHT = 2.0, 60.0
 
 
 async def until_known(card: Card, file: File) -> None:
-    """Find out what has the name of a file whose commit was interrupted, as soon as the vehicle is heard. The
-    next delivery of the file looks, too, but it may be long in coming: a program may still write the file."""
+    """Find out what has the name of a file whose commit was interrupted, once the vehicle is heard. The next
+    delivery would find it out, too, but it waits for the end of a flight, and for programs that have the file
+    open for writing; the name may lack its file until then."""
     pause = LOOK_AGAIN
     while file.unsure is not None:
         await trio.sleep(pause)
@@ -106,8 +107,10 @@ async def _give_name_back(
 
 
 async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry, directory: Directory) -> bool:
-    """Return whether a file on the vehicle is what was committed. Where the vehicle tells no checksum, it is
-    if it has the right size, and the temporary file is gone."""
+    """Return whether a file on the vehicle is what was committed: the checksums are equal. If the vehicle
+    tells none, the size is right, and the temporary file is gone. If the one of what was committed is not
+    known any more, because a program changed a file larger than verify_max, the size is right: all of the
+    file is sent once more anyway."""
     sent = unsure.sent
     if there.kind is not EntryKind.FILE or there.size != sent.size:
         return False
