@@ -11,7 +11,7 @@ Requests that carry a path and need no session (`ask`) run beside it, and carry 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -136,6 +136,7 @@ class ServerSession:
         self.held_up = 0
         self.on_reads_distrusted: Callable[[], None] = lambda: None
         self._asked_sessions_at = -inf
+        self._terminating = trio.CancelScope()
         self.changed = trio.lowlevel.ParkingLot()
 
     # --- trust
@@ -169,6 +170,8 @@ class ServerSession:
         # Where servers echo ids, each client has one of its own.
         shared = not traits.ack_carries_own_session or used == self.engine.home_session
         took = shared and took_session(payload)
+        if took:
+            self._terminating.cancel()
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
         # If no file was opened since reads were last distrusted, no more bytes are suspect.
         suspect = session is not None or self.newest_open_at >= self.epoch
@@ -360,7 +363,7 @@ class ServerSession:
             case Holder.NOBODY, _:
                 raise nak
             case Holder.HIDDEN, _:
-                await self._try(ListDirectory(b"/", False))
+                await self._try(self.driver.run(ListDirectory(b"/", False)))
             case Holder.OURS, _:
                 await self._close_maybe_open()
             case Holder.ANOTHER, _:
@@ -370,7 +373,8 @@ class ServerSession:
             case Holder.GONE, 1:
                 await self.driver.be_silent(SILENCE_PX4)
             case Holder.GONE, 2 if tried.opens and not self.vehicle.another_client_heard(now):
-                await self._try(Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session))
+                reset = Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session)
+                await self._try(self.driver.run(reset))
             case _:
                 raise SessionBusy(_IN_USE) from nak
 
@@ -420,7 +424,7 @@ class ServerSession:
         left, asked_at = {(session.id, session.path)}, self.clock()
         try:
             with trio.move_on_after(limit):
-                await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session.id))
+                await self._terminate(session.id)
                 self._forget(left)
                 return True
         except FtpNak as nak:
@@ -454,8 +458,14 @@ class ServerSession:
         for session in {session for session, _ in self.maybe_open}:
             left = {one for one in self.maybe_open if one[0] == session}
             if self._may_terminate:
-                await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
+                await self._try(self._terminate(session))
             self._forget(left)
+
+    async def _terminate(self, session: int) -> None:
+        """Send Terminate until it is answered, or another client has the session. Then ours is closed, and a
+        repetition would close that client's file."""
+        with trio.CancelScope() as self._terminating:
+            await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session))
 
     @property
     def _may_terminate(self) -> bool:
@@ -530,14 +540,14 @@ class ServerSession:
         traits.several_sessions = not refused and self.others.has_session(now, self.clock())
         self.wake()
 
-    async def _try(self, operation: Operation) -> None:
-        """Run a remedy, and ignore its refusal.
+    async def _try(self, remedy: Awaitable[None]) -> None:
+        """Carry out a remedy, and ignore its refusal.
 
         Raises:
             RequestTimeout: no answer.
         """
         try:
-            await self.driver.run(operation)
+            await remedy
         except RequestTimeout:
             raise
         except MavftpfsError:

@@ -569,15 +569,15 @@ async def test_a_session_that_another_client_took_is_its_own(profile: str, ours:
 
 
 def taken_behind(here: Rig, opcode: Opcode) -> trio.Event:
-    """Have another client make a file right behind our first open: both answers come at once, before the task
-    that opened the file goes on."""
+    """Have another client make a file right behind our first such request: both answers come at once, before
+    the task that asked goes on."""
     handle, took = here.server.handle, trio.Event()
 
     def on_request(wire: bytes, source: Address, now: float) -> None:
         handle(wire, source, now)
         if wire[3] == opcode and source != STATION and not took.is_set():
             took.set()
-            here.another_asks(Opcode.CREATE_FILE, path("mavsdk", "its"))
+            here.another_asks(Opcode.CREATE_FILE, path(here.profile, "its"))
 
     here.server.handle = on_request  # type: ignore[method-assign]
     return took
@@ -592,6 +592,21 @@ async def test_also_one_that_it_took_right_behind_our_open() -> None:
         assert took.is_set()
     assert here.data(b"/d/new") == DATA[:500]
     assert here.data(b"/d/its") == b""
+
+
+@pytest.mark.holds("promise 6")
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "mavsdk"])
+async def test_a_terminate_whose_answer_is_lost_leaves_the_next_clients_file_open(profile: str) -> None:
+    here = Rig(profile, {b"/d/f": DATA}, LINK)
+    async with here.connected() as connection:
+        here.faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+        took = taken_behind(here, Opcode.TERMINATE_SESSION)
+        assert await read_file(connection, path(profile, "f")) == DATA
+        await took.wait()
+        await trio.sleep(5.0)
+        assert here.server.open_paths == [path(profile, "its")]
+        here.another_asks(Opcode.TERMINATE_SESSION)
+        assert await read_file(connection, path(profile, "f")) == DATA
 
 
 async def test_an_open_that_finds_all_of_several_sessions_taken_is_told_in_time() -> None:
