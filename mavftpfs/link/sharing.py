@@ -32,7 +32,7 @@ log = logging.getLogger("mavftpfs.link")
 
 PATIENCE = 20.0
 """Seconds for the mavftpfs program that has the port to end, or to share it."""
-GRACE = 0.1
+GRACE = 0.2
 """Seconds for a killed program's port to become free: the kernel frees it with the port's name."""
 HELLO_PATIENCE = 1.0
 """Seconds for a program that calls to send its request."""

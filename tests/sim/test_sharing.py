@@ -250,7 +250,7 @@ async def test_a_program_that_ends_while_it_is_asked_is_waited_for(port: Port) -
         for _ in range(2):
             (await next_caller(name)).close()
         name.close()
-        await trio.sleep(0.2)
+        await trio.sleep(0.02)
         old.close()
 
     name = take_name(port_name(port.spec))
