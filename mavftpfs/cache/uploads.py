@@ -163,7 +163,8 @@ async def leave_to_repair(card: Card, attempt: Attempt) -> None:
 
 
 def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
-    """Note that an attempt ended without success. Bytes under the file's own name belong to the file."""
+    """Note that an attempt ended without success, and have its upload send no more bytes. Those under the
+    file's own name belong to the file."""
     if file.lies_in_place:
         # The next listing shows a part, or still the old file. Neither is larger than this, or others would
         # seem to write it.
@@ -171,6 +172,7 @@ def forget_attempt(card: Card, file: File, attempt: Attempt) -> None:
         card.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, most))
         card.directories.expire(split(attempt.path)[0])
         file.has_part = True
+    attempt.sending.on_changed(0, 0)  # the upload may be about to read bytes that the file forgets next
     file.attempt = None
 
 

@@ -214,3 +214,20 @@ async def test_bytes_are_not_kept_of_a_file_that_the_server_had_closed_before_it
         await read_file(tree, b"/file")
         await trio.sleep(5.0)
         assert await read_file(tree, b"/file") == OLD * 1000
+
+
+async def test_a_truncation_that_is_cancelled_at_each_request_ends_alone() -> None:
+    """Its content is forgotten while the upload, which just got its file open, is about to send from it."""
+    for cut in count(1):
+        async with rig("px4-2026", {b"/file": OLD}) as here:
+            tree = here.mount()
+            await tree.list(b"/")
+            await trio.sleep(3.0)
+            with trio.CancelScope() as caller:
+                here.faults.after(cut, caller.cancel)
+                await tree.truncate(b"/file", 7)
+            await trio.sleep(20.0)
+            whole = (OLD, OLD[:7]) if caller.cancelled_caught else (OLD[:7],)
+            assert here.files()[b"/file"] in whole and len(here.files()) == 1
+            if not caller.cancel_called:
+                return
