@@ -74,8 +74,14 @@ class ReadHandle(OpenFile):
                 return data
 
     async def fsync(self, *, ends_write: bool = False) -> None:
-        """Deliver what was written through any handle; see OpenFile.fsync."""
+        """Deliver what was written through any handle; see OpenFile.fsync.
+
+        `sync FILE` also tells a shell, which does not look at the result of a close, that a write to the name
+        failed before.
+        """
         await self._deliver(ends_write=ends_write)
+        if self.file.has_name and (broken := self._card.find_broken(self.file.path)) is not None:
+            broken.require_not_broken()
 
     async def release(self) -> None:
         """Deliver what was written by this handle, and close it. Bytes that could not be delivered stay held.

@@ -261,19 +261,21 @@ async def break_off(card: Card, file: File, error: MavftpfsError) -> None:
     card.live.pop(file, None)
     file.leave_tree()
     card.forget_broken(path)
-    card.broken.append(file)
+    if file.size or file.has_part:
+        card.broken.append(file)
     file.blocks.end(FileChanged(f"a write to {path!r} failed"))
     card.forget_time(path)
     card.tell_changed(path)
     card.retry_later()
     card.throttle.waiting.unpark_all()
-    log.warning(
-        "a write to %r failed (%s): the vehicle does not get this version; copy the file again (umount "
-        "moves the part that was written to a recovery directory; `mavftpfs recover` lists it)",
-        path,
-        error,
-    )
-    persist(card, file)
+    if file in card.broken:
+        log.warning(
+            "a write to %r failed (%s): the vehicle does not get this version; copy the file again (umount "
+            "moves the part that was written to a recovery directory; `mavftpfs recover` lists it)",
+            path,
+            error,
+        )
+        persist(card, file)
     if attempt is not None:
         await uploads.leave_to_repair(card, attempt)
 

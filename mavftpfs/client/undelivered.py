@@ -97,9 +97,10 @@ class Recovered:
             return "its path on the vehicle is unknown"
         if "whole" not in self.facts:
             return "its program had not closed it, so it may be incomplete"
-        if self.facts.get("broken"):
-            return "a write failed, so this is only the part that was written before"
-        return "" if self.facts.get("whole") else "only the changed parts of it are here"
+        if not self.facts.get("whole"):
+            return "only the changed parts of it are here, and zeros between them"
+        broken = self.facts.get("broken")
+        return "a write failed, so this is only the part that was written before" if broken else ""
 
 
 def recovered_below(base: Path) -> list[Recovered]:

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Awaitable, Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -382,6 +383,25 @@ async def test_an_append_whose_close_cannot_fetch_the_old_file(here: Rig, armed:
     await trio.sleep(LONG)
     assert here.files() == {FILE: OLD + b"more" if armed else OLD}
     assert tree.broken() == ([] if armed else [FILE])
+    reader = await tree.open(FILE)
+    with nullcontext() if armed else pytest.raises(WriteFailed):
+        await reader.fsync()  # as `sync FILE` does
+    await write_file(tree, FILE, b"again")
+    await reader.fsync()
+
+
+async def test_a_new_file_whose_first_write_fails_leaves_nothing(here: Rig) -> None:
+    tree = await mount(here)
+    file = await tree.create(FRESH, exclusive=True)
+    await here.arm()
+    with pytest.raises(Armed):
+        await file.write(0, b"x")
+    with pytest.raises(WriteFailed):
+        await file.release()
+    await here.disarm()
+    await trio.sleep(LONG)
+    assert here.files() == {FILE: OLD}
+    assert tree.broken() == []
 
 
 async def test_a_program_that_is_killed_leaves_its_part_as_on_a_local_disk(here: Rig) -> None:
