@@ -169,23 +169,32 @@ def lengthening(heard: bool) -> Callable[[Scene], Awaitable[None]]:
 
 
 def uploading(heard: bool) -> Callable[[Scene], Awaitable[None]]:
-    """Return another computer's mavftpfs, which uploads a file for five minutes over a slow radio."""
+    """Return another computer's mavftpfs, which uploads a file for five minutes over a slow radio. Where a
+    file stays open for so long, it begins again if the server closed it, because our Terminate was on its way
+    when it opened the file."""
 
     async def act(scene: Scene) -> None:
         here = scene.here
         client, temporary = OtherClient(here, heard), here.root + D + b"/.mavftpfs-zzzznabc"
-        stays_open = PROFILES[here.profile].write_only_truncates
-        if stays_open:
-            await client.insist(partial(client.ask, Opcode.CREATE_FILE, temporary))
-        for at in range(0, len(BESIDE), PIECE):
-            piece, opcode = BESIDE[at : at + PIECE], Opcode.OPEN_FILE_WO if at else Opcode.CREATE_FILE
-            if stays_open:
-                await client.insist(partial(client.ask, Opcode.WRITE_FILE, piece, offset=at))
-            else:
+        pieces = [(at, BESIDE[at : at + PIECE]) for at in range(0, len(BESIDE), PIECE)]
+        pause = TAKES * PIECE / len(BESIDE)
+
+        async def in_one_session() -> bool:
+            if not await client.ask(Opcode.CREATE_FILE, temporary):
+                return False
+            for at, piece in pieces:
+                if not await client.ask(Opcode.WRITE_FILE, piece, offset=at):
+                    return False
+                await trio.sleep(pause)
+            return await client.ask(Opcode.TERMINATE_SESSION)
+
+        if PROFILES[here.profile].write_only_truncates:
+            await client.insist(in_one_session)
+        else:
+            for at, piece in pieces:
+                opcode = Opcode.OPEN_FILE_WO if at else Opcode.CREATE_FILE
                 await client.insist(partial(client.write, temporary, opcode, at, piece))
-            await trio.sleep(TAKES * PIECE / len(BESIDE))
-        if stays_open:
-            await client.ask(Opcode.TERMINATE_SESSION)
+                await trio.sleep(pause)
         assert await client.ask(Opcode.RENAME, temporary + b"\0" + here.root + D + b"/theirs")
 
     return act
