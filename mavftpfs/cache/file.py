@@ -99,15 +99,13 @@ class Replaces(Enum):
     """The thing that a delivery of a file may replace under its name.
 
     NOTHING: the vehicle has no file of it, so the name has to be free. BASE: bytes of the base stay, so the
-    base has to be there still. ANYTHING: a program emptied the file, so no byte of the base stays, and
-    whatever has the name by then is replaced. PART: the card cannot rename, and may have a part of the file
-    under its own name.
+    base has to be there still. ANYTHING: whatever has the name by then, because a program emptied the file, or
+    because the card, which cannot rename, may have a part of the file under its own name.
     """
 
     NOTHING = "nothing"
     BASE = "base"
     ANYTHING = "anything"
-    PART = "part"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +206,7 @@ class File(Item):
     def replaces(self) -> Replaces:
         """The thing that a delivery of it may replace now."""
         if self.lies_in_place:
-            return Replaces.PART
+            return Replaces.ANYTHING
         if self.base is None:
             return Replaces.NOTHING
         return Replaces.BASE if self.content.keeps_base else Replaces.ANYTHING

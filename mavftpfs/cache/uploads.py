@@ -58,8 +58,8 @@ def require_deliverable(card: Card, file: File) -> None:
         FileChanged: the vehicle has another file there now. NotSupported: that cannot be replaced safely.
     """
     file.require_not_stale()
-    in_place = card.store.traits.rename_works is False
-    if in_place and file.replaces in (Replaces.BASE, Replaces.ANYTHING) and not card.options.inplace:
+    empties = card.store.traits.rename_works is False and file.base is not None and not file.lies_in_place
+    if empties and not card.options.inplace:
         raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
 
 
