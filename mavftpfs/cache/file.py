@@ -99,8 +99,8 @@ class Replaces(Enum):
     """The thing that a delivery of a file may replace under its name.
 
     NOTHING: the vehicle has no file of it, so the name has to be free. BASE: bytes of the base stay, so the
-    base has to be there still. ANYTHING: whatever has the name by then, because a program emptied the file, or
-    because the card, which cannot rename, may have a part of the file under its own name.
+    base has to be there still. ANYTHING: whatever has the name by then, because a program emptied the file,
+    or because the card, which cannot rename, may have a part of the file under its own name.
     """
 
     NOTHING = "nothing"

@@ -53,7 +53,7 @@ async def put_back(
     others = await _of_others(session, wanted)
     mine = [copy for copy in wanted if copy not in others]
     failed = [
-        (copy, f"{copy.hindrance}; look at it, upload it with `mavftpfs put` only if it is whole, and delete it")
+        (copy, f"{copy.hindrance}; look at it, `mavftpfs put` it if nothing is missing, and delete it here")
         for copy in mine
         if copy.hindrance
     ]
