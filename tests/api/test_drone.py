@@ -470,7 +470,7 @@ def test_a_mount_that_takes_a_part_of_a_write_has_not_taken_it(field: Field) -> 
     with mavftpfs.connect(str(mount.path)) as drone, pytest.raises(OSError, match="discarded") as caught:
         drone.write_bytes("/f", bytes(3 << 20))
     assert caught.value.errno == errno.ENOSPC
-    assert list(card.iterdir()) == []
+    wait_until("the repair removed its temporary file", lambda: list(card.iterdir()) == [])
 
 
 @pytest.mark.mount
