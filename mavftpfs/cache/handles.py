@@ -76,8 +76,11 @@ class ReadHandle(OpenFile):
     async def fsync(self, *, ends_write: bool = False) -> None:
         """Deliver what was written through any handle; see OpenFile.fsync.
 
-        `sync FILE` also tells a shell, which does not look at the result of a close, that a write to the name
-        failed before.
+        A shell does not look at the result of a close. So `sync FILE` also fails while a broken file of this
+        name is kept.
+
+        Raises:
+            WriteFailed: it is. Otherwise as delivery.deliver.
         """
         await self._deliver(ends_write=ends_write)
         if self.file.has_name and (broken := self._card.find_broken(self.file.path)) is not None:

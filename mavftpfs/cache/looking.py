@@ -108,9 +108,9 @@ async def _give_name_back(
 
 async def _is_sent(card: Card, file: File, unsure: Unsure, there: DirEntry, directory: Directory) -> bool:
     """Return whether a file on the vehicle is what was committed: the checksums are equal. If the vehicle
-    tells none, the size is right, and the temporary file is gone. If the one of what was committed is not
-    known any more, because a program changed a file larger than verify_max, the size is right: all of the
-    file is sent once more anyway."""
+    tells none, the size is right, and the temporary file is gone. If a program changed a file larger than
+    verify_max since, nobody knows the checksum of what was committed, and the right size is enough: all of
+    the file is sent once more anyway."""
     sent = unsure.sent
     if there.kind is not EntryKind.FILE or there.size != sent.size:
         return False

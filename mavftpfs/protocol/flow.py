@@ -1,4 +1,4 @@
-"""What may go out now: the window of requests in flight, and their pace. Layer: protocol; pure.
+"""The window of requests in flight, and their pace: how much may go out now. Layer: protocol; pure.
 
 Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more requests
 only wait in a queue, and delay all others. So the window aims at what fills the path, its rate times its

@@ -1,4 +1,4 @@
-"""What is known of the network path: rate, round trip, losses. Layer: protocol; pure.
+"""The network path, as far as it is known: rate, round trip, losses. Layer: protocol; pure.
 
 The path is all that lies between a request and its answer: link, server and card. Its slowest part, the
 bottleneck, answers so many requests per second; more of them wait in a queue before it, or are lost. What may

@@ -46,7 +46,7 @@ class Holder(Enum):
 
 @dataclass
 class Tried:
-    """What was tried since `began`, because the server refused one request.
+    """The remedies tried since `began`, because the server refused one request.
 
     opens: the request opens a file, in a turn of the session; others need no turn. resent: one of the tries
     was sent more than once. remedies: how often a remedy was tried against each holder.
