@@ -101,8 +101,7 @@ class Store:
         self._clock = scheduler.clock
         self._op_deadline = scheduler.server.op_deadline
         self._longest_change = inf if scheduler.server.patient else self._op_deadline + MOST + VERIFY_LIMIT
-        self._sent = 0  # requests to change a name so far
-        self._under_way = 0  # those without an answer yet
+        self._under_way = self._ended = 0  # requests to change a name: waiting for an answer; over
         self._quarantine = scheduler.server.quarantine
         self._finishing: set[trio.CancelScope] = set()
         self._hurry_until = inf
@@ -385,12 +384,14 @@ class Store:
     # --- did that change happen?
 
     async def _perform(self, make: Callable[[], Simple], after: Mapping[bytes, After]) -> None:
-        """Run a request; look at listings if its answer may not be that to its first execution. after: the
-        state of each name once the change happened."""
+        """Run a request; if it failed and may have been executed all the same, return or raise by what
+        listings show. A refused request of which they show that it was not executed is sent once more.
+
+        after: the state of each name once the change happened.
+        """
         error: FtpNak | RequestTimeout
         for last in (False, True):
             self._under_way += 1
-            self._sent += 1
             began, repeated = self._clock(), True  # as long as no answer came
             try:
                 repeated = (await self._server.ask(make, changes=True)).retransmitted
@@ -401,18 +402,19 @@ class Store:
                 error = timeout
             finally:
                 self._under_way -= 1
+                self._ended += 1
                 now = self._clock()
                 for path, then in after.items():
                     # a late RENAME finds nothing that it could give the new name
                     counts = repeated and then is not After.PRESENT
                     self._quarantine.on_changed(path, now, now - began if counts else 0.0)
             silent = isinstance(error, RequestTimeout)
-            twice = last or not isinstance(error, FtpNak) or self._may_be_second(error)
+            may_have_happened = last or isinstance(error, RequestTimeout) or self._may_be_second(error)
             # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
-            if isinstance(error, FtpNak) and not twice and error.code != NakCode.FILE_EXISTS:
+            if isinstance(error, FtpNak) and not may_have_happened and error.code != NakCode.FILE_EXISTS:
                 raise error
-            outcome = await self._look(after, error)
-            if outcome is Outcome.HAPPENED and twice:
+            outcome = await self._look(after, silent=silent)
+            if outcome is Outcome.HAPPENED and may_have_happened:
                 return
             if outcome is Outcome.UNKNOWN or (silent and outcome is Outcome.CONFLICT):
                 raise OutcomeUnknown(f"{error}; whether it was done is not known") from error
@@ -428,29 +430,28 @@ class Store:
         missing = error.opcode == Opcode.RENAME and error.code in _MISSING
         return error.retransmitted or missing or self._server.in_doubt()
 
-    async def _look(self, after: Mapping[bytes, After], error: FtpNak | RequestTimeout) -> Outcome:
-        """List the directories of these names; return the verdict on a change that failed with an error."""
-        with trio.move_on_after(VERIFY_LIMIT if isinstance(error, RequestTimeout) else inf):
+    async def _look(self, after: Mapping[bytes, After], *, silent: bool) -> Outcome:
+        """List the directories of these names; return the verdict on a change that was refused, or not
+        answered (silent)."""
+        listed: dict[bytes, Listing] = {}
+        evidence: list[Outcome] = []
+        with trio.move_on_after(VERIFY_LIMIT if silent else inf):
             try:
-                return await self._verdict(after)
+                for path, then in after.items():
+                    parent, name = split(path)
+                    if parent not in listed:
+                        listed[parent] = await self._names(parent)
+                    found = judge(listed[parent], name, then)
+                    made = then is After.DIRECTORY and found is Outcome.HAPPENED
+                    if made and (await self.list_directory(path)).entries:
+                        found = Outcome.CONFLICT  # a directory with entries is somebody else's
+                    evidence.append(found)
+                return together(evidence)
             except FtpNak:  # there is not even a parent to list
-                return Outcome.DID_NOT if isinstance(error, FtpNak) else Outcome.UNKNOWN
+                return Outcome.UNKNOWN if silent else Outcome.DID_NOT
             except MavftpfsError:
                 pass
         return Outcome.UNKNOWN
-
-    async def _verdict(self, after: Mapping[bytes, After]) -> Outcome:
-        listed: dict[bytes, Listing] = {}
-        for parent in {split(path)[0]: None for path in after}:
-            listed[parent] = await self._names(parent)
-        verdict = together(
-            judge(listed[split(path)[0]], split(path)[1], then) for path, then in after.items()
-        )
-        for path, then in after.items():  # a directory with entries is somebody else's
-            made = then is After.DIRECTORY and verdict is Outcome.HAPPENED
-            if made and (await self.list_directory(path)).entries:
-                return Outcome.CONFLICT
-        return verdict
 
     async def _names(self, directory: bytes) -> Listing:
         """Return a fresh listing.
@@ -461,9 +462,9 @@ class Store:
         """
         seen: dict[bytes, DirEntry] = {}
         for _ in range(SWEEPS):
-            before = self._sent
+            before = self._ended
             listing = await self.list_directory(directory)
-            if self._sent == before and not self._under_way:
+            if self._ended == before and not self._under_way:
                 return listing
             seen |= {entry.name: entry for entry in listing.entries}
         return replace(listing, entries=tuple(seen.values()))

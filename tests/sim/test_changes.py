@@ -83,6 +83,31 @@ async def test_a_look_misses_no_name_because_other_names_go(profile: str) -> Non
             nursery.start_soon(connection.store.remove, path(profile, name.decode()))
 
 
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+async def test_nor_because_names_go_whose_requests_went_out_before_the_look(profile: str) -> None:
+    """The requests are lost once, so the second transmissions arrive after the first page of the look."""
+    here = Rig(profile, {b"/d": None}, LinkSettings(delay=0.1))
+    names = [path(profile, f"name of some length {number:02}") for number in range(60)]
+    for name in names[:10]:
+        here.card.add(name, b"x")
+    here.card.add_directory(path(profile, "zone"))
+    for name in names[10:]:
+        here.card.add(name, b"x")
+    async with here.connected() as connection, trio.open_nursery() as nursery:
+        await connection.store.list_directory(path(profile, "")[:-1])
+        here.faults.ignore(Opcode.REMOVE_DIRECTORY)
+        here.faults.at(Opcode.REMOVE_FILE, lambda: None, times=5, drop=True)
+
+        async def remove_soon(name: bytes) -> None:
+            await trio.sleep(29.9)  # the look begins after 30 s
+            await connection.store.remove(name)
+
+        for name in names[:5]:
+            nursery.start_soon(remove_soon, name)
+        with pytest.raises(RequestTimeout):
+            await connection.store.remove_directory(path(profile, "zone"))
+
+
 LIMIT = CacheOptions().op_deadline + SLACK
 RADIO = LinkSettings(rate=5760.0, delay=0.05)
 D = b"/d"
