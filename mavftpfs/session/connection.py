@@ -90,8 +90,7 @@ class Connection:
     """One reachable vehicle. Made by `connected`, which runs its tasks.
 
     Attributes:
-        began_at: the time since which the link is listened to. was_lost: the vehicle was lost, and has stayed
-            silent since. news: see `subscribe`.
+        began_at: the time since which the link is listened to. news: see `subscribe`.
     """
 
     def __init__(
@@ -106,10 +105,8 @@ class Connection:
     ) -> None:
         self.link, self.options, self.clock = link, options, clock
         self.began_at = clock()
-        self.was_lost = False
         self.news: list[Callable[[str], None]] = []
         self._first_heartbeat, self._doubted = trio.Event(), trio.Event()
-        self._warned = False  # that another vehicle answers
         own = Address(options.source_system, OWN_COMPONENT) if link.seat is None else link.seat.own
         framer = Framer(
             own,
@@ -131,6 +128,7 @@ class Connection:
             on_refusal=partial(self._tell, "arming refused"),
             on_double=self._move_away,
             on_doubt=self._on_doubt,
+            on_stranger=self._on_stranger,
             patience=options.op_deadline,
         )
         flow = Flow(serial=link.is_serial, bwlimit=options.bwlimit)
@@ -205,8 +203,7 @@ class Connection:
         one."""
         if self.vehicle.identity.standing is Standing.STRANGER:
             return "replaced"
-        silent = self.vehicle.heartbeat_at is not None and self.vehicle.silence(now) > SILENCE_LIMIT
-        if silent or self.vehicle.lost(now):
+        if SILENCE_LIMIT < self.vehicle.silence(now) < inf or self.vehicle.lost(now):
             return "lost"
         return "lossy" if self.engine.flow.path.loss >= LOSSY else "fine"
 
@@ -236,10 +233,13 @@ class Connection:
     def _on_doubt(self) -> None:
         self._doubted.set()  # wakes `_ask_about_vehicle`
 
-    def _on_heartbeat(self) -> None:
+    def _on_stranger(self, told: bool) -> None:
+        if self.vehicle.address is not None:
+            log.warning(_ANOTHER if told else _TELLS_NO_ID, *self.vehicle.address)
+
+    def _on_heartbeat(self, was_lost: bool) -> None:
         self._first_heartbeat.set()
-        if self.was_lost:
-            self.was_lost = False
+        if was_lost:
             self.scheduler.server.wake()
             self._tell("back")
 
@@ -250,8 +250,7 @@ class Connection:
     # --- what runs as long as the connection
 
     async def _beat(self) -> None:
-        """Each second, send a heartbeat, tell the flow control whether other clients are heard, and note when
-        the vehicle is lost.
+        """Each second, send a heartbeat, and tell the flow control whether other clients are heard.
 
         The heartbeats are an onboard controller's, because those of a GCS would feed the GCS-loss failsafe
         (promise 6).
@@ -261,8 +260,6 @@ class Connection:
             driver.send(driver.framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID))
             self.engine.flow.sole_client = not self.vehicle.another_client_heard(self.clock())
             await trio.sleep(HEARTBEAT_PERIOD)
-            if not self.was_lost and self.vehicle.lost(self.clock()):
-                self.was_lost = True
 
     async def _ask_about_vehicle(self) -> None:
         """Ask for the vehicle's id, boot time and card, a few times, since none of this is necessary.
@@ -277,35 +274,26 @@ class Connection:
             while not self._doubted.is_set() and (wanted := self._wanted(asked)):
                 address, now = self.vehicle.address, self.clock()
                 period = _HURRIED if identity.standing is Standing.DOUBTED else _INFO_PERIOD
-                if address is not None and identity.heard_since(asked_at) and now - asked_at >= period:
+                if address is not None and identity.heard_at > asked_at and now - asked_at >= period:
                     for message_id in wanted:
                         driver.send(driver.framer.encode_request_message(address, message_id))
                     if asked >= _OLD_WAY_FROM and AUTOPILOT_VERSION_ID in wanted:
                         driver.send(driver.framer.encode_request_capabilities(address))
                     asked, asked_at = asked + 1, now
                 await trio.sleep(_HURRIED)
-                self._warn_of_stranger()
             await self._doubted.wait()
 
     def _wanted(self, asked: int) -> list[int]:
         """Return the messages to request; asked: the number of earlier requests. The boot time comes first,
         because no file is requested before the id is known, and by then a restart is known, too."""
         vehicle, wanted, optional = self.vehicle, [], asked < _INFO_TRIES
-        if optional and (not vehicle.tells_boot_time or vehicle.lacks_boot_time(self.clock())):
+        if optional and vehicle.lacks_boot_time:
             wanted.append(SYSTEM_TIME_ID)
         if vehicle.identity.standing is not Standing.TRUSTED or (optional and vehicle.version is None):
             wanted.append(AUTOPILOT_VERSION_ID)
         if optional and vehicle.storage is None:
             wanted.append(STORAGE_INFORMATION_ID)
         return wanted
-
-    def _warn_of_stranger(self) -> None:
-        """Warn once each time that the vehicle counts as another one."""
-        identity, address = self.vehicle.identity, self.vehicle.address
-        expired, strange = identity.expire(self.clock()), identity.standing is Standing.STRANGER
-        if strange and not self._warned and address is not None:
-            log.warning(_TELLS_NO_ID if expired else _ANOTHER, *address)
-        self._warned = strange
 
 
 async def heard_within(first: trio.Event, timeout: float, on_wait: Callable[[], None]) -> bool:

@@ -123,7 +123,7 @@ class Driver:
         if self.link.seat is not None:
             self.vehicle.own = self.framer.source = self.link.seat.own
             self.framer.link_id = self.link.seat.number
-        self.vehicle.identity.reopened(now)
+        self.vehicle.identity.reopened()
 
     async def run(self, operation: Operation) -> None:
         """Carry out an operation; cancelling the caller cancels the operation.
@@ -253,7 +253,7 @@ class Driver:
                 self._impostor_at = self.second = None
                 if self.peer is not None:
                     log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
-                    self.vehicle.identity.reopened(now)
+                    self.vehicle.identity.reopened()
             self.peer = sender
         return True
 
@@ -262,7 +262,7 @@ class Driver:
         warn only when it is heard at its old address again."""
         if self._impostor_at is None:
             self._impostor_at = now
-        elif self.vehicle.identity.heard_since(self._impostor_at):
+        elif self.vehicle.identity.heard_at > self._impostor_at:
             self._impostor_at = inf
             self.second = sender
             log.warning(_IGNORED, readable_address(sender), *source)

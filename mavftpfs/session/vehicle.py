@@ -50,14 +50,11 @@ _REPLACED = "another vehicle answers, or the mounted one stopped sending its uni
 _SILENT = "the vehicle is silent; waiting for its heartbeat"
 
 _OPCODE_INDEX = 3
-_REBOOT_SLACK_MS = 2000
-_OLDEST_NEWS_MS = 20_000
-"""Of a restart that is news the boot time is less than twice what passed since the last message (simulators
-may run faster than the clock), and this. A message that is further behind was held back by the network."""
+_SLACK_MS = 2000
+"""How far behind a message may be whose vehicle did not restart."""
 
-_MISSING_MS = 20_000
-"""Less boot time than half of what passed, and this beyond it, is a restart that nobody saw: a full queue
-delays a message less, and simulators may run slower than the clock."""
+_MOST_DELAY_MS = 20_000
+"""More than a full queue delays a message."""
 
 
 class Standing(Enum):
@@ -77,97 +74,75 @@ class Identity:
     | it answers from another network address | the same |
     | it tells the id that is known, or the first one | TRUSTED |
     | it tells another id | STRANGER |
-    | while DOUBTED it is heard, and does not tell its id for `patience` seconds | STRANGER |
+    | while DOUBTED it is heard for `patience` seconds, and does not tell its id | STRANGER |
 
     Attributes:
         standing: of the one that answers now. Only a trusted one is asked for files.
-        left_at: when it was heard last before it was away, the last time.
         heard_at: when it was heard last.
+        left_at: when it was heard last before it was away, the last time.
     """
 
     def __init__(
-        self, on_doubt: Callable[[], None], on_trusted: Callable[[bool], None], patience: float
+        self,
+        on_doubt: Callable[[], None],
+        on_trusted: Callable[[bool], None],
+        on_stranger: Callable[[bool], None],
+        patience: float,
     ) -> None:
-        """on_doubt: it may have restarted, or be another one: it is to be asked. on_trusted: called with
-        whether it was a stranger meanwhile: it is trusted again."""
+        """on_doubt: it is to be asked, because it may have restarted, or be another one. on_trusted: called
+        with whether it was a STRANGER until now. on_stranger: called with whether it told another id."""
         self._patience = patience
         self.standing = Standing.TRUSTED
-        self._on_doubt, self._on_trusted = on_doubt, on_trusted
+        self._on_doubt, self._on_trusted, self._on_stranger = on_doubt, on_trusted, on_stranger
         self._known: AutopilotVersion | None = None  # its id, once it was told
-        # A stranger answered since it was trusted last: boot times heard meanwhile are not the vehicle's.
-        self._strange = False
-        self._doubted_from: float | None = None  # when it was first heard while it was doubted
-        self.heard_at: float | None = None
-        self._back_at = self.left_at = -inf  # the end of the last absence, and its beginning
+        self._doubted_for = 0.0  # seconds for which it was heard while DOUBTED
+        self.heard_at = self.left_at = -inf
 
     def may_be_asked(self, now: float) -> bool:
         """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
-        if self.standing is not Standing.TRUSTED:
-            return False
-        return self._known is None or self.heard_at is None or now - self.heard_at <= ABSENCE
+        heard = self._known is None or now - self.heard_at <= ABSENCE
+        return heard and self.standing is Standing.TRUSTED
 
     def heard(self, now: float) -> None:
         """Note that something came from the vehicle's address."""
-        before, self.heard_at = self.heard_at, now
-        if before is not None and now - before > ABSENCE:
-            self.left_at, self._back_at = before, now
-            self.doubt()
-        if self.standing is Standing.DOUBTED and self._doubted_from is None:
-            self._doubted_from = now
+        pause = now - self.heard_at
+        if ABSENCE < pause < inf:
+            self.reopened()
+        self.heard_at = now
+        if self.standing is Standing.DOUBTED:
+            self._doubted_for += min(pause, ABSENCE)
+            if self._doubted_for > self._patience:
+                self._is_stranger(told=False)
 
-    def reopened(self, now: float) -> None:
+    def reopened(self) -> None:
         """Note that the link was reopened, or that the vehicle answers from another network address: it may
         have been away, or be another vehicle."""
-        if self.heard_at is not None:
-            self.left_at, self._back_at = self.heard_at, now
+        self.left_at = self.heard_at
         self.doubt()
 
-    def away_since(self, when: float, now: float) -> bool:
-        """Return whether it was away after that, so that it may have restarted."""
-        silent = self.heard_at is not None and now - self.heard_at > ABSENCE
-        return silent or self._back_at > when
-
-    def heard_since(self, when: float) -> bool:
-        """Return whether something came from it after that."""
-        return self.heard_at is not None and self.heard_at > when
-
     def doubt(self) -> None:
-        """Doubt that this is still the same vehicle, because it restarted or was silent."""
+        """Doubt that this is still the same vehicle, because it restarted or was away."""
         if self._known is not None and self.standing is not Standing.DOUBTED:
-            self._strange |= self.standing is Standing.STRANGER
-            self.standing, self._doubted_from = Standing.DOUBTED, None
+            self.standing, self._doubted_for = Standing.DOUBTED, 0.0
         self._on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
         """Take the id that the vehicle told; return whether it is the same as ever."""
         if self._known is not None and is_another(self._known, version):
-            self._is_stranger()
+            self._is_stranger(told=True)
             return False
         if self._known is None and (version.uid or any(version.uid2)):
             self._known = version
-        self._trust()
+        before, self.standing = self.standing, Standing.TRUSTED
+        if before is not Standing.TRUSTED:
+            self._on_trusted(before is Standing.STRANGER)
         return True
 
-    def expire(self, now: float) -> bool:
-        """Take the vehicle for a stranger if it was heard for `patience` seconds without reporting its id;
-        return whether it became one just now."""
-        since = self._doubted_from
-        late = self.standing is Standing.DOUBTED and since is not None and now - since > self._patience
-        if late:
-            self._is_stranger()
-        return late
-
-    def _is_stranger(self) -> None:
-        was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
-        if was_trusted:  # nobody asks, and the known vehicle may come back without a silence
-            self._on_doubt()
-
-    def _trust(self) -> None:
-        if self.standing is Standing.TRUSTED:
-            return
-        strange = self._strange or self.standing is Standing.STRANGER
-        self.standing, self._strange = Standing.TRUSTED, False
-        self._on_trusted(strange)
+    def _is_stranger(self, *, told: bool) -> None:
+        if self.standing is not Standing.STRANGER:
+            self.standing = Standing.STRANGER
+            self._on_stranger(told)
+            self._on_doubt()  # it is asked on, because the known vehicle may return without a silence
 
 
 def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
@@ -181,18 +156,47 @@ def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
 
 
 @dataclass(slots=True)
+class BootTime:
+    """The boot time that the vehicle told last, which shows whether it restarted since then.
+
+    Simulators run at half to twice the clock's speed. So after a restart, the boot time is at most twice what
+    passed since the last one. If it is behind and more than that, the network held the message back.
+    Exception: two of them in a row are believed, whatever clock they follow.
+
+    told_ms: milliseconds since the vehicle started, by the last message that was believed. told_at: when that
+    message came.
+    """
+
+    told_ms: int
+    told_at: float
+    _held_back: bool = False
+
+    def shows_restart(self, boot_ms: int, now: float, left_at: float) -> bool:
+        """Take the next boot time; return whether the vehicle restarted. left_at: see Identity."""
+        passed_ms = (now - self.told_at) * 1000
+        # It counted on until it left, perhaps for long: some tell their boot time only when they are asked.
+        counted_ms = max(0.0, left_at - self.told_at) * 1000
+        least = max(counted_ms / 2 - _SLACK_MS, passed_ms / 2 - _MOST_DELAY_MS)
+        is_behind = boot_ms - self.told_ms < least
+        self._held_back = is_behind and not self._held_back and boot_ms > 2 * passed_ms + _MOST_DELAY_MS
+        if not self._held_back:
+            self.told_ms, self.told_at = boot_ms, now
+        return is_behind and not self._held_back
+
+
+@dataclass(slots=True)
 class Vehicle:
     """Records what the target and its neighbours on the link tell.
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
     own: this connection's address. on_another_client: called with each payload from or to another FTP client,
-    and whether none was heard for a while before. on_refusal: called when the vehicle refuses to arm.
-    on_double: called when another program uses the address `own`. on_doubt, patience: see Identity.
+    and whether none was heard for a while before. on_heartbeat: called with whether the vehicle was lost.
+    on_refusal: called when the vehicle refuses to arm. on_double: called when another program uses the
+    address `own`. on_doubt, on_stranger, patience: see Identity.
 
     Attributes:
-        armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
-            to now (promise 9).
+        armed: whether to treat it as armed; never heard counts as armed.
     """
 
     wanted_system: int
@@ -201,34 +205,35 @@ class Vehicle:
     write_armed: bool = False
     on_reboot: Callable[[], None] = lambda: None
     on_another_client: Callable[[bytes, bool], None] = lambda payload, newcomer: None
-    on_heartbeat: Callable[[], None] = lambda: None
+    on_heartbeat: Callable[[bool], None] = lambda was_lost: None
     on_armed: Callable[[bool], None] = lambda armed: None
     on_refusal: Callable[[], None] = lambda: None
     on_double: Callable[[], None] = lambda: None
     on_doubt: Callable[[], None] = lambda: None
+    on_stranger: Callable[[bool], None] = lambda told: None
     patience: float = 30.0
     address: Address | None = None
     heartbeat: Heartbeat | None = None
-    heartbeat_at: float | None = None
+    heartbeat_at: float = -inf
     version: AutopilotVersion | None = None
     storage: StorageInformation | None = None
-    another_client_at: float | None = None
+    another_client_at: float = -inf
     reboots: int = 0
     refusals: int = 0
     identity: Identity = field(init=False)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     armed: bool = True
-    may_write: bool = False
-    _told_armed: bool | None = None
     _disarmed_at: float = -inf
-    _boot_ms: int | None = None
-    boot_heard_at: float = -inf
-    _held_back: bool = False
+    _boot: BootTime | None = None
     _timed_out: bool = False
 
     def __post_init__(self) -> None:
-        self.identity = Identity(self.on_doubt, self._on_trusted, self.patience)
-        self.may_write = self.write_armed
+        self.identity = Identity(self.on_doubt, self._on_trusted, self._on_stranger, self.patience)
+
+    @property
+    def may_write(self) -> bool:
+        """Whether it may be written to now (promise 9)."""
+        return self.write_armed or not self.armed
 
     @property
     def ftp_flag(self) -> bool | None:
@@ -253,7 +258,7 @@ class Vehicle:
 
     def silence(self, now: float) -> float:
         """Return the seconds since the vehicle's last heartbeat (infinite before the first)."""
-        return inf if self.heartbeat_at is None else now - self.heartbeat_at
+        return now - self.heartbeat_at
 
     def lost(self, now: float) -> bool:
         """Return whether requests that need the link should fail at once."""
@@ -277,24 +282,18 @@ class Vehicle:
         """
         if self.identity.standing is Standing.STRANGER:
             return _REPLACED
-        silent = not self.identity.heard_since(now - SILENCE_LIMIT)
+        silent = self.identity.heard_at <= now - SILENCE_LIMIT
         return _SILENT if silent or self.lost(now) else None
 
     def another_client_heard(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
-        return self.another_client_at is not None and now - self.another_client_at < CLIENT_MEMORY
+        return now - self.another_client_at < CLIENT_MEMORY
 
     @property
-    def tells_boot_time(self) -> bool:
-        """Whether it told it at all; some do only when they are asked (ArduCopter)."""
-        return self.boot_heard_at > -inf
-
-    def lacks_boot_time(self, now: float) -> bool:
-        """Return whether its boot time is worth asking for again: it was away since it told it, so a restart
-        may have gone unnoticed, or what it told does not count."""
-        if not self.tells_boot_time:
-            return False
-        return self._boot_ms is None or self.identity.away_since(self.boot_heard_at, now)
+    def lacks_boot_time(self) -> bool:
+        """Whether its boot time is worth asking for, because some tell it only then (ArduCopter): it was not
+        told yet, or the vehicle was away since, so a restart may have gone unnoticed."""
+        return self._boot is None or self._boot.told_at <= self.identity.left_at
 
     def note_timeout(self) -> None:
         """Note that a request to the vehicle went unanswered to its deadline."""
@@ -349,29 +348,34 @@ class Vehicle:
         speaks = self.address not in self.heard and source.component == MAV_COMP_ID_AUTOPILOT1
         if source != self.address and not speaks:
             return
-        self.heartbeat_at = now
-        self.heartbeat = heartbeat
+        was_lost = self.lost(now)
+        self.heartbeat, self.heartbeat_at = heartbeat, now
         self.identity.heard(now)
         if self.identity.standing is Standing.TRUSTED:
-            self._timed_out = False
-            self.on_heartbeat()
+            self._lives(was_lost)
+
+    def _lives(self, was_lost: bool) -> None:
+        self._timed_out = False
+        self.on_heartbeat(was_lost)
 
     def _on_trusted(self, was_stranger: bool) -> None:
-        """Trust the vehicle again. It counts as restarted if another one answered meanwhile, whose boot times
-        tell nothing."""
-        if was_stranger:
-            self._boot_ms = None
-            self.reboots += 1
-            self.on_reboot()
-        elif self._disarmed_at > self.identity.left_at:  # it was this one that said so
+        if not was_stranger and self._disarmed_at > self.identity.left_at:  # it was this one that said so
             self._on_armed(False)
-        self._timed_out = False
-        self.on_heartbeat()
+        self._lives(self._timed_out)
+
+    def _on_stranger(self, told: bool) -> None:
+        """Count the vehicle as restarted when another one takes its place, whose boot times tell nothing."""
+        self._boot, self._timed_out = None, True
+        self._on_restart()
+        self.on_stranger(told)
+
+    def _on_restart(self) -> None:
+        self.reboots += 1
+        self.on_reboot()
 
     def _on_armed(self, armed: bool) -> None:
-        if armed is not self._told_armed:
-            self._told_armed = self.armed = armed
-            self.may_write = self.write_armed or not armed
+        if armed is not self.armed:
+            self.armed = armed
             self.on_armed(armed)
 
     def _on_ftp_of_another_client(self, run: FtpRun, now: float) -> None:
@@ -388,20 +392,8 @@ class Vehicle:
                 self.on_another_client(payload, newcomer)
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
-        before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000
-        # It counted on until it was away: one that tells only when it is asked told this long before.
-        # (Simulators may run slower than the clock.)
-        counted_on = max(0.0, self.identity.left_at - self.boot_heard_at) * 1000 / 2
-        went_back = before is not None and boot_ms + _REBOOT_SLACK_MS < before + counted_on
-        # Two of them in a row are believed, whatever clock they follow.
-        if went_back and boot_ms > 2 * elapsed_ms + _OLDEST_NEWS_MS and not self._held_back:
-            self._held_back = True
-            return
-        self._held_back = False
-        self._boot_ms, self.boot_heard_at = boot_ms, now
-        if before is None:
-            return
-        if went_back or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:
-            self.reboots += 1
+        if self._boot is None:
+            self._boot = BootTime(boot_ms, now)
+        elif self._boot.shows_restart(boot_ms, now, self.identity.left_at):
             self.identity.doubt()
-            self.on_reboot()
+            self._on_restart()

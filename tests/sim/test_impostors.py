@@ -306,6 +306,26 @@ async def test_ours_is_known_again_though_nobody_was_silent(caplog: pytest.LogCa
     assert len([line for line in caplog.messages if "another vehicle" in line]) == 1
 
 
+@pytest.mark.holds("fault another vehicle")
+async def test_one_heartbeat_between_two_silences_makes_nobody_another_vehicle(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It had no time to tell its id."""
+    scene = Crowd()
+    async with scene.rig.connected() as connection:
+        await told(connection)
+        scene.link.cut()
+        await trio.sleep(10.0)
+        scene.link.intrude(HERE, heartbeat())
+        await trio.sleep(60.0)
+        assert connection.status()["link"]["state"] == "lost"
+        scene.link.restore()
+        await trio.sleep(5.0)
+        assert await read_file(connection, b"/f") == OURS
+        assert connection.vehicle.reboots == 0
+    assert caplog.messages == []
+
+
 @pytest.mark.holds("promise 10")
 async def test_a_target_without_heartbeats_moves_with_its_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Crowd("mavsdk", component=191)

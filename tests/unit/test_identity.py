@@ -23,12 +23,14 @@ def standing(identity: Identity) -> Standing:
 
 
 class Watched(Identity):
-    """An identity that counts what it tells. doubts: questions wanted; trusted: what on_trusted was told."""
+    """An identity that counts what it tells. doubts: questions wanted; trusted: what on_trusted was told;
+    strangers: what on_stranger was told."""
 
     def __init__(self) -> None:
         self.doubts = 0
         self.trusted: list[bool] = []
-        super().__init__(self._count, self.trusted.append, PATIENCE)
+        self.strangers: list[bool] = []
+        super().__init__(self._count, self.trusted.append, self.strangers.append, PATIENCE)
 
     def _count(self) -> None:
         self.doubts += 1
@@ -58,56 +60,53 @@ def test_it_may_have_restarted_while_it_was_away() -> None:
     identity.told(version(1))
     assert identity.may_be_asked(10.0 + ABSENCE)
     assert not identity.may_be_asked(10.1 + ABSENCE), "not into a silence"
-    assert not identity.away_since(10.0, 10.0 + ABSENCE)
-    assert identity.away_since(10.0, 10.1 + ABSENCE)
     identity.heard(20.0)
-    assert identity.doubts == 1
-    assert identity.away_since(10.0, 20.0)
-    assert not identity.away_since(20.0, 20.0)
-    identity.reopened(20.5)
-    assert identity.doubts == 2
-    assert identity.away_since(20.0, 20.5)
+    assert (identity.doubts, identity.left_at) == (1, 10.0)
+    identity.heard(21.0)
+    identity.reopened()
+    assert (identity.doubts, identity.left_at) == (2, 21.0)
 
 
 def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity = Watched()
     identity.told(version(1))
     assert not identity.told(version(2))
-    assert identity.doubts == 1
+    assert not identity.told(version(2))
+    assert (identity.doubts, identity.strangers) == (1, [True]), "that is told once"
     assert standing(identity) is Standing.STRANGER
     identity.doubt()  # it went: the next one may be ours
-    assert standing(identity) is not Standing.STRANGER
-    assert standing(identity) is not Standing.TRUSTED
+    assert standing(identity) is Standing.DOUBTED
     assert identity.told(version(1))
     assert standing(identity) is Standing.TRUSTED
-    assert identity.trusted == [True]
+    identity.told(version(2))
+    assert identity.told(version(1))
+    assert identity.trusted == [False, True]
 
 
-@pytest.mark.parametrize("silences", [False, True])
+@pytest.mark.parametrize("period", [1.0, 3.0])
 def test_a_vehicle_that_told_its_id_and_does_not_tell_it_again_is_a_stranger_in_the_end(
-    silences: bool,
+    period: float,
 ) -> None:
-    """Silences between the questions do not make the time begin again; before it is heard no time runs."""
+    """Silences between its heartbeats do not make the time begin again, and do not count."""
     identity = Watched()
     identity.heard(0.0)
     identity.told(version(1))
-    identity.doubt()
-    assert not identity.expire(1000.0)
-    for beat in range(1000, 1000 + int(PATIENCE), 3 if silences else 1):
-        identity.heard(float(beat))
-        assert not identity.expire(float(beat))
+    beats = [1000.0 + period * count for count in range(int(PATIENCE / min(period, ABSENCE)) + 2)]
+    for beat in beats[:-4]:
+        identity.heard(beat)
         assert standing(identity) is Standing.DOUBTED
-    assert identity.expire(1000.1 + PATIENCE)
+    for beat in beats[-4:]:
+        if not identity.strangers:
+            identity.heard(beat)
     assert standing(identity) is Standing.STRANGER
-    assert not identity.expire(1001.0 + PATIENCE), "that is told once"
     assert identity.told(version(1))
-    assert identity.trusted == [True]
+    assert (identity.strangers, identity.trusted) == ([False], [True])
 
 
 def test_one_that_never_told_an_id_need_not_tell_one() -> None:
     identity = Watched()
     identity.heard(0.0)
-    identity.reopened(10.0)
-    identity.heard(10.0)
-    assert not identity.expire(10.0 + 2 * PATIENCE)
+    identity.reopened()
+    for second in range(10, 10 + 2 * int(PATIENCE)):
+        identity.heard(float(second))
     assert standing(identity) is Standing.TRUSTED

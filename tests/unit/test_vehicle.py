@@ -127,7 +127,7 @@ def test_a_component_cannot_disarm_the_autopilot() -> None:
     assert vehicle.armed
     vehicle.on_message(heartbeat(PILOT), 3.0)
     assert not vehicle.armed
-    assert news == [True, False]
+    assert news == [False]
 
 
 @pytest.mark.holds("promise 6", "rule 14.39")
@@ -179,10 +179,10 @@ def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, to
     tell_boot_times(vehicle, (0.0, 5_000))
     for second in [*range(21), 35]:
         vehicle.on_message(heartbeat(PILOT), float(second))
-    assert vehicle.lacks_boot_time(35.0)
+    assert vehicle.lacks_boot_time
     tell_boot_times(vehicle, (35.0, told))
     assert vehicle.reboots == restarts
-    assert not vehicle.lacks_boot_time(35.0)
+    assert not vehicle.lacks_boot_time
 
 
 def test_facts_are_taken_from_the_target_alone() -> None:
