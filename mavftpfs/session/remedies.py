@@ -3,7 +3,7 @@
 | who has the session (`Holder`) | NAK | remedy |
 |---|---|---|
 | HIDDEN: PX4's sticky errno hides every other code | 8 | list a directory to its end, once; that clears it |
-| OURS: this connection has a file open, whose ACK it missed | 4, 5, 8, 1: see `left_open` | close it |
+| OURS: this connection, whose `maybe_open` is not empty | 4, 5, 8, 1 | close that, three times at most |
 | ANOTHER: a client that was heard | 4, 5, 8 | the caller waits for that client |
 | GONE: a client that is not heard | 4, 5, 8 | be silent for 3.5 s, then 10.5 s; for an open, then reset |
 | NOBODY: the refusal has another reason | any other | none: an error |
@@ -28,10 +28,15 @@ SILENCE_ARDUPILOT = 3.5
 SILENCE_PX4 = 10.5
 """Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
 
+MOST_CLOSES = 3
+"""How often `maybe_open` is closed because of one request; then its refusal has another reason."""
+
 TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
 MAYBE_TAKEN = TAKEN | {NakCode.FILE_EXISTS}
 """NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open or a
 Terminate."""
+IF_OPEN = MAYBE_TAKEN | {NakCode.FAIL}
+"""Refusals of an open that servers send while a file is open."""
 
 
 class Holder(Enum):
@@ -58,27 +63,15 @@ class Tried:
     remedies: Counter[Holder] = field(default_factory=Counter)
 
 
-def left_open(nak: FtpNak, tried: Tried, *, echoes: bool) -> bool:
-    """Return whether this connection may have a file open under the id that a refused open asked for.
-
-    Either the open was sent twice, so the first transmission opened the file, and the second one was refused.
-    Or an ArduPilot, whose ACKs echo ids, says so by NAK 1: a late duplicate of an earlier open opened a file.
-    If the server repeats NAK 1 after that file was closed, the refusal has another reason.
-    """
-    if nak.code == NakCode.FAIL:
-        return nak.retransmitted or (echoes and not tried.remedies[Holder.OURS])
-    return nak.retransmitted and nak.code in MAYBE_TAKEN
-
-
 def holder(nak: FtpNak, tried: Tried, *, ours: bool, another: bool) -> Holder:
     """Return who has the session. ours: this connection may have a file open, and may close it. another:
     another client may have a file open."""
-    if nak.code == NakCode.FAIL:
-        return Holder.OURS if ours else Holder.NOBODY
-    if nak.code not in (MAYBE_TAKEN if tried.opens else TAKEN):
+    if nak.code not in (IF_OPEN if tried.opens else TAKEN):
         return Holder.NOBODY
     if nak.code == NakCode.FILE_EXISTS and not tried.remedies[Holder.HIDDEN]:
         return Holder.HIDDEN
-    if ours:
+    if ours and tried.remedies[Holder.OURS] < MOST_CLOSES:
         return Holder.OURS
+    if nak.code == NakCode.FAIL:
+        return Holder.NOBODY
     return Holder.ANOTHER if another else Holder.GONE

@@ -489,7 +489,7 @@ class Scheduler:
 
     def _used_paths(self) -> list[bytes]:
         """Return the paths of files that are open, may be open, or may be opened at any time."""
-        used = [path for _, path in self.server.maybe_open]
+        used = self.server.maybe_open.copy()
         if self.server.opened is not None:
             used.append(self.server.opened.path)
         if self.holder is not None:
@@ -570,7 +570,7 @@ class Scheduler:
             if not self._is_kept(session.path):
                 return 0.0
             return max(0.0, self._used_at + IDLE_CLOSE - now)
-        if any(self.is_excluded(path) for _, path in server.maybe_open):
+        if any(map(self.is_excluded, server.maybe_open)):
             return 0.0
         if not server.maybe_open or self.next_user() is not None:  # whose open closes those first
             return inf

@@ -21,7 +21,7 @@ from typing import TypeVar
 import trio
 
 from mavftpfs.protocol.operations import BEYOND, ListDirectory, OpenRequest, Simple
-from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Request
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.others import (
@@ -34,6 +34,7 @@ from mavftpfs.session.others import (
 )
 from mavftpfs.session.quarantine import LASTS, Quarantine
 from mavftpfs.session.remedies import (
+    IF_OPEN,
     MAYBE_TAKEN,
     SILENCE_ARDUPILOT,
     SILENCE_PX4,
@@ -41,7 +42,6 @@ from mavftpfs.session.remedies import (
     Holder,
     Tried,
     holder,
-    left_open,
 )
 from mavftpfs.shared.errors import (
     FtpNak,
@@ -97,8 +97,8 @@ class ServerSession:
     Attributes:
         opened: the open file; None if none is open, or if it was moved to `maybe_open`. transfer: the
         operation that reads or writes it now.
-        maybe_open: (session id, path) of each file that this connection may have open: its open or its
-        Terminate is not answered (yet), or `distrust` moved it here. The path is b"" if that is not known.
+        maybe_open: the path of each file that this connection may have open: its open or its Terminate is not
+        answered (yet), or `distrust` moved it here. The path is b"" if that is not known.
         newest_open_at: the time of the newest open: when it went out, then when its ACK came. A request that
         went out earlier belongs to an earlier file.
         epoch: the time of the last `distrust` of reads, always later than the one before. Bytes that were
@@ -128,7 +128,7 @@ class ServerSession:
         self.patient = patient
         self.opened: OpenSession | None = None
         self.transfer: Operation | None = None
-        self.maybe_open: set[tuple[int, bytes]] = set()
+        self.maybe_open: list[bytes] = []
         self.newest_open_at = -inf
         self.epoch = self._distrusted_at = -inf
         self.quarantine = Quarantine()
@@ -193,7 +193,7 @@ class ServerSession:
         why = "an answer came that no request explains"
         self.distrust(why, reads=another and self.opened is not None)
         if another:
-            self.maybe_open.add((reply.session, b""))
+            self.maybe_open.append(b"")
             self.wake()
 
     def on_unawaited(self, reply: Payload, request: Request) -> None:
@@ -222,7 +222,7 @@ class ServerSession:
         if self.transfer is not None:
             self.driver.cancel(self.transfer)
         if self.opened is not None:
-            self.maybe_open.add((self.opened.id, self.opened.path))
+            self.maybe_open.append(self.opened.path)
             self.opened, self.engine.session = None, self.engine.home_session
         self.wake()
 
@@ -234,10 +234,10 @@ class ServerSession:
         else:
             self.leave()
 
-    def _forget(self, closed: set[tuple[int, bytes]]) -> None:
-        """Note that these files are closed. The others stay, because a late open may have opened one behind
-        the Terminate."""
-        self.maybe_open -= closed
+    def _forget(self, count: int) -> None:
+        """Note that the first files in `maybe_open` are closed. The later ones stay, because a late open may
+        have opened one behind the Terminate."""
+        del self.maybe_open[:count]
         self.wake()
 
     # --- waiting
@@ -308,21 +308,19 @@ class ServerSession:
 
     async def _opens(self, path: bytes, opcode: Opcode, tried: Tried) -> bool:
         """Ask to open a file once; return False if that is to be tried again."""
-        asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
-        operation = OpenRequest(opcode, wire_path(path), session=asked)
+        operation = OpenRequest(opcode, wire_path(path), session=self.engine.home_session)
         operation.on_opened = partial(self._on_opened, path, tried)
-        # After a time-out or a cancellation these stay: the server may have opened the file. PX4 and MAVSDK
-        # answer with id 0, whatever was asked for; until an ACK tells which, the file may have either id.
-        ids = {True: {asked}, False: {0}, None: {asked, 0}}[echoes]
-        opening = {(session, path) for session in ids} - self.maybe_open  # an earlier try may have opened it
-        self.maybe_open |= opening
+        self.maybe_open.append(path)  # where it stays after a time-out or a cancellation
         self.newest_open_at = self.clock()
         try:
             await self.driver.run(operation)
         except FtpNak as nak:
             tried.resent |= nak.retransmitted
-            if not left_open(nak, tried, echoes=bool(echoes)):
-                self.maybe_open -= opening
+            # If the open was sent twice, the first transmission may have opened the file. By NAK 1 an
+            # ArduPilot, whose ACKs echo ids, says that a late open left a file open under our id.
+            says_so = self.engine.traits.ack_carries_own_session and nak.code == NakCode.FAIL
+            if not (says_so or (nak.retransmitted and nak.code in IF_OPEN)):
+                self.maybe_open.remove(path)
             await self._remedy(nak, tried)
             return False
         return True
@@ -354,8 +352,7 @@ class ServerSession:
             SessionBusy: nothing is left that could help. RequestTimeout: a remedy was not answered.
         """
         now = self.clock()
-        in_time = now - tried.began < self.op_deadline  # no close that never helps is repeated for ever
-        ours = tried.opens and bool(self.maybe_open) and self._may_terminate and in_time
+        ours = tried.opens and bool(self.maybe_open) and self._may_terminate
         who = holder(nak, tried, ours=ours, another=now < self.others_until)
         tries = tried.remedies[who]
         tried.remedies[who] += 1
@@ -421,14 +418,14 @@ class ServerSession:
         if session is None:
             return True
         self.leave()
-        left, asked_at = {(session.id, session.path)}, self.clock()
+        asked_at = self.clock()
         try:
             with trio.move_on_after(limit):
                 await self._terminate(session.id)
-                self._forget(left)
+                self._forget(1)
                 return True
         except FtpNak as nak:
-            self._forget(left)
+            self._forget(1)
             if nak.code not in MAYBE_TAKEN:
                 raise
             # The file was in use when the first transmission went out.
@@ -455,11 +452,13 @@ class ServerSession:
         Raises:
             RequestTimeout: no answer; the files stay in `maybe_open`.
         """
-        for session in {session for session, _ in self.maybe_open}:
-            left = {one for one in self.maybe_open if one[0] == session}
-            if self._may_terminate:
+        count, asked = len(self.maybe_open), self.engine.home_session
+        # PX4 and MAVSDK answer with id 0, whatever was asked for; before the first ACK it may be either.
+        ids = {True: (asked,), False: (0,), None: (asked, 0)}[self.engine.traits.ack_carries_own_session]
+        for session in ids:
+            if count and self._may_terminate:
                 await self._try(self._terminate(session))
-            self._forget(left)
+        self._forget(count)
 
     async def _terminate(self, session: int) -> None:
         """Send Terminate until it is answered, or another client has the session. Then ours is closed, and a

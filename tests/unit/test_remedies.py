@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.session.remedies import Holder, Tried, holder, left_open
+from mavftpfs.session.remedies import MOST_CLOSES, Holder, Tried, holder
 from mavftpfs.shared.errors import FtpNak
 
 
@@ -36,13 +36,8 @@ def test_a_plain_failure_is_no_question_of_the_session_unless_the_file_is_ours()
     assert holder(refused(NakCode.FILE_NOT_FOUND), tried, ours=True, another=True) is Holder.NOBODY
 
 
-def test_an_open_left_a_file_if_it_was_sent_twice_or_an_ardupilot_says_so_for_the_first_time() -> None:
+def test_a_close_that_does_not_help_is_not_repeated_for_ever() -> None:
     tried = Tried(0.0, opens=True)
-    assert left_open(refused(NakCode.NO_SESSIONS_AVAILABLE, retransmitted=True), tried, echoes=False)
-    assert not left_open(refused(NakCode.NO_SESSIONS_AVAILABLE), tried, echoes=True)
-    assert not left_open(refused(NakCode.FILE_NOT_FOUND, retransmitted=True), tried, echoes=True)
-    assert left_open(refused(NakCode.FAIL), tried, echoes=True)
-    assert not left_open(refused(NakCode.FAIL), tried, echoes=False)
-    tried.remedies[Holder.OURS] += 1
-    assert not left_open(refused(NakCode.FAIL), tried, echoes=True)
-    assert left_open(refused(NakCode.FAIL, retransmitted=True), tried, echoes=True)
+    tried.remedies[Holder.OURS] = MOST_CLOSES
+    assert holder(refused(NakCode.FAIL), tried, ours=True, another=True) is Holder.NOBODY
+    assert holder(refused(NakCode.NO_SESSIONS_AVAILABLE), tried, ours=True, another=False) is Holder.GONE
