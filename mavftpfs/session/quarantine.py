@@ -41,8 +41,8 @@ class Quarantine:
     def __init__(self) -> None:
         self._lateness = 0.0
         self._seen_at = -inf
-        # By name, the oldest first: the time of the change, and the time to the answer if it was
-        # retransmitted.
+        # By name, the oldest first: the time of the last change, and the end of the quarantine if no
+        # duplicate is seen.
         self._changed: dict[bytes, tuple[float, float]] = {}
 
     def saw(self, lateness: float | None, now: float) -> None:
@@ -58,19 +58,18 @@ class Quarantine:
         took: seconds from its first transmission to its answer or time-out, if the session repeated it or
             got no answer; otherwise 0.
         """
-        name, took = path.lower(), min(max(took, LEAST_IF_REPEATED / 2), MOST / 2) if took else 0.0
-        since, before = self._changed.pop(name, (now, 0.0))
-        # An earlier, longer quarantine stays. `left` counts `took` twice, so a second that passed is half a
-        # second of it.
-        self._changed[name] = now, max(took, before - (now - since) / 2)
+        name = path.lower()
+        until = now + min(max(2 * took, LEAST_IF_REPEATED), MOST) if took else now
+        _, before = self._changed.pop(name, (now, now))
+        self._changed[name] = now, max(until, before)
         while now - next(iter(self._changed.values()))[0] > MOST:
             del self._changed[next(iter(self._changed))]
 
     def left(self, path: bytes, now: float) -> float:
         """Return the seconds for which the name is still in quarantine."""
-        since, took = self._changed.get(path.lower(), (-inf, 0.0))
-        lateness = max(took, self._lateness if self._is_fresh(now) else 0.0)
-        return max(0.0, since + min(MOST, 2 * lateness) - now)
+        changed_at, until = self._changed.get(path.lower(), (-inf, -inf))
+        lateness = self._lateness if self._is_fresh(now) else 0.0
+        return max(0.0, until - now, changed_at + min(MOST, 2 * lateness) - now)
 
     def _is_fresh(self, now: float) -> bool:
         return now - self._seen_at <= LASTS
