@@ -211,7 +211,7 @@ class Connection:
 
     def _on_reboot(self) -> None:
         self.engine.forget_server()
-        self.scheduler.server.distrust("the vehicle restarted", reads=True)
+        self.scheduler.server.distrust(reads=True)
         self._tell("reboot")
 
     def _on_another_client(self, payload: bytes, newcomer: bool) -> None:

@@ -141,7 +141,7 @@ class ServerSession:
 
     # --- trust
 
-    def distrust(self, why: str, *, reads: bool) -> None:
+    def distrust(self, *, reads: bool) -> None:
         """Make ACKs suspect: for ten minutes the caches compare each file that they write.
 
         Servers share session ids between clients, requests name a session and no file, and some links deliver
@@ -175,7 +175,7 @@ class ServerSession:
         missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
         # If no file was opened since reads were last distrusted, no more bytes are suspect.
         suspect = session is not None or self.newest_open_at >= self.epoch
-        self.distrust("another FTP client is active", reads=(took or missed) and suspect)
+        self.distrust(reads=(took or missed) and suspect)
         self.wake()
 
     def on_unexplained(self, reply: Payload, lateness: float | None) -> None:
@@ -190,8 +190,7 @@ class ServerSession:
         self.quarantine.saw(lateness, self.clock())
         opens = reply.opcode == Opcode.ACK and reply.req_opcode in OPENING
         another = opens and (self.opened is None or self.opened.ack_seq != reply.seq)
-        why = "an answer came that no request explains"
-        self.distrust(why, reads=another and self.opened is not None)
+        self.distrust(reads=another and self.opened is not None)
         if another:
             self.maybe_open.append(b"")
             self.wake()
@@ -214,7 +213,7 @@ class ServerSession:
             if not cancelled and (self.opened is None or self.opened.ack_seq != reply.seq):
                 self.on_unexplained(reply, late)
         elif reply.req_opcode == Opcode.WRITE_FILE and not newest:
-            self.distrust("a WriteFile came after its file was closed", reads=False)
+            self.distrust(reads=False)
 
     def leave(self) -> None:
         """Stop using the open file: cancel its transfer, and move it to `maybe_open`, so that it is closed
@@ -230,7 +229,7 @@ class ServerSession:
         """Leave the session that its user found lost; distrust reads if the server said so, because then
         another client may have had the session."""
         if lost.by_server:
-            self.distrust(str(lost), reads=True)
+            self.distrust(reads=True)
         else:
             self.leave()
 
@@ -406,6 +405,9 @@ class ServerSession:
     async def close(self, limit: float = inf) -> bool:
         """Terminate the session; return False if the server had closed it by itself before.
 
+        The result is also True if another client took the session before the answer came. That closed the
+        file, and raises a distrust by which the caches compare it.
+
         If the server answers a repeated Terminate with "no such session", the first transmission closed it.
         Exception: after 8 s the server may have closed the session because it was idle. limit: seconds to
         wait for the answer, inf for op_deadline.
@@ -431,7 +433,7 @@ class ServerSession:
             # The file was in use when the first transmission went out.
             closed = nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
             if not closed:  # another client may have had the session
-                self.distrust("the server had closed a file before it was told to", reads=True)
+                self.distrust(reads=True)
             return closed
         raise RequestTimeout("no answer to TerminateSession")
 

@@ -485,7 +485,7 @@ async def test_no_checksum_is_asked_for_in_flight() -> None:
         await here.arm()
         await write_file(tree, b"/new", NEW)
         assert here.data(b"/new") == NEW
-        here.connection.scheduler.server.distrust("for the test", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
         with pytest.raises(Armed):
             await write_file(tree, b"/newer", NEW)
         assert b"/newer" not in here.files()

@@ -42,7 +42,7 @@ async def test_distrust_lasts_for_ten_minutes() -> None:
     async with here.connected() as connection:
         store = connection.store
         assert not store.in_doubt()
-        connection.scheduler.server.distrust("a reason", reads=False)
+        connection.scheduler.server.distrust(reads=False)
         at = trio.current_time()
         await trio.sleep(LASTS)
         assert store.in_doubt()
@@ -370,7 +370,7 @@ async def test_a_late_rename_or_remove_never_loses_old_and_new(
         tree = here.mount()
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
-            here.connection.scheduler.server.distrust("a copy was late", reads=True)
+            here.connection.scheduler.server.distrust(reads=True)
             here.connection.scheduler.server.quarantine.saw(0.5, trio.current_time())
         Latecomer(here, what, after=after, nth=nth, first=first)
         wanted = content(500, 1)
@@ -401,7 +401,7 @@ async def test_a_rename_that_comes_after_all_waiting_is_mended_unasked(profile: 
         tree = here.mount()
         await write_file(tree, b"/d/g", b"x")  # what the card can is known from now on
         if known:
-            here.connection.scheduler.server.distrust("a copy was late", reads=True)
+            here.connection.scheduler.server.distrust(reads=True)
             here.connection.scheduler.server.quarantine.saw(0.1, trio.current_time())
         renames: list[bytes] = []
 
@@ -424,7 +424,7 @@ async def test_the_old_file_is_removed_only_when_the_new_one_is_seen() -> None:
     async with rig("px4-nuttx", {b"/d/f": content(500, 1), b"/d/g": content(500, 2)}, link=CLEAN) as here:
         tree = here.mount()
         await write_file(tree, b"/d/k", b"x")
-        here.connection.scheduler.server.distrust("a copy was late", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
         here.connection.scheduler.server.quarantine.saw(0.1, trio.current_time())
         await tree.list(b"/d")
         copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME, first=True)
@@ -443,7 +443,7 @@ async def test_an_older_file_never_gets_the_name_while_the_next_is_placed(profil
     async with rig(profile, {b"/d/f": content(500, 1), b"/d/g": content(500, 3)}, link=CLEAN) as here:
         tree = here.mount()
         await write_file(tree, b"/d/k", b"x")  # what the card can is known from now on
-        here.connection.scheduler.server.distrust("a copy was late", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
         await write_file(tree, b"/d/f", content(500, 2))
         here.faults.refuse(Opcode.REMOVE_FILE, NakCode.FAIL_ERRNO, errno.EACCES, times=100)
         await trio.sleep(11.0)
@@ -723,7 +723,7 @@ async def test_in_doubt_a_file_waits_for_its_checksum(told: str) -> None:
     async with rig("px4", {b"/d/f": b"x"}, link=CLEAN) as here:
         tree = here.mount(op_deadline=5.0)
         here.connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
-        here.connection.scheduler.server.distrust("an answer that came twice", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
 
         def spoil() -> None:
             here.put(here.litter()[0], data[:70_000] + b"?" + data[70_001:])

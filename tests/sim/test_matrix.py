@@ -132,7 +132,7 @@ async def meet(
         await tree.list(D)
         await trio.sleep(10.0 if event in EARLY else 3.0)
         if operation is append_in_doubt:
-            here.connection.scheduler.server.distrust("an answer that came twice", reads=True)
+            here.connection.scheduler.server.distrust(reads=True)
         began, done = len(here.faults.requests), False
         with caller:
             if event not in EARLY:

@@ -166,7 +166,7 @@ async def test_a_read_whose_bytes_fell_into_doubt_leaves_the_reader_of_another_r
 
         async def doubt_comes(*args: object, **kwargs: object) -> None:
             monkeypatch.setattr(reading, "_prove", prove)
-            here.connection.scheduler.server.distrust("doubt", reads=True)
+            here.connection.scheduler.server.distrust(reads=True)
             await handle.read(STEP, STEP)  # opens the file anew
             readers.append(blocks.reader)
 

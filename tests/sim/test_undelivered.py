@@ -193,7 +193,7 @@ async def test_what_others_put_there_after_an_interruption_stays(
 async def test_what_others_put_there_before_ours_was_confirmed_stays(profile: str, path: bytes) -> None:
     """In doubt the file is compared once more under its own name, and the vehicle falls silent there."""
     async with mounted(profile, {FILE: OLD}) as (here, tree):
-        here.connection.scheduler.server.distrust("for the test", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
         file = await (tree.open(path, write=True) if path == FILE else tree.create(path, exclusive=True))
         await file.write(len(OLD) if path == FILE else 0, b"more")
         sums = 2 + (path == FILE and profile == "px4")  # without times the old file is compared by one, too
@@ -233,7 +233,7 @@ async def test_an_old_file_that_is_kept_for_a_while_is_not_put_in_a_later_one_s_
     """In doubt it is kept for ten seconds. Meanwhile others remove the file, and a new one is made."""
     async with rig(profile, {FILE: OLD}, options=QUICK) as here:
         tree = here.mount()
-        here.connection.scheduler.server.distrust("for the test", reads=True)
+        here.connection.scheduler.server.distrust(reads=True)
         await write_file(tree, FILE, b"replaced")
         here.take(FILE)
         tree.forget_caches()

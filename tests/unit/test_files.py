@@ -261,7 +261,7 @@ async def test_bytes_that_stay_suspect_are_an_error() -> None:
 
         async def raise_doubt() -> None:
             while wrong:
-                here.connection.scheduler.server.distrust("somebody else", reads=True)
+                here.connection.scheduler.server.distrust(reads=True)
                 await trio.sleep(0.05)
 
         handle = await here.mount().open(LOG)
@@ -278,7 +278,7 @@ async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_li
     """A tree is read twice over a link that doubles: with a listing for each file that took minutes."""
     tree = timed.mount()
     await read_file(tree, LOG)
-    timed.connection.scheduler.server.distrust("late news", reads=True)
+    timed.connection.scheduler.server.distrust(reads=True)
     assert timed.invalidated == [LOG]
     listings = timed.count(*LISTS)
     assert await read_file(tree, LOG) == DATA
@@ -289,7 +289,7 @@ async def test_a_file_that_became_smaller_while_its_bytes_were_doubted(here: Rig
     handle = await here.mount().open(LOG)
     await handle.read(0, 100)
     here.put(LOG, DATA[:1000])
-    here.connection.scheduler.server.distrust("somebody else", reads=True)
+    here.connection.scheduler.server.distrust(reads=True)
     with pytest.raises(FileChanged):
         await handle.read(0, 100)
 
@@ -301,7 +301,7 @@ async def test_closing_the_last_handle_under_a_read_ends_it(doubted: bool) -> No
         tree = here.mount()
         handle = await tree.open(LOG)
         if doubted:
-            here.connection.scheduler.server.distrust("somebody else", reads=True)
+            here.connection.scheduler.server.distrust(reads=True)
 
         async def read() -> None:
             with pytest.raises(LocalProtocolError):

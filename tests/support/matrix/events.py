@@ -53,7 +53,7 @@ def answer_the_second(scene: Scene, count: int) -> None:
 
     Of a link that was not seen to do so before that is expected for a rename only."""
     if scene.operation in (unlink, mkdir, rmdir):
-        scene.here.connection.scheduler.server.distrust("an answer that came twice", reads=True)
+        scene.here.connection.scheduler.server.distrust(reads=True)
     scene.here.faults.repeat(count)
     lose_answer(scene, count)
 
