@@ -45,8 +45,6 @@ class FileStream(SessionUser):
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
             self.first_open.end()
-        else:
-            self.waiting_since = scheduler.clock()
 
     # --- the cache's side
 
@@ -59,13 +57,9 @@ class FileStream(SessionUser):
             self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
         if self._wants.idle:
-            self.barren_since, self.retry_at = None, -inf
-        if self._transfer is not None:  # which knows what is in flight
-            self._transfer.want(start, stop, demand)
-        else:
-            self._wants.add(self._sink.missing(start, stop), demand=demand)
-        if self.waiting_since is None and not self._wants.demand.todo.empty:
-            self.waiting_since = self._scheduler.clock()
+            self.tries.begin_anew()
+        self._wants.add(self._sink.missing(start, stop), demand=demand)
+        self.note_pressing(self._server.clock())
         self._changed.unpark_all()
         self._server.wake()
 
@@ -73,8 +67,7 @@ class FileStream(SessionUser):
         """Drop all pending ranges; demand: False: only readahead. Requests in flight still bring their
         bytes."""
         self._wants.drop(demand=demand)
-        if self._transfer is None and self._wants.demand.todo.empty and self.first_open.ended:
-            self.waiting_since = None
+        self.note_pressing(self._server.clock())
 
     def close(self) -> None:
         """Close the stream: drop all pending ranges, and cancel the requests in flight."""
@@ -86,6 +79,11 @@ class FileStream(SessionUser):
         self._scheduler.remove(self)
 
     # --- the scheduler's side
+
+    @property
+    def pressing(self) -> bool:
+        """See SessionUser."""
+        return not (self.first_open.ended and self._wants.demand.empty)
 
     @property
     def idle(self) -> bool:
@@ -108,7 +106,6 @@ class FileStream(SessionUser):
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in the reads that wait, and drop their ranges."""
         self.drop()
-        self.waiting_since = self.barren_since = None
         if not self.first_open.ended:
             self.first_open.end(error)
         elif not self.closed:
@@ -120,7 +117,7 @@ class FileStream(SessionUser):
         """Take turns whenever ranges are pending, until the stream is closed."""
         server = self._server
         while not self.closed:
-            pause = inf if self.idle else self.retry_at - server.clock()
+            pause = inf if self.idle else self.tries.retry_at - server.clock()
             if pause > 0.0:
                 with trio.move_on_after(pause):
                     await self._changed.park()
@@ -137,8 +134,7 @@ class FileStream(SessionUser):
                 self._scheduler.lose(self, error)
             except MavftpfsError as error:
                 self._fail(error)
-            if not self._wants.demand.todo.empty or not self.first_open.ended:
-                self.waiting_since = server.clock()
+            self.note_pressing(server.clock())
 
     async def _open(self, turn: Turn) -> None:
         """Open the file unless it is open. After the first open, wait FIRST_WANT for the first read before
@@ -199,7 +195,8 @@ class FileStream(SessionUser):
             return
         count = transfer.received_bytes - self._received
         if count:
-            self._received, self.barren_since = transfer.received_bytes, None
+            self._received = transfer.received_bytes
+            self.tries.begin_anew()
             if not self.closed:
                 self._sink.on_batch(count)
         if transfer.idle or transfer.done:

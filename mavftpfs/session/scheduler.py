@@ -28,6 +28,7 @@ from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.serversession import OpenSession, ServerSession
+from mavftpfs.session.tries import Tries
 from mavftpfs.shared.errors import (
     LocalProtocolError,
     MavftpfsError,
@@ -63,9 +64,6 @@ MAYBE_OPEN_CLOSE = 5.0
 LONGEST_BARREN = 20.0
 """Seconds without progress after which a turn does not end before it brought something. That costs an
 interactive user a round trip, so it must be seldom."""
-
-LEAST_PAUSE = 0.1
-"""Seconds after a second lost session before a third is begun."""
 
 _KEPT = "the vehicle's only session is kept by another transfer"
 _UNANSWERED = "the vehicle did not answer while a file was to be opened"
@@ -105,21 +103,16 @@ class SessionUser:
 
     Attributes:
         path: of the file it uses.
-        waiting_since: when it began to need a turn for more than readahead; None if it needs none. The user
-            sets it; `Scheduler.turn` clears it at its end.
+        waiting_since: when it was first `pressing` since its last turn; None if it is not.
         writing: its turns are refused while nothing may be written.
-        barren_since: when its first turn without progress began; None after a progress, which is bytes that
-        were read or ACKed. The user clears it. retry_at: the user waits for no turn before.
-        loss: how its session was lost since then.
+        tries: its turns without progress.
     """
 
-    def __init__(self, path: bytes, waiting_since: float | None = None, *, writing: bool = False) -> None:
+    def __init__(self, path: bytes, *, writing: bool = False) -> None:
         self.path = path
-        self.waiting_since = waiting_since
+        self.waiting_since: float | None = None
         self.writing = writing
-        self.barren_since: float | None = None
-        self.retry_at = -inf
-        self.loss: MavftpfsError | None = None
+        self.tries = Tries()
         self._used = 0.0
         self._until = 0.0
 
@@ -128,6 +121,18 @@ class SessionUser:
         """When a caller began to wait for this user, so that it gets a turn or an error in time. None if no
         caller waits: an upload in the background has only `waiting_since`, and readahead neither."""
         return self.waiting_since
+
+    @property
+    def pressing(self) -> bool:
+        """Whether the user needs a turn for more than readahead."""
+        return True
+
+    def note_pressing(self, now: float) -> None:
+        """Note since when this user is `pressing`. Called whenever that may have changed."""
+        if not self.pressing:
+            self.waiting_since = None
+        elif self.waiting_since is None:
+            self.waiting_since = now
 
     @property
     def idle(self) -> bool:
@@ -158,10 +163,13 @@ class SessionUser:
         until = now if self.waiting_since is None else min(now, self.waiting_since)
         return self._used * min(1.0, max(0.0, 1.0 - (until - self._until) / USE_MEMORY))
 
+    def waited(self, now: float) -> float:
+        """Return for how many seconds the user has waited for a turn."""
+        return 0.0 if self.waiting_since is None else max(0.0, now - self.waiting_since)
+
     def score(self, now: float) -> float:
         """Return the score by which waiting users are ordered: the least is next."""
-        waited = 0.0 if self.waiting_since is None else now - self.waiting_since
-        return min(self.used(now), MOST_USE) - WAITED * waited
+        return min(self.used(now), MOST_USE) - WAITED * self.waited(now)
 
 
 class Turn:
@@ -177,8 +185,6 @@ class Turn:
         self.task = trio.lowlevel.current_task()
         self.granted_at = self.began = scheduler.clock()
         self._scheduler = scheduler
-        since = self.began if user.waiting_since is None else user.waiting_since
-        self._waited = self.began - since
 
     async def open(self, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
         """Close the open file and open the user's. While another client has a file open, other users may have
@@ -228,13 +234,13 @@ class Turn:
         if scheduler.is_excluded(user.path):
             return True
         lasted = now - self.began
-        barren = user.barren_since is not None and now - user.barren_since >= LONGEST_BARREN
+        barren = user.tries.barren_for(now) >= LONGEST_BARREN
         if barren and lasted < scheduler.server.longest_silence:
             return False
         used, rivals = user.used(self.began) + lasted, scheduler.waiting(now)
         score = min(used, MOST_USE)
         if lasted < LEAST_TURN:
-            score -= WAITED * self._waited
+            score -= WAITED * user.waited(self.granted_at)
         if lasted < min(LONGEST_TURN, max(LEAST_TURN, TURN_TRIPS * (rtt or 0.0))):
             if score <= 0.0 or used < MOST_USE:
                 return False
@@ -331,13 +337,13 @@ class Scheduler:
         """
         turn: Turn | None = None
         try:
+            user.note_pressing(self.clock())
             await trio.lowlevel.checkpoint()
             await self._wait(user)
             turn = Turn(self, user)
             self._set_holder(turn)
             self.server.vehicle.require(self.clock(), writing=user.writing)
-            if user.barren_since is None:
-                user.barren_since, user.loss = turn.granted_at, None
+            user.tries.on_turn(turn.granted_at)
             yield turn
         finally:
             if turn is not None and self.holder is turn:
@@ -385,24 +391,13 @@ class Scheduler:
         return max(since, self.server.others_until) + self._longest_wait
 
     def failure(self, user: SessionUser) -> MavftpfsError | None:
-        """Return the error if a user made no progress for `op_deadline`, and let it begin anew."""
-        if user.barren_since is None or self.clock() - user.barren_since < self._op_deadline:
-            return None
-        loss, user.loss, user.barren_since = user.loss, None, None
-        return loss or RequestTimeout(f"no progress for {self._op_deadline:g} s")
+        """Return the error of a user that made no progress for `op_deadline`."""
+        return user.tries.failure(self.clock(), self._op_deadline)
 
     def lose(self, user: SessionUser, lost: SessionLost) -> None:
-        """Leave the session that its user found lost. The user tries again at once. After a second loss
-        without progress it pauses as long as its tries have failed, at least LEAST_PAUSE: each pause doubles
-        that time."""
+        """Leave the session that its user found lost. The user tries again."""
         self.server.lose(lost)
-        now, cause, first = self.clock(), lost.__cause__, user.loss is None
-        user.loss = cause if isinstance(cause, MavftpfsError) else lost
-        if user.barren_since is None:
-            user.barren_since = now
-        failing = now - user.barren_since
-        pause = max(LEAST_PAUSE, min(failing, self._op_deadline - failing))
-        user.retry_at = now if first else now + pause
+        user.tries.on_lost(lost, self.clock(), self._op_deadline)
 
     @property
     def _answered_in_turn_at(self) -> float:

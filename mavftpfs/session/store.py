@@ -217,7 +217,7 @@ class Store:
         Raises:
             MavftpfsError: the turn, the open or the Terminate failed.
         """
-        user = SessionUser(path, self._clock(), writing=opcode != Opcode.OPEN_FILE_RO)
+        user = SessionUser(path, writing=opcode != Opcode.OPEN_FILE_RO)
         self._vehicle.require(self._clock(), writing=user.writing)
         async with self._scheduler.turn(user) as turn:
             yield await turn.open(opcode)

@@ -79,9 +79,6 @@ class Upload(SessionUser):
         self._clock = scheduler.clock
         self._finishers: list[Future] = []  # of those that wait for the end
         self._awaited_since = 0.0  # when the first of them began to wait
-        # Until then nothing is sent: the upload was refused (`_fail`), or more bytes would cost the whole
-        # file once more (`_complete`).
-        self._waits_for_finish = False
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
         self._changed = trio.lowlevel.ParkingLot()
@@ -103,7 +100,7 @@ class Upload(SessionUser):
         if self._scope.cancel_called:
             raise LocalProtocolError("the upload was ended")
         self._vehicle.require(self._clock(), writing=True)
-        self._waits_for_finish, self.barren_since, self.retry_at = False, None, -inf
+        self.tries.begin_anew()
         finisher = Future()
         if not self.awaited:
             self._awaited_since = self._clock()
@@ -143,9 +140,7 @@ class Upload(SessionUser):
     def on_armed_changed(self) -> None:
         """Raise Armed in the callers at once if the upload waits for a turn. In a turn, `_watch` notices that
         the vehicle is armed. The upload resumes when the vehicle disarms."""
-        if self._vehicle.may_write:
-            self.retry_at = -inf
-        else:
+        if not self._vehicle.may_write:
             self._scheduler.refuse(self, Armed("the vehicle was armed"))
         self._changed.unpark_all()
 
@@ -176,17 +171,18 @@ class Upload(SessionUser):
         else:
             if (failure := self._scheduler.failure(self)) is not None:
                 raise failure
-            self.waiting_since = self._clock()
             async with self._scheduler.turn(self) as turn:
                 await self._use(turn)
 
     def _due_in(self) -> float:
         """Return in how many seconds the upload needs a turn, unless it is woken before. While the vehicle is
-        armed, it needs none, so that no reader yields to it."""
-        wanted = self.awaited or (not self._waits_for_finish and self._has_work())
+        armed, it needs none, so that no reader yields to it. If its file cannot be resumed, more bytes cost
+        the whole file once more, so they wait for the next `finish`."""
+        cannot_resume = self._source.has_checkpoint and not self._may_interrupt
+        wanted = self.awaited or (self._has_work() and not cannot_resume)
         if not wanted or not self._vehicle.may_write:
             return inf
-        return self.retry_at - self._clock()
+        return self.tries.retry_at - self._clock()
 
     def _has_work(self) -> bool:
         """Whether there is something to send or to close. An empty file, too, has to be created once."""
@@ -198,8 +194,7 @@ class Upload(SessionUser):
         at the next `finish`."""
         for finisher in self._finishers:
             finisher.end(error)
-        self._waits_for_finish = isinstance(error, REFUSALS)
-        self.retry_at = self._clock() + RETRY_AFTER
+        self.tries.begin_anew(inf if isinstance(error, REFUSALS) else self._clock() + RETRY_AFTER)
 
     async def _use(self, turn: Turn) -> None:
         """Use a turn: open, write, close."""
@@ -241,12 +236,10 @@ class Upload(SessionUser):
 
     def _complete(self, finishers: list[Future]) -> None:
         """Return from these callers' `finish`: all bytes that the source had then are ACKed, and the file was
-        closed. If the file cannot be resumed, more bytes cost the whole file once more, so they wait for the
-        next `finish`."""
+        closed."""
         for finisher in finishers:
             finisher.end()
-        self.barren_since = None
-        self._waits_for_finish = self._source.has_checkpoint and not self._may_interrupt
+        self.tries.begin_anew()
 
     # --- opening
 
@@ -337,7 +330,8 @@ class Upload(SessionUser):
         Bytes that were ACKed before the session was lost are no progress."""
         transfer = self._transfer
         if self._source.reached > self._furthest:
-            self._furthest, self.barren_since = self._source.reached, None
+            self._furthest = self._source.reached
+            self.tries.begin_anew()
         if transfer is not None and (transfer.idle or transfer.done):
             self._server.wake()
 
@@ -355,7 +349,7 @@ class Upload(SessionUser):
             # otherwise the transfer's own patience ends it.
             closes = self._keeps_content or self._vehicle.another_client_heard(clock())
             stalled = closes and server.is_stalled(transfer)
-            if stalled and self.barren_since is not None:
+            if stalled and self.tries.barren_for(clock()) > 0.0:
                 raise SessionLost("no answer for a while during a write", by_server=False)
             if stalled and stop is None:
                 stop = Stop.YIELD

@@ -211,7 +211,7 @@ async def test_a_checksum_or_a_change_of_names_is_not_asked_for_in_a_turn() -> N
     """The request would wait for itself, because a change waits until the session is off its path."""
     here = Rig("px4", {b"/d/f": DATA}, LINK)
     async with here.connected() as connection:
-        async with connection.scheduler.turn(SessionUser(b"/d/f", trio.current_time())) as turn:
+        async with connection.scheduler.turn(SessionUser(b"/d/f")) as turn:
             await turn.open()
             with pytest.raises(AssertionError):
                 await connection.store.crc32(b"/d/f")
