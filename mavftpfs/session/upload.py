@@ -13,7 +13,7 @@ Bytes that were ACKed before an ACKed Terminate are written.
 
 from __future__ import annotations
 
-from enum import Enum
+from functools import partial
 from math import inf
 
 import trio
@@ -49,17 +49,6 @@ REFUSALS = (FtpNak, ProtocolError)
 """Errors after which the upload is tried again only at the next `finish`."""
 
 
-class Stop(Enum):
-    """Why an upload lets go of the session."""
-
-    DRAINED = "drained"
-    """The source has nothing to send, and all sent bytes are ACKed."""
-    YIELD = "yield"
-    """The upload resumes in a later turn."""
-    ARMED = "armed"
-    """The vehicle is armed, so the upload does not wait for answers in flight."""
-
-
 class Upload(SessionUser):
     """Implements cache.remote.Upload. The upload sends nothing before its source has something, or `finish`
     is called.
@@ -77,14 +66,13 @@ class Upload(SessionUser):
         self._vehicle = scheduler.server.vehicle
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
-        self._finishers: list[Future] = []  # of those that wait for the end
-        self._awaited_since = 0.0  # when the first of them began to wait
+        self._finishers: dict[Future, float] = {}  # of those that wait for the end, with when they began to
         self._scope = trio.CancelScope()  # of its task: cancelled when its owner gives it up
         self._over = trio.Event()  # set when its task ended
         self._changed = trio.lowlevel.ParkingLot()
         self._transfer: WriteTransfer | None = None  # what sends its bytes now
         self._furthest = 0  # one past the highest byte that was ever ACKed
-        self._cannot_resume = False  # its file was not opened again, or was empty then, or no size was told
+        self._cannot_resume = False  # its file was not found again as it was left
 
     # --- the owner's side
 
@@ -102,14 +90,12 @@ class Upload(SessionUser):
         self._vehicle.require(self._clock(), writing=True)
         self.tries.begin_anew()
         finisher = Future()
-        if not self.awaited:
-            self._awaited_since = self._clock()
-        self._finishers.append(finisher)
+        self._finishers[finisher] = self._clock()
         self.wake()
         try:
             await finisher.wait()
         finally:
-            self._finishers.remove(finisher)
+            del self._finishers[finisher]
 
     async def end(self) -> None:
         """See cache.remote.Upload."""
@@ -130,12 +116,12 @@ class Upload(SessionUser):
     @property
     def awaited(self) -> bool:
         """Whether a caller waits in `finish`."""
-        return not all(finisher.ended for finisher in self._finishers)
+        return self.awaited_since is not None
 
     @property
     def awaited_since(self) -> float | None:
         """See SessionUser."""
-        return self._awaited_since if self.awaited else None
+        return min((since for finisher, since in self._finishers.items() if not finisher.ended), default=None)
 
     def on_armed_changed(self) -> None:
         """Raise Armed in the callers at once if the upload waits for a turn. In a turn, `_watch` notices that
@@ -160,13 +146,13 @@ class Upload(SessionUser):
             self._over.set()
 
     async def _go_on(self) -> None:
-        """Do the next thing: wait, let callers go, or take a turn."""
+        """Do the next thing: wait, let callers go, or take a turn. An empty file, too, takes one."""
         if self.awaited:
             self._vehicle.require(self._clock(), writing=True)
         if (pause := self._due_in()) > 0.0:
             with trio.move_on_after(pause):
                 await self._changed.park()
-        elif not self._has_work():
+        elif self._source.has_checkpoint and not self._source.has_more():
             self._complete(list(self._finishers))
         else:
             if (failure := self._scheduler.failure(self)) is not None:
@@ -178,16 +164,11 @@ class Upload(SessionUser):
         """Return in how many seconds the upload needs a turn, unless it is woken before. While the vehicle is
         armed, it needs none, so that no reader yields to it. If its file cannot be resumed, more bytes cost
         the whole file once more, so they wait for the next `finish`."""
-        cannot_resume = self._source.has_checkpoint and not self._may_interrupt
-        wanted = self.awaited or (self._has_work() and not cannot_resume)
+        costs_all = self._source.has_checkpoint and not self._may_interrupt
+        wanted = self.awaited or (self._source.has_more() and not costs_all)
         if not wanted or not self._vehicle.may_write:
             return inf
         return self.tries.retry_at - self._clock()
-
-    def _has_work(self) -> bool:
-        """Whether there is something to send or to close. An empty file, too, has to be created once."""
-        source = self._source
-        return source.has_more() or not source.acked.empty or (self.awaited and not source.has_checkpoint)
 
     def _fail(self, error: MavftpfsError) -> None:
         """Raise an error in each `finish` that waits, and try again after RETRY_AFTER; after a refusal only
@@ -200,11 +181,11 @@ class Upload(SessionUser):
         """Use a turn: open, write, close."""
         try:
             session = await self._open(turn)
-            stop = await self._write(turn, session)
+            await self._write(turn, session)
             # All that was given by now is in the file that is closed next; what comes later is not.
-            finishers = list(self._finishers)
-            await self._close(session, stop)
-            if stop is Stop.DRAINED:
+            complete, finishers = self._source.ranges.empty, list(self._finishers)
+            await self._close(session)
+            if complete:
                 self._complete(finishers)
         except MavftpfsError as error:
             self._on_failure(error)
@@ -250,6 +231,7 @@ class Upload(SessionUser):
             session = await self._reopen(turn)
             if session is not None:
                 return session
+            self._cannot_resume = True
         source.start_over()
         self.made_twice |= self.may_exist
         self.may_exist = True
@@ -278,20 +260,15 @@ class Upload(SessionUser):
                 if size is not None:
                     traits.wo_truncates = size < reached
                 if not self._keeps_content:
-                    self._cannot_resume = True
                     return None
                 session = await turn.open(Opcode.OPEN_FILE_WO)
         except FtpNak:  # the file is gone, or this server opens none like that
-            self._cannot_resume = True
             return None
-        if session.size is None or session.size >= reached:
-            return session
-        await self._server.close()
-        return None
+        return session if session.size is None or session.size >= reached else None
 
     # --- writing
 
-    async def _write(self, turn: Turn, session: OpenSession) -> Stop:
+    async def _write(self, turn: Turn, session: OpenSession) -> None:
         """Write until there is a reason to stop. The session is still open then, and all sent bytes are
         ACKed, unless the server went silent or the vehicle is armed.
 
@@ -312,8 +289,8 @@ class Upload(SessionUser):
         )
         self._transfer = transfer
         try:
-            with server.running(transfer, self._on_batch):
-                stop = await self._watch(turn, session, transfer)
+            with server.running(transfer, partial(self._on_batch, transfer)):
+                await self._watch(turn, session, transfer)
         except FtpNak as error:
             if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
                 # That client's requests with a path do not alternate with these writes; the next turns try
@@ -322,69 +299,61 @@ class Upload(SessionUser):
             raise
         finally:
             self._transfer = None
-        assert stop is not None
-        return stop
 
-    def _on_batch(self, now: float) -> None:
+    def _on_batch(self, transfer: WriteTransfer, now: float) -> None:
         """Note progress, and wake the turn's task when a batch of replies left the transfer nothing to do.
         Bytes that were ACKed before the session was lost are no progress."""
-        transfer = self._transfer
         if self._source.reached > self._furthest:
             self._furthest = self._source.reached
             self.tries.begin_anew()
-        if transfer is not None and (transfer.idle or transfer.done):
+        if transfer.idle or transfer.done:
             self._server.wake()
 
-    async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> Stop | None:
-        """Return why the upload stops; None if the transfer ended by itself."""
+    async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> None:
+        """Return when the upload is to close its file: the vehicle is armed, the source has nothing more, the
+        server is silent, or another user is to go first and all sent bytes are ACKed."""
         server, clock = self._server, self._clock
         fed_at = clock()
-        while not transfer.done:
+        while not transfer.done and self._vehicle.may_write:
             server.require_open(session)
             if not transfer.drained:
                 fed_at = clock()
-            stop = self._reason_to_stop(turn, session, transfer, clock() - fed_at)
-            # After a silence the session may be gone (servers.md 14.9), which the answer to Terminate shows.
-            # If closing costs the whole file, the upload closes it only if another client was heard;
-            # otherwise the transfer's own patience ends it.
-            closes = self._keeps_content or self._vehicle.another_client_heard(clock())
-            stalled = closes and server.is_stalled(transfer)
-            if stalled and self.tries.barren_for(clock()) > 0.0:
-                raise SessionLost("no answer for a while during a write", by_server=False)
-            if stalled and stop is None:
-                stop = Stop.YIELD
-            transfer.paused = stop is not None
-            if stop is not None and (transfer.idle or stalled or stop is Stop.ARMED):
-                return stop
+            elif self.awaited or clock() - fed_at >= DRAINED_SECONDS:
+                return
+            if server.is_stalled(transfer) and self._may_close_after_silence:
+                if self.tries.barren_for(clock()) > 0.0:
+                    raise SessionLost("no answer for a while during a write", by_server=False)
+                return
+            transfer.paused = self._yields(turn, session)
+            if transfer.paused and transfer.idle:
+                return
             await server.look_again()
-        return None
 
-    def _reason_to_stop(
-        self, turn: Turn, session: OpenSession, transfer: WriteTransfer, drained_for: float
-    ) -> Stop | None:
-        """Return why the upload should stop now, or None. drained_for: seconds with nothing to send."""
-        if not self._vehicle.may_write:
-            return Stop.ARMED
+    @property
+    def _may_close_after_silence(self) -> bool:
+        """Whether a silence ends the turn: the session may be gone (servers.md 14.9), which the answer to
+        Terminate shows. If closing costs the whole file, the upload closes it only if another client was
+        heard; otherwise the transfer's own patience ends it."""
+        return self._keeps_content or self._vehicle.another_client_heard(self._clock())
+
+    def _yields(self, turn: Turn, session: OpenSession) -> bool:
+        """Return whether the file should be closed now, to be resumed in a later turn."""
         if self._scheduler.is_excluded(self.path):
-            return Stop.YIELD
-        if transfer.drained and (self.awaited or drained_for >= DRAINED_SECONDS):
-            return Stop.DRAINED
+            return True
         if turn.contended:
-            over = self._may_interrupt and turn.is_over()
-        else:
-            over = self._keeps_content and self._clock() - session.opened_at >= CHECKPOINT_EVERY
-        return Stop.YIELD if over else None
+            return self._may_interrupt and turn.is_over()
+        return self._keeps_content and self._clock() - session.opened_at >= CHECKPOINT_EVERY
 
     # --- letting go
 
-    async def _close(self, session: OpenSession, stop: Stop) -> None:
+    async def _close(self, session: OpenSession) -> None:
         """Close the file, and take all ACKed bytes for written if that worked.
 
         A vehicle that restarted before may ACK the Terminate, too, because ArduPilot ACKs that of any
         session. But a restart makes ACKs suspect, so the file is compared; and `_reopen` compares its size.
         """
         self._server.require_open(session)
-        if not await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else inf):
+        if not await self._server.close(inf if self._vehicle.may_write else TERMINATE_LIMIT):
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         self._source.check_point()
 

@@ -33,8 +33,6 @@ class SendBuffer:
         handed_out: one past the highest byte that was ever handed out.
         invalidated: bytes changed, or were cut off, after they were handed out, so the file must be sent
             again.
-        reached: one past the highest byte that was ACKed; after the session was lost, one past the highest
-            proven byte.
         growing: more bytes may follow. Meanwhile the last bytes wait if they do not fill a request.
     """
 
@@ -51,13 +49,17 @@ class SendBuffer:
         self._progress = progress
         self._read = read
         self.handed_out = 0
-        self.reached = 0
         self._ahead = (0, b"")
 
     @property
     def unacked(self) -> int:
         """Bytes not ACKed yet."""
         return self.size - self.acked.total - self.proven.total
+
+    @property
+    def reached(self) -> int:
+        """One past the highest byte that was ACKed and not rolled back."""
+        return max(self.acked.end, self.proven.end)
 
     def on_changed(self, start: int, size: int) -> None:
         """Note that the file changed from `start` on, perhaps to its end, and has `size` bytes now."""
@@ -99,7 +101,6 @@ class SendBuffer:
         before = self.acked.total
         self.ranges.on_done(start, stop)
         self.acked.add(start, stop)
-        self.reached = max(self.reached, stop)
         if self._progress is not None:
             self._progress(self.acked.total - before)
 
@@ -113,7 +114,6 @@ class SendBuffer:
     def roll_back(self) -> None:
         """Note that the session was lost: all bytes without proof must be sent again."""
         self.acked = ExtentSet()
-        self.reached = self.proven.end
         self.ranges = Ranges()
         for start, stop in self.proven.missing(0, self.size):
             self.ranges.todo.add(start, stop)
