@@ -127,7 +127,7 @@ class ReadTransfer(Operation):
         sink: takes the data. chunks: the size of requests. wants: what is wanted already.
 
     Attributes:
-        received_bytes: delivered to the sink so far.
+        received_bytes: delivered to the sink since the owner last set this to 0.
 
     Fails with SessionLost (reopen, and start another with `wants`; the file may have become shorter, too),
     FtpNak, or RequestTimeout. At the end, `finish` included, all bytes that did not arrive are in `wants`.

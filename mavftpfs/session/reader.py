@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import inf
 
 import trio
@@ -41,7 +42,6 @@ class FileStream(SessionUser):
         self._wants = Wants()
         self._removed = False
         self._transfer: ReadTransfer | None = None
-        self._received = 0  # bytes of that transfer
         self._changed = trio.lowlevel.ParkingLot()
         if expected_size is not None:
             self.first_open.end()
@@ -150,7 +150,7 @@ class FileStream(SessionUser):
         if session.size is None:
             await server.close_quietly()
             raise RemoteProtocolError("the vehicle's open reply contains no size")
-        if not first and compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
+        if compare(Known(self.size), Opened(session.size)) is Sameness.OTHER:
             await server.close_quietly()
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
         if first:
@@ -170,11 +170,11 @@ class FileStream(SessionUser):
         kind = BurstTransfer if self._scheduler.read_mode == "burst" else ReadTransfer
         transfer = kind(session.id, self.size, self._sink, self._scheduler.read_chunks, self._wants)
         engine = server.engine
-        self._transfer, self._received = transfer, 0
+        self._transfer = transfer
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = engine.in_flight > 0
         try:
-            with server.running(transfer, self._on_batch):
+            with server.running(transfer, partial(self._on_batch, transfer)):
                 while not (transfer.done or transfer.idle or self.closed or server.opened is None):
                     if turn.is_over() or (turn.contended and not transfer.demanded):
                         break
@@ -188,16 +188,11 @@ class FileStream(SessionUser):
         finally:
             self._transfer = None
 
-    def _on_batch(self, now: float) -> None:
+    def _on_batch(self, transfer: ReadTransfer, now: float) -> None:
         """Report to the sink, once for each batch of replies, how many bytes arrived."""
-        transfer = self._transfer
-        if transfer is None:
-            return
-        count = transfer.received_bytes - self._received
+        count, transfer.received_bytes = transfer.received_bytes, 0
         if count:
-            self._received = transfer.received_bytes
             self.tries.begin_anew()
-            if not self.closed:
-                self._sink.on_batch(count)
+            self._sink.on_batch(count)
         if transfer.idle or transfer.done:
             self._server.wake()
