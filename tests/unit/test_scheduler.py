@@ -70,6 +70,8 @@ def test_a_user_that_used_little_goes_first_until_another_waited_three_seconds()
         (5.0, 0.0, 0.0, 0.0, 0.02, 0.0),  # an editor beside a copy goes first
         (5.0, 0.9, 0.0, 0.0, 0.3, 0.0),
         (5.0, 3.5, 0.0, 0.0, 0.02, LEAST_TURN),  # but not before one that waited long
+        (5.0, 3.5, 0.0, 0.4, 0.02, LEAST_TURN),
+        (5.0, 6.0, 0.0, 0.0, 0.02, LEAST_TURN),
         (5.0, 0.0, 5.0, 0.0, 0.02, LEAST_TURN),  # two copies alternate
         (5.0, 0.5, 5.0, 0.0, 0.02, LEAST_TURN),
         (5.0, 0.0, 5.0, 0.0, 0.2, 2.0),
