@@ -14,6 +14,7 @@ the others hear the first one that opens a file.
 from __future__ import annotations
 
 import random
+from enum import Enum
 from math import inf
 
 from mavftpfs.protocol.payload import Opcode
@@ -29,9 +30,35 @@ STAYS_ITS_OWN = 2.5
 """Seconds after an answer for which no ArduPilot with one session reassigns that session; it does after 3."""
 
 OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
-_USING = OPENING | {Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE}
+_USING = frozenset((Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE))
 _CLOSING = frozenset((Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS))
 _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # their positions in a payload
+
+
+class Heard(Enum):
+    """What a request of another client, or the answer to it, tells of its session."""
+
+    ASKED = "asked to open"
+    OPENED = "opened"
+    REFUSED = "refused to open"
+    USED = "read or written"
+    CLOSED = "closed"
+
+
+class Theirs(Enum):
+    """What other clients have, as far as it was heard."""
+
+    NOTHING = "nothing"
+    ASKED = "an open that is not answered yet"
+    FILE = "a file"
+
+
+_THEN: dict[Theirs, dict[Heard | None, Theirs]] = {
+    Theirs.NOTHING: {Heard.ASKED: Theirs.ASKED, Heard.OPENED: Theirs.FILE, Heard.USED: Theirs.FILE},
+    Theirs.ASKED: {Heard.REFUSED: Theirs.NOTHING, Heard.OPENED: Theirs.FILE, Heard.USED: Theirs.FILE},
+    Theirs.FILE: {Heard.CLOSED: Theirs.NOTHING},
+}
+"""What they have -> what is heard -> what they have then; anything else changes nothing."""
 
 
 class OtherClients:
@@ -40,83 +67,57 @@ class OtherClients:
     Attributes:
         session: the id that another client used or closed last; None before the first.
         closed_at: when one of them was last heard to close a file.
+        file_open_until: the time until which another client may have a file open.
     """
 
     def __init__(self, rng: random.Random) -> None:
         """rng: draws for how long this connection waits after another client closed its file."""
         self._rng = rng
-        self._paused_until = -inf
         self.session: int | None = None
-        self.closed_at = -inf
-        self._has_file = False
-        self._asks = False  # their open is not answered yet
-        self._heard_at = self._answered_at = -inf
+        self._theirs = Theirs.NOTHING  # until `file_open_until`
+        self.closed_at = self.file_open_until = self._answered_at = -inf
         self._answered_since = inf  # since then its answers show no pause that loses a session
 
-    def hear(self, payload: bytes, now: float) -> int | None:
-        """Take a request of another client, or an answer to one; return the id of its session.
+    def hear(self, payload: bytes, now: float) -> Heard | None:
+        """Take a request of another client, or an answer to one; return what it tells of its session.
 
-        None for listings, checksums and changes of names, which use no session, so that a ground station that
-        shows directories makes nobody's bytes suspect.
+        None for a refused read or write, and for listings, checksums and changes of names, which use no
+        session, so that a ground station that shows directories makes nobody's bytes suspect.
         """
-        opcode, answered = _opcode_of(payload)
-        if now >= self.file_open_until:
-            self._has_file = self._asks = False
-        self._heard_at = now
-        if opcode not in _USING | _CLOSING:
-            return None
-        self.session = payload[_SESSION]
-        if opcode in _CLOSING:
-            self._on_closed(now)
-        elif opcode not in OPENING:
-            self._has_file = True
-        elif asks_to_open(payload):
-            self._asks = True
-        else:
-            self._asks, self._has_file = False, self._has_file or answered
-        if not self._has_file:
+        event, before = _event(payload), self._theirs if now < self.file_open_until else Theirs.NOTHING
+        self._theirs = _THEN[before].get(event, before)
+        if self._theirs is not Theirs.NOTHING:
+            self.file_open_until = now + LEFT_OPEN
+        elif before is not Theirs.NOTHING:
+            self.file_open_until = now + MOST_PAUSE * self._rng.random() if event is Heard.CLOSED else -inf
+        if event is Heard.CLOSED:
+            self.closed_at = now
+        if event is not None:
+            self.session = payload[_SESSION]
+        if self._theirs is not Theirs.FILE:
             self._answered_at = -inf
-        elif answered:
+        elif event is not None and payload[_OPCODE] == Opcode.ACK:
             if now - self._answered_at >= STAYS_ITS_OWN:
                 self._answered_since = now
             self._answered_at = now
-        return self.session
-
-    def _on_closed(self, now: float) -> None:
-        """Note that one of them closes its file. The request and its answer are one event."""
-        if self._has_file:
-            self._paused_until = now + MOST_PAUSE * self._rng.random()
-        self._has_file, self.closed_at = False, now
+        return event
 
     def on_ours_opened(self) -> None:
         """Note that this connection opened a file, so no other client has the session, or the server has
         several sessions."""
-        self._has_file = self._asks = False
-
-    @property
-    def file_open_until(self) -> float:
-        """The time until which another client may have a file open."""
-        return self._heard_at + LEFT_OPEN if self._has_file or self._asks else self._paused_until
+        self.file_open_until = -inf
 
     def has_session(self, since: float, now: float) -> bool:
         """Return whether the answers to another client show that it had a session from `since` until now."""
         return self._answered_since <= since and now - self._answered_at < STAYS_ITS_OWN
 
 
-def took_session(payload: bytes) -> bool:
-    """Return whether this payload shows that another client has the shared session."""
-    opcode, answered = _opcode_of(payload)
-    return opcode in _USING and (answered or (opcode not in OPENING and payload[_OPCODE] != Opcode.NAK))
-
-
-def asks_to_open(payload: bytes) -> bool:
-    """Return whether this is a request to open a file, whose result only the answer shows."""
-    return payload[_OPCODE] in OPENING
-
-
-def _opcode_of(payload: bytes) -> tuple[int, bool]:
-    """Return the opcode of a request, or of the answered request, and whether this is its ACK."""
-    opcode = payload[_OPCODE]
-    if opcode in (Opcode.ACK, Opcode.NAK):
-        return payload[_REQ_OPCODE], opcode == Opcode.ACK
-    return opcode, False
+def _event(payload: bytes) -> Heard | None:
+    """Return what a payload tells of the session of another client; None if nothing."""
+    kind = payload[_OPCODE]
+    opcode = payload[_REQ_OPCODE] if kind in (Opcode.ACK, Opcode.NAK) else kind
+    if opcode in OPENING:
+        return Heard.ASKED if kind == opcode else Heard.OPENED if kind == Opcode.ACK else Heard.REFUSED
+    if opcode in _USING and kind != Opcode.NAK:
+        return Heard.USED
+    return Heard.CLOSED if opcode in _CLOSING else None

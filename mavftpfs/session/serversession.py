@@ -28,9 +28,8 @@ from mavftpfs.session.others import (
     LEFT_OPEN,
     OPENING,
     STAYS_ITS_OWN,
+    Heard,
     OtherClients,
-    asks_to_open,
-    took_session,
 )
 from mavftpfs.session.quarantine import LASTS, Quarantine
 from mavftpfs.session.remedies import (
@@ -166,13 +165,14 @@ class ServerSession:
             that this connection missed. Exceptions: its request to open takes nothing before the server
             answers, and an upload goes on because its file is compared afterwards.
         """
-        traits, used, session = self.engine.traits, self.others.hear(payload, self.clock()), self.opened
+        engine, heard, session = self.engine, self.others.hear(payload, self.clock()), self.opened
         # Where servers echo ids, each client has one of its own.
-        shared = not traits.ack_carries_own_session or used == self.engine.home_session
-        took = shared and took_session(payload)
+        shared = not engine.traits.ack_carries_own_session or self.others.session == engine.home_session
+        took = shared and heard in (Heard.OPENED, Heard.USED)
         if took:
             self._terminating.cancel()
-        missed = newcomer and not asks_to_open(payload) and not (session is not None and session.writing)
+        uploads = session is not None and session.writing
+        missed = newcomer and heard is not Heard.ASKED and not uploads
         # If no file was opened since reads were last distrusted, no more bytes are suspect.
         suspect = session is not None or self.newest_open_at >= self.epoch
         self.distrust(reads=(took or missed) and suspect)
