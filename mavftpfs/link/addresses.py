@@ -28,21 +28,23 @@ class _Known:
 
 
 class AddressBook:
-    """The senders of one link.
-
-    Attributes:
-        distrusted: addresses where another vehicle answered for a sender. Any other may replace them at once.
-    """
+    """The senders of one link."""
 
     def __init__(self) -> None:
-        self.distrusted: NetAddress | None = None
         self._senders: dict[Address, _Known] = {}
 
-    def __contains__(self, sender: Address) -> bool:
-        return sender in self._senders
+    def of(self, sender: Address) -> NetAddress | None:
+        """Return the address from which a sender's frames count; None if it was not heard."""
+        known = self._senders.get(sender)
+        return None if known is None else known.address
 
-    def accepts(self, sender: Address, address: NetAddress, now: float) -> bool:
-        """Return whether a sender's frame from an address counts, and note that the sender was heard."""
+    def accepts(
+        self, sender: Address, address: NetAddress, now: float, distrusted: NetAddress | None = None
+    ) -> bool:
+        """Return whether a sender's frame from an address counts, and note that the sender was heard.
+
+        distrusted: the address where another vehicle answers now; any other may replace it at once.
+        """
         known = self._senders.get(sender)
         if known is None:
             if len(self._senders) >= _MOST_SENDERS:
@@ -51,7 +53,7 @@ class AddressBook:
                 self._senders[sender] = _Known(address, now)
             return True
         if known.address != address:
-            if now - known.heard_at <= PATIENCE and known.address != self.distrusted:
+            if now - known.heard_at <= PATIENCE and known.address != distrusted:
                 return False
             known.address = address
         known.heard_at = now

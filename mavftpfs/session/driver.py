@@ -16,7 +16,7 @@ import trio
 from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
 from mavftpfs.link.base import Link, Piece
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpRun, Message
+from mavftpfs.link.messages import MAV_COMP_ID_AUTOPILOT1, Address, FtpRun, Message
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.vehicle import Standing, Vehicle
@@ -51,7 +51,6 @@ class Driver:
     """Moves payloads between one link and one engine, and everything else to the vehicle.
 
     Attributes:
-        peer: the vehicle's network address; None where the link has only one.
         second: the network address of another sender that claims to be the vehicle.
     """
 
@@ -69,35 +68,38 @@ class Driver:
         self.framer = framer
         self.engine = engine
         self.vehicle = vehicle
-        self.peer: NetAddress | None = None
         self.second: NetAddress | None = None
         self.last_reply_at = clock()
         self._heard_at = clock()
         self._clock = clock
         self._on_payload = on_payload
         self._addresses = AddressBook()
-        self._impostor_at: float | None = None
-        self._scope: trio.CancelScope | None = None
-        self._deadline = inf  # the next one of `pump`
-        self._may_send = False
+        self._impostor_at = inf  # when another sender claimed for the first time to be the vehicle
+        self._waiting = trio.CancelScope()  # of `pump`, now or the next time
         # Each operation with its `on_finished` and `on_batch`.
         self._under_way: dict[Operation, tuple[Callable[[], None], Callable[[float], None] | None]] = {}
         self._silent_until = -inf
         self._gathered: list[bytes] = []
+
+    @property
+    def peer(self) -> NetAddress | None:
+        """The vehicle's network address; None where the link has only one. A target that was never heard has
+        the address of its system's autopilot."""
+        target = self.vehicle.address
+        if target is None:
+            return None
+        pilot = Address(target.system, MAV_COMP_ID_AUTOPILOT1)
+        return self._addresses.of(target) or self._addresses.of(pilot)
 
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
         sender: NetAddress | None = None
         while True:
             pieces: list[Piece] = []
-            with trio.CancelScope(deadline=self._deadline) as scope:
-                self._scope = scope
-                try:
-                    pieces = await self.link.receive()
-                finally:
-                    self._scope = None
-            now = self._clock()
-            if scope.cancelled_caught:
+            with self._waiting as waiting:
+                pieces = await self.link.receive()
+            self._waiting, now = trio.CancelScope(), self._clock()
+            if waiting.cancelled_caught:
                 self.engine.on_deadline(now)
                 if self.framer.waiting and now >= self._heard_at + QUIET:
                     self._handle(self.framer.on_silence(), now, sender)
@@ -176,7 +178,7 @@ class Driver:
         """Send the requests that may go out now, and call `on_finished` of operations that ended. Call this
         after anything that may have given the engine work."""
         now = self._clock()
-        self._refill(now)
+        may_send = self._refill(now)
         for operation in self.engine.take_finished():
             callbacks = self._under_way.pop(operation, None)
             if isinstance(operation.error, RequestTimeout):
@@ -188,13 +190,11 @@ class Driver:
         if self.link.backlog >= BACKLOG_LIMIT:
             # The link does not report that it drained, and before that nothing can go out.
             deadline = now + 0.01
-        elif not self._may_send:
+        elif not may_send:
             deadline = max(deadline, now + 0.05)  # because nothing can be sent, whatever is due
         if self.framer.waiting:
             deadline = min(deadline, self._heard_at + QUIET)
-        self._deadline = deadline
-        if self._scope is not None:
-            self._scope.deadline = deadline
+        self._waiting.deadline = deadline
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
@@ -212,16 +212,10 @@ class Driver:
                 continue
             self._pass_on(now)
             vehicle.on_message(message, now)
-            if sender is None or vehicle.address is None:
-                continue
-            if message is vehicle.heartbeat:
-                # A target without heartbeats of its own has the address of its system's autopilot.
-                if vehicle.address in self._addresses:
-                    self._is_from(vehicle.address, sender, now)
-                else:
-                    self.peer = sender
-            strange = vehicle.identity.standing is Standing.STRANGER
-            self._addresses.distrusted = self.peer if strange else None
+            # A target without heartbeats of its own moves with its system's autopilot.
+            target, speaks = vehicle.address, message is vehicle.heartbeat
+            if target is not None and sender is not None and speaks and self._addresses.of(target):
+                self._is_from(target, sender, now)
 
     def _pass_on(self, now: float) -> None:
         """Pass the collected replies to the engine."""
@@ -241,44 +235,39 @@ class Driver:
 
     def _is_from(self, source: Address, sender: NetAddress, now: float) -> bool:
         """Return whether a message from this network address counts; follow the vehicle if it moved there."""
-        is_vehicle = source == self.vehicle.address
-        moves = is_vehicle and source in self._addresses
-        if not self._addresses.accepts(source, sender, now):
+        is_vehicle, before = source == self.vehicle.address, self._addresses.of(source)
+        strange = self.vehicle.identity.standing is Standing.STRANGER
+        if not self._addresses.accepts(source, sender, now, self.peer if strange else None):
             if is_vehicle:
                 self._on_impostor(source, sender, now)
             return False
-        if is_vehicle and sender != self.peer:
+        if is_vehicle and before is not None and before != sender:
             self._pass_on(now)
-            if moves:
-                self._impostor_at = self.second = None
-                if self.peer is not None:
-                    log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
-                    self.vehicle.identity.reopened()
-            self.peer = sender
+            self._impostor_at, self.second = inf, None
+            log.warning(_MOVED, readable_address(before), readable_address(sender))
+            self.vehicle.identity.reopened()
         return True
 
     def _on_impostor(self, source: Address, sender: NetAddress, now: float) -> None:
         """Warn once that another sender claims to be the vehicle. The vehicle itself may have moved there, so
         warn only when it is heard at its old address again."""
-        if self._impostor_at is None:
-            self._impostor_at = now
-        elif self.vehicle.identity.heard_at > self._impostor_at:
-            self._impostor_at = inf
+        if self.second is None and self.vehicle.identity.heard_at > self._impostor_at:
             self.second = sender
             log.warning(_IGNORED, readable_address(sender), *source)
+        self._impostor_at = min(self._impostor_at, now)
 
-    def _refill(self, now: float) -> None:
-        """Send the engine's requests, if the link has room."""
+    def _refill(self, now: float) -> bool:
+        """Send the engine's requests, if the link has room; return whether requests may go out now."""
         target, link = self.vehicle.address, self.link
-        self._may_send = link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
-        self._may_send &= now >= self._silent_until
-        if target is None or not self._may_send:
+        may_send = link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
+        may_send &= now >= self._silent_until
+        if target is None or not may_send:
             self.engine.hold(now)
-            return
+            return may_send
         payloads = self.engine.outgoing(now)
-        if not payloads:
-            return
-        if self._on_payload is not None:
-            for wire in payloads:
-                self._on_payload(now, "request", wire)
-        link.send(self.framer.encode_ftp_run(target, payloads), self.peer)
+        if payloads:
+            if self._on_payload is not None:
+                for wire in payloads:
+                    self._on_payload(now, "request", wire)
+            link.send(self.framer.encode_ftp_run(target, payloads), self.peer)
+        return True
