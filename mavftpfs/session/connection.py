@@ -184,7 +184,7 @@ class Connection:
                 "state": self._link_state(now),
                 "rtt": self.engine.rtt,
                 "loss": round(self.engine.flow.path.loss, 4),
-                "other_ftp_client": self.vehicle.another_client_heard(now),
+                "other_ftp_client": self.scheduler.server.others.are_heard(now),
                 "waits_for": self.scheduler.waits_for,
                 "received_bytes": link.stats.received_bytes,
                 "sent_bytes": link.stats.sent_bytes,
@@ -214,9 +214,9 @@ class Connection:
         self.scheduler.server.distrust(reads=True)
         self._tell("reboot")
 
-    def _on_another_client(self, payload: bytes, newcomer: bool) -> None:
+    def _on_another_client(self, payload: bytes) -> None:
         self.engine.flow.sole_client = False
-        self.scheduler.server.on_another_client(payload, newcomer=newcomer)
+        self.scheduler.server.on_another_client(payload)
 
     def _on_armed(self, armed: bool) -> None:
         self.scheduler.on_armed_changed()
@@ -255,10 +255,10 @@ class Connection:
         The heartbeats are an onboard controller's, because those of a GCS would feed the GCS-loss failsafe
         (promise 6).
         """
-        driver = self.driver
+        driver, others = self.driver, self.scheduler.server.others
         while True:
             driver.send(driver.framer.encode_heartbeat(MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID))
-            self.engine.flow.sole_client = not self.vehicle.another_client_heard(self.clock())
+            self.engine.flow.sole_client = not others.are_heard(self.clock())
             await trio.sleep(HEARTBEAT_PERIOD)
 
     async def _ask_about_vehicle(self) -> None:

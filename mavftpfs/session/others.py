@@ -26,6 +26,9 @@ PX4 of September 2026 after 30."""
 MOST_PAUSE = 0.3
 """The most seconds for which this connection opens nothing after another client closed its file."""
 
+CLIENT_MEMORY = 10.0
+"""Seconds for which an FTP client that was heard counts as present."""
+
 STAYS_ITS_OWN = 2.5
 """Seconds after an answer for which no ArduPilot with one session reassigns that session; it does after 3."""
 
@@ -65,6 +68,7 @@ class OtherClients:
     """Records the requests of other clients, and the answers to them.
 
     Attributes:
+        heard_at: when one of them was heard last.
         session: the id that another client used or closed last; None before the first.
         closed_at: when one of them was last heard to close a file.
         file_open_until: the time until which another client may have a file open.
@@ -75,7 +79,7 @@ class OtherClients:
         self._rng = rng
         self.session: int | None = None
         self._theirs = Theirs.NOTHING  # until `file_open_until`
-        self.closed_at = self.file_open_until = self._answered_at = -inf
+        self.heard_at = self.closed_at = self.file_open_until = self._answered_at = -inf
         self._answered_since = inf  # since then its answers show no pause that loses a session
 
     def hear(self, payload: bytes, now: float) -> Heard | None:
@@ -84,6 +88,7 @@ class OtherClients:
         None for a refused read or write, and for listings, checksums and changes of names, which use no
         session, so that a ground station that shows directories makes nobody's bytes suspect.
         """
+        self.heard_at = now
         event, before = _event(payload), self._theirs if now < self.file_open_until else Theirs.NOTHING
         self._theirs = _THEN[before].get(event, before)
         if self._theirs is not Theirs.NOTHING:
@@ -101,6 +106,10 @@ class OtherClients:
                 self._answered_since = now
             self._answered_at = now
         return event
+
+    def are_heard(self, now: float) -> bool:
+        """Return whether another FTP client of this vehicle was heard lately."""
+        return now - self.heard_at < CLIENT_MEMORY
 
     def on_ours_opened(self) -> None:
         """Note that this connection opened a file, so no other client has the session, or the server has

@@ -158,14 +158,15 @@ class ServerSession:
         `since`."""
         return self.clock() - self._distrusted_at <= LASTS or self._distrusted_at > since
 
-    def on_another_client(self, payload: bytes, *, newcomer: bool) -> None:
+    def on_another_client(self, payload: bytes) -> None:
         """Note another FTP client's payload, and distrust reads if that client may have the shared session.
 
-        newcomer: none was heard for a while, so this client may have taken the session by earlier payloads
-            that this connection missed. Exceptions: its request to open takes nothing before the server
-            answers, and an upload goes on because its file is compared afterwards.
+        If none was heard for a while, this client may have taken the session by earlier payloads that this
+        connection missed. Exceptions: its request to open takes nothing before the server answers, and an
+        upload goes on because its file is compared afterwards.
         """
-        engine, heard, session = self.engine, self.others.hear(payload, self.clock()), self.opened
+        engine, session, now = self.engine, self.opened, self.clock()
+        newcomer, heard = not self.others.are_heard(now), self.others.hear(payload, now)
         # Where servers echo ids, each client has one of its own.
         shared = not engine.traits.ack_carries_own_session or self.others.session == engine.home_session
         took = shared and heard in (Heard.OPENED, Heard.USED)
@@ -368,7 +369,7 @@ class ServerSession:
                 await self.driver.be_silent(SILENCE_ARDUPILOT)
             case Holder.GONE, 1:
                 await self.driver.be_silent(SILENCE_PX4)
-            case Holder.GONE, 2 if tried.opens and not self.vehicle.another_client_heard(now):
+            case Holder.GONE, 2 if tried.opens and not self.others.are_heard(now):
                 reset = Simple(Opcode.RESET_SESSIONS, session=self.engine.home_session)
                 await self._try(self.driver.run(reset))
             case _:

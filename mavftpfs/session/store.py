@@ -251,7 +251,7 @@ class Store:
 
     def another_client_heard(self) -> bool:
         """Return whether another FTP client was heard in the last ten seconds."""
-        return self._vehicle.another_client_heard(self._clock())
+        return self._server.others.are_heard(self._clock())
 
     def address(self) -> tuple[int, int]:
         """Return system and component id; (1, 1), an autopilot's, before the first heartbeat."""

@@ -292,7 +292,7 @@ class Upload(SessionUser):
             with server.running(transfer, partial(self._on_batch, transfer)):
                 await self._watch(turn, session, transfer)
         except FtpNak as error:
-            if is_path_refusal(error) and self._vehicle.another_client_heard(self._clock()):
+            if is_path_refusal(error) and self._server.others.are_heard(self._clock()):
                 # That client's requests with a path do not alternate with these writes; the next turns try
                 # again.
                 raise SessionLost(f"beside another FTP client: {error}") from error
@@ -334,7 +334,7 @@ class Upload(SessionUser):
         """Whether a silence ends the turn: the session may be gone (servers.md 14.9), which the answer to
         Terminate shows. If closing costs the whole file, the upload closes it only if another client was
         heard; otherwise the transfer's own patience ends it."""
-        return self._keeps_content or self._vehicle.another_client_heard(self._clock())
+        return self._keeps_content or self._server.others.are_heard(self._clock())
 
     def _yields(self, turn: Turn, session: OpenSession) -> bool:
         """Return whether the file should be closed now, to be resumed in a later turn."""

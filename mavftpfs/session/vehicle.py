@@ -39,9 +39,6 @@ from mavftpfs.shared.readable import autopilot_name
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
 
-CLIENT_MEMORY = 10.0
-"""Seconds for which an FTP client that was heard counts as present."""
-
 ABSENCE = 2.5
 """Seconds of silence in which a vehicle may have restarted, or have been exchanged for another: no autopilot
 starts faster. (A cable that is moved reopens the link, which is told.)"""
@@ -190,10 +187,10 @@ class Vehicle:
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
     write_armed: write in flight, too.
-    own: this connection's address. on_another_client: called with each payload from or to another FTP client,
-    and whether none was heard for a while before. on_heartbeat: called with whether the vehicle was lost.
-    on_refusal: called when the vehicle refuses to arm. on_double: called when another program uses the
-    address `own`. on_doubt, on_stranger, patience: see Identity.
+    own: this connection's address. on_another_client: called with each payload from or to another FTP client.
+    on_heartbeat: called with whether the vehicle was lost. on_refusal: called when it refuses to arm.
+    on_double: called when another program uses the address `own`. on_doubt, on_stranger, patience: see
+    Identity.
 
     Attributes:
         armed: whether to treat it as armed; never heard counts as armed.
@@ -204,7 +201,7 @@ class Vehicle:
     own: Address
     write_armed: bool = False
     on_reboot: Callable[[], None] = lambda: None
-    on_another_client: Callable[[bytes, bool], None] = lambda payload, newcomer: None
+    on_another_client: Callable[[bytes], None] = lambda payload: None
     on_heartbeat: Callable[[bool], None] = lambda was_lost: None
     on_armed: Callable[[bool], None] = lambda armed: None
     on_refusal: Callable[[], None] = lambda: None
@@ -217,7 +214,6 @@ class Vehicle:
     heartbeat_at: float = -inf
     version: AutopilotVersion | None = None
     storage: StorageInformation | None = None
-    another_client_at: float = -inf
     reboots: int = 0
     refusals: int = 0
     identity: Identity = field(init=False)
@@ -285,10 +281,6 @@ class Vehicle:
         silent = self.identity.heard_at <= now - SILENCE_LIMIT
         return _SILENT if silent or self.lost(now) else None
 
-    def another_client_heard(self, now: float) -> bool:
-        """Return whether another FTP client of this vehicle was heard lately."""
-        return now - self.another_client_at < CLIENT_MEMORY
-
     @property
     def lacks_boot_time(self) -> bool:
         """Whether its boot time is worth asking for, because some tell it only then (ArduCopter): it was not
@@ -307,7 +299,7 @@ class Vehicle:
             case Heartbeat():
                 self._on_heartbeat(message, now)
             case FtpRun():
-                self._on_ftp_of_another_client(message, now)
+                self._on_ftp_of_another_client(message)
             case _ if self.address is None or message.source.system != self.address.system:
                 return
             case AutopilotVersion() if message.source == self.address:
@@ -378,7 +370,7 @@ class Vehicle:
             self.armed = armed
             self.on_armed(armed)
 
-    def _on_ftp_of_another_client(self, run: FtpRun, now: float) -> None:
+    def _on_ftp_of_another_client(self, run: FtpRun) -> None:
         if self.address is None or run.source == self.own:
             return
         for payload in run.payloads:
@@ -387,9 +379,7 @@ class Vehicle:
             else:
                 theirs = run.target.system in (0, self.address.system)
             if theirs:
-                newcomer = not self.another_client_heard(now)
-                self.another_client_at = now
-                self.on_another_client(payload, newcomer)
+                self.on_another_client(payload)
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
         if self._boot is None:

@@ -628,8 +628,7 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool) -
         def take() -> None:
             here.another_asks(Opcode.RESET_SESSIONS, heard=False)
             here.another_asks(Opcode.CREATE_FILE, here.root + b"/d/theirs", heard=False)
-            here.connection.vehicle.another_client_at = trio.current_time()
-            here.connection.vehicle.on_another_client(bytes(251), True)
+            here.connection.vehicle.on_another_client(bytes(251))
 
         here.faults.at(Opcode.WRITE_FILE, take, nth=100)
         if leaves:

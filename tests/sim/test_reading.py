@@ -228,7 +228,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await trio.sleep(pause)
         here.another_asks(Opcode.NONE)
         await trio.sleep(0.5)
-        assert here.connection.vehicle.another_client_at > 0.0
+        assert here.connection.scheduler.server.others.heard_at > 0.0
         assert here.invalidated == ([b"/f"] if doubted else [])
         here.connection.scheduler.server.distrust(reads=True)
         assert len(here.invalidated) == doubted, "those bytes are gone"

@@ -286,7 +286,7 @@ async def test_a_taken_session_is_waited_out_then_reset_if_nobody_is_heard_then_
     async with here.connected() as connection:
         here.faults.refuse(Opcode.OPEN_FILE_RO, NakCode.NO_SESSIONS_AVAILABLE, times=99)
         if heard:
-            connection.vehicle.another_client_at = trio.current_time() + SILENCE_PX4
+            connection.scheduler.server.others.heard_at = trio.current_time() + SILENCE_PX4
         with pytest.raises(SessionBusy):
             await connection.scheduler.server.open(path("ardupilot", "f"))
         assert not connection.scheduler.server.maybe_open

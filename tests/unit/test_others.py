@@ -7,7 +7,7 @@ import random
 import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.session.others import LEFT_OPEN, MOST_PAUSE, OtherClients
+from mavftpfs.session.others import CLIENT_MEMORY, LEFT_OPEN, MOST_PAUSE, OtherClients
 
 pytestmark = pytest.mark.holds("promise 6")
 
@@ -47,6 +47,14 @@ def test_a_client_that_left_its_file_long_ago_and_lists_has_none() -> None:
     others.hear(acks(OPEN), 0.0)
     others.hear(asks(Opcode.LIST_DIRECTORY), LEFT_OPEN + 1)
     assert others.file_open_until <= LEFT_OPEN + 1
+
+
+def test_a_client_that_only_lists_is_present_for_a_while() -> None:
+    others = OtherClients(random.Random(1))
+    assert not others.are_heard(0.0)
+    others.hear(asks(Opcode.LIST_DIRECTORY), 0.0)
+    assert others.are_heard(CLIENT_MEMORY - 1)
+    assert not others.are_heard(CLIENT_MEMORY)
 
 
 @pytest.mark.parametrize("code", [NakCode.FILE_NOT_FOUND, NakCode.NO_SESSIONS_AVAILABLE])

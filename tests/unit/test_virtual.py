@@ -99,7 +99,7 @@ async def test_a_server_without_trees_sees_one_probe(px4: Rig) -> None:
 
 
 async def test_beside_another_client_a_server_is_probed_only_if_somebody_asks(px4_2026: Rig) -> None:
-    px4_2026.connection.vehicle.another_client_at = trio.current_time()
+    px4_2026.connection.scheduler.server.others.heard_at = trio.current_time()
     tree = px4_2026.mount()
     assert await names(tree, b"/") == {b"fs"}
     assert px4_2026.count(OPEN) == 0
