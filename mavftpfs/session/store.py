@@ -80,9 +80,6 @@ VERIFY_LIMIT = 4.0
 SWEEPS = 3
 """Listings of a directory at most, because its names changed during the earlier ones."""
 
-_MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
-"""Refusals if a name does not exist; the errno may be a stale one (docs/servers.md 12)."""
-
 
 class Store:
     """Reads, lists, checks and changes remote files; see cache.remote for what each call does.
@@ -422,13 +419,9 @@ class Store:
                 raise error
 
     def _may_be_second(self, error: FtpNak) -> bool:
-        """Return whether a refusal may answer the second execution of a request.
-
-        A rename that is refused because a name is missing is looked at in any case, because the caller would
-        take its refusal for proof that the server renames no files.
-        """
-        missing = error.opcode == Opcode.RENAME and error.code in _MISSING
-        return error.retransmitted or missing or self._server.in_doubt()
+        """Return whether a refusal may answer the second execution of a request. That of a rename always
+        may, because the caller would take it for proof that the server renames no files."""
+        return error.retransmitted or error.opcode == Opcode.RENAME or self._server.in_doubt()
 
     async def _look(self, after: Mapping[bytes, After], *, silent: bool) -> Outcome:
         """List the directories of these names; return the verdict on a change that was refused, or not
