@@ -406,7 +406,14 @@ class Store:
                     counts = repeated and then is not After.PRESENT
                     self._quarantine.on_changed(path, now, now - began if counts else 0.0)
             silent = isinstance(error, RequestTimeout)
-            may_have_happened = last or isinstance(error, RequestTimeout) or self._may_be_second(error)
+            # A refusal may answer the second execution.
+            may_have_happened = (
+                last
+                or isinstance(error, RequestTimeout)
+                or error.retransmitted
+                or error.opcode == Opcode.RENAME  # the caller would take it for proof that nothing is renamed
+                or self._server.in_doubt()
+            )
             # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
             if isinstance(error, FtpNak) and not may_have_happened and error.code != NakCode.FILE_EXISTS:
                 raise error
@@ -417,11 +424,6 @@ class Store:
                 raise OutcomeUnknown(f"{error}; whether it was done is not known") from error
             if outcome is not Outcome.DID_NOT or last or silent:
                 raise error
-
-    def _may_be_second(self, error: FtpNak) -> bool:
-        """Return whether a refusal may answer the second execution of a request. That of a rename always
-        may, because the caller would take it for proof that the server renames no files."""
-        return error.retransmitted or error.opcode == Opcode.RENAME or self._server.in_doubt()
 
     async def _look(self, after: Mapping[bytes, After], *, silent: bool) -> Outcome:
         """List the directories of these names; return the verdict on a change that was refused, or not
