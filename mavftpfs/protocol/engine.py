@@ -83,7 +83,6 @@ class Engine:
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._ops: list[Operation] = []
-        self._finished: list[Operation] = []
         self._gate = PathGate()
         self._timers = Timers()
         self._due = inf  # no timer of a request runs out before
@@ -151,11 +150,6 @@ class Engine:
         self._ops.append(op)
         self._ops.sort(key=lambda one: not one.urgent)
 
-    def take_finished(self) -> list[Operation]:
-        """Return the operations that ended since the last call."""
-        finished, self._finished = self._finished, []
-        return finished
-
     def remove(self, op: Operation) -> None:
         """Forget an operation, ended or not; late replies to it are discarded. A second call is harmless."""
         if op not in self._ops:
@@ -164,8 +158,6 @@ class Engine:
         self._ledger.release(op)
         if op is self._burst_op:
             self._burst_op = None
-        if op.done:
-            self._finished.append(op)
 
     # --- what comes in
 
@@ -193,8 +185,8 @@ class Engine:
                 self.on_unawaited(reply, request)
             return
         if late:
-            self.flow.path.on_spurious()
-            self._timers.reordering.on_needless(now)
+            self.flow.path.on_late()
+            self._timers.reordering.on_late(now)
             ledger.on_late(request)
         self._on_answers(request, 1, now)
         if reply.opcode == _NAK and self._session_changed(request, reply):
@@ -230,14 +222,14 @@ class Engine:
         ledger, timers = self._ledger, self._timers
         self.stats.replies += count
         self._heard_at = now
-        timed = not newest.repeated and newest.sent_at > self._burst_heard_at
+        timed = newest.sent_at == newest.first_sent and newest.sent_at > self._burst_heard_at
         rtt = timers.sample(newest, now) if timed else None
         size = newest.size if newest.policy.bulk else MAX_DATA
         self.flow.on_replies(now, rtt, count, newest.order, ledger.order, size)
-        if not timed:
+        if rtt is None:
             return  # if it is not known which transmission was answered, no earlier request is passed
         ledger.on_passed(newest)
-        wait = timers.passed_wait(now) if ledger.passed else 0.0
+        wait = timers.passed_wait(rtt, now) if ledger.passed else 0.0
         for request in list(ledger.passed.values()):
             request.timer = request.sent_at + wait
             if request.timer <= now:
@@ -343,7 +335,7 @@ class Engine:
         """Number requests of one opcode, and return them encoded."""
         first, ledger = requests[0], self._ledger
         op, policy = first.op, first.policy
-        op.sent = True
+        op.sent += 1
         quiet = now - op.progress_at
         timer = now + self._timers.wait(policy, quiet)
         if first.follows:

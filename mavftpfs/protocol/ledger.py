@@ -43,8 +43,7 @@ class Ledger:
 
     def __init__(self, next_seq: int) -> None:
         self._seq = next_seq
-        self._table: dict[int, Request] = {}  # by the seq of their answers
-        self._late: dict[int, Request] = {}  # of those, the ones that are not outstanding, oldest first
+        self._table: dict[int, Request] = {}  # by the seq of their answers: outstanding ones and late ones
         self._sent: deque[tuple[int, int, float]] = deque(maxlen=MOST_REMEMBERED)
         self.outstanding: dict[int, Request] = {}
         self.passed: dict[int, Request] = {}
@@ -95,8 +94,7 @@ class Ledger:
         request.order, self.order = self.order, self.order + 1
         request.sent_at, request.timer = now, timer
         request.owed += 1
-        request.repeated = request.outstanding = True
-        self._late.pop(request.seq + 1, None)
+        request.outstanding = True
         self._table[request.seq + 1] = self.outstanding[request.order] = request
 
     def leave(self, request: Request) -> None:
@@ -141,7 +139,6 @@ class Ledger:
         if request.outstanding:
             self.retire(request)
         if not request.owed:
-            self._late.pop(request.seq + 1, None)
             self._table.pop(request.seq + 1, None)
 
     def on_passed(self, answered: Request) -> None:
@@ -164,10 +161,8 @@ class Ledger:
         request.outstanding = False
         del self.outstanding[request.order]
         self.passed.pop(request.order, None)
-        self._late[request.seq + 1] = request
-        if len(self._late) > MOST_REMEMBERED:
-            oldest = next(iter(self._late))
-            del self._late[oldest], self._table[oldest]
+        if len(self._table) - len(self.outstanding) > MOST_REMEMBERED:
+            del self._table[next(seq for seq, one in self._table.items() if not one.outstanding)]
 
     def late_by(self, seq: int, now: float) -> float | None:
         """Return the seconds since the request with this answer went out; None: forgotten."""
@@ -178,7 +173,6 @@ class Ledger:
 
     def release(self, op: Operation) -> None:
         """Make ghosts of the requests of an operation."""
-        for requests in (self.outstanding, self._late):
-            for request in requests.values():
-                if request.op is op:
-                    request.op = self.ghost
+        for request in self._table.values():
+            if request.op is op:
+                request.op = self.ghost

@@ -200,8 +200,8 @@ class NetworkPath:
         """Note that a request was declared lost."""
         self._round.lost += 1
 
-    def on_spurious(self) -> None:
-        """Note that a request was answered after all that had been declared lost."""
+    def on_late(self) -> None:
+        """Note that a request that had been declared lost was answered after all."""
         self._round.lost = max(0, self._round.lost - 1)
 
     def on_app_limited(self) -> None:

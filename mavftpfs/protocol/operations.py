@@ -42,7 +42,6 @@ class Simple(Operation):
 
     Attributes:
         reply: the ACK, once done without error.
-        retransmitted: the request went out more than once, so a refusal may answer the second execution.
 
     Raises:
         PathTooLong: the data does not fit a request.
@@ -64,7 +63,6 @@ class Simple(Operation):
         self.patience = patience
         self.opcode = opcode
         self.exclusive = exclusive
-        self.retransmitted = False
         policy = RETRY_POLICIES[opcode]
         if server_time is not None:
             usual = server_time * (_USUAL_PACE if opcode == Opcode.CALC_FILE_CRC32 else 1.0)
@@ -79,8 +77,12 @@ class Simple(Operation):
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the one request, once, and again when it was lost."""
         requests, self._requests = self._requests, []
-        self.retransmitted = self.retransmitted or (self.sent and bool(requests))
         return requests
+
+    @property
+    def retransmitted(self) -> bool:
+        """Whether the request went out more than once, so a refusal may answer the second execution."""
+        return self.sent > 1
 
     def on_lost(self, request: Request, now: float) -> None:
         """Have it go out again, under the same seq where an answer may still come under that."""

@@ -77,7 +77,6 @@ class Request:
         follows: the request carries the engine's session.
         outstanding: the request is in flight: neither answered nor lost.
         owed: how many answers may still come, one for each transmission.
-        repeated: the request went out more than once.
         stale: no answer will come under this seq, because the server replays another reply.
         seq, order, sent_at, timer: of the last transmission. first_sent: of the first one.
     """
@@ -92,7 +91,6 @@ class Request:
     follows: bool = False
     outstanding: bool = False
     owed: int = 0
-    repeated: bool = False
     stale: bool = False
     # Set by each transmission.
     seq: int = field(init=False)
@@ -177,8 +175,8 @@ class Operation:
 
     The operation reports its `progress`; `progress_at` is inf while it is idle. The engine fails an operation
     with RequestTimeout if there was no progress for `patience` seconds (inf: the engine's deadline). `timer`
-    is the time at which the engine calls `on_timer`. `sent`: a request went out. An operation ends by
-    `finish` or `fail`, once.
+    is the time at which the engine calls `on_timer`. `sent`: how often requests went out. An operation ends
+    by `finish` or `fail`, once.
     """
 
     urgent = True
@@ -202,7 +200,7 @@ class Operation:
     patience = inf
     progress_at = inf
     timer = inf
-    sent = False
+    sent = 0
     started = False
 
     port: Port

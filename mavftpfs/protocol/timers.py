@@ -75,8 +75,8 @@ class Reordering:
         """Return the share of a round trip to wait beyond it."""
         return max(EIGHTH, self._late - EIGHTH * (now - self._at) / FADE)
 
-    def on_needless(self, now: float) -> None:
-        """Note that an answer came to what was taken to be lost."""
+    def on_late(self, now: float) -> None:
+        """Note that a request that had been declared lost was answered after all."""
         self._late, self._at = min(MOST_LATE, self.share(now) + EIGHTH), now
 
 
@@ -87,7 +87,6 @@ class Timers:
         self.bulk, self.single = RttEstimator(), RttEstimator()
         self.reordering = Reordering()
         self._last = (-inf, -inf, False)
-        self._rtt = 0.0
 
     def _estimator(self, policy: RetryPolicy) -> RttEstimator:
         """Return what is known for this policy, or at least for the other one."""
@@ -113,7 +112,6 @@ class Timers:
         if moment != self._last and policy.work <= _NO_WORK:  # else most of it was work
             self._last = moment
             (self.bulk if policy.bulk else self.single).sample(rtt)
-        self._rtt = rtt
         return rtt
 
     def wait(self, policy: RetryPolicy, quiet: float) -> float:
@@ -126,10 +124,9 @@ class Timers:
         wait = max(self.timeout(policy), min(quiet * backoff, LONGEST_BACK_OFF))
         return wait + min(policy.work, max(policy.usual_work, quiet))
 
-    def passed_wait(self, now: float) -> float:
+    def passed_wait(self, rtt: float, now: float) -> float:
         """Return how many seconds after its transmission a request is lost, if a later one was answered.
 
-        The last round trip counts, because the smoothed one is too long when a pause of the card has ended.
+        rtt: of that one, because the smoothed one is too long when a pause of the card has ended.
         """
-        rtt = self._rtt
         return max((1.0 + self.reordering.share(now)) * rtt, rtt + AT_ONCE)

@@ -179,12 +179,12 @@ class Driver:
         after anything that may have given the engine work."""
         now = self._clock()
         may_send = self._refill(now)
-        for operation in self.engine.take_finished():
-            callbacks = self._under_way.pop(operation, None)
-            if isinstance(operation.error, RequestTimeout):
-                self.vehicle.note_timeout()
-            if callbacks is not None:
-                callbacks[0]()
+        for operation, (on_finished, _) in list(self._under_way.items()):
+            if operation.done:
+                self._under_way.pop(operation, None)
+                if isinstance(operation.error, RequestTimeout):
+                    self.vehicle.note_timeout()
+                on_finished()
         due = self.engine.next_deadline()
         deadline = inf if due is None else due
         if self.link.backlog >= BACKLOG_LIMIT:

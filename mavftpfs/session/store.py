@@ -149,7 +149,7 @@ class Store:
             except RequestTimeout as exc:  # `left` is only the rest of what users know as op_deadline
                 raise RequestTimeout(f"no answer within {self._op_deadline:g} s") from exc
             if tried and tried[-1].error is None:
-                traits.time_silences += tried[-1].sent  # it may have had to wait for its turn all the time
+                traits.time_silences += tried[-1].sent > 0  # it may never have had its turn
             if refused or traits.time_silences >= TIME_SILENCES:
                 traits.lists_times = False
         entries = tuple(operation.entries)

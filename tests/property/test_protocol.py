@@ -193,7 +193,6 @@ class Way:
         deadline = self.engine.next_deadline()
         if deadline is not None and deadline <= now:
             self.engine.on_deadline(now)
-        self.engine.take_finished()
         for wire in self.engine.outgoing(now):
             self.model.push(Direction.TO_VEHICLE, wire, now)
         for wire in self.model.pop(Direction.TO_VEHICLE, now):

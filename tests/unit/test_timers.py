@@ -83,14 +83,14 @@ def test_what_went_and_came_together_is_one_sample() -> None:
 @pytest.mark.holds("fault duplicate")
 def test_what_comes_late_and_not_at_all_widens_the_patience_which_fades() -> None:
     timers = learned(READ_POLICY, 0.1)
-    assert timers.passed_wait(100.0) == pytest.approx(0.1125)
-    timers.reordering.on_needless(100.0)
-    assert timers.passed_wait(100.0) == pytest.approx(0.125)
+    assert timers.passed_wait(0.1, 100.0) == pytest.approx(0.1125)
+    timers.reordering.on_late(100.0)
+    assert timers.passed_wait(0.1, 100.0) == pytest.approx(0.125)
     for _ in range(20):
-        timers.reordering.on_needless(100.0)
-    assert timers.passed_wait(100.0) == pytest.approx(0.1 * (1.0 + MOST_LATE))
-    assert timers.passed_wait(100.0 + 2 * FADE) == pytest.approx(0.1 * (1.0 + MOST_LATE - 2 * EIGHTH))
-    assert timers.passed_wait(200.0) == pytest.approx(0.1125)
+        timers.reordering.on_late(100.0)
+    assert timers.passed_wait(0.1, 100.0) == pytest.approx(0.1 * (1.0 + MOST_LATE))
+    assert timers.passed_wait(0.1, 100.0 + 2 * FADE) == pytest.approx(0.1 * (1.0 + MOST_LATE - 2 * EIGHTH))
+    assert timers.passed_wait(0.1, 200.0) == pytest.approx(0.1125)
 
 
 # --- work of the server: checksums, cuts; and what is done at once
