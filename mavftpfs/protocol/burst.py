@@ -1,10 +1,16 @@
 """Reading an open file by bursts (`read_mode=burst`). Layer: protocol; pure.
 
 One BurstReadFile brings many packets of data, which saves the uplink of a half-duplex radio. `BurstTransfer`
-asks for a burst where the first wanted byte is missing. It reads what a burst left out by a window of
-ReadFile requests, as ReadTransfer does; while others wait for answers it reads everything so. It never does
-both at once, because a ReadFile during a burst moves MAVSDK's stream. A burst that was asked for cannot be
-stopped: ArduPilot sends 500 to 2000 packets, and answers nothing else until then.
+never asks for anything else meanwhile, because a ReadFile during a burst moves MAVSDK's stream. A burst
+cannot be stopped: ArduPilot sends 500 to 2000 packets, and answers nothing else until then.
+
+| the first of these that holds | asks for | ends |
+|---|---|---|
+| a burst is running | nothing | with the burst |
+| `by_requests`: others wait for answers | what is wanted, by ReadFile | when its owner says so |
+| a burst was refused, or two in a row brought no data | what is wanted, by ReadFile | never |
+| the last burst left gaps below `_covered` | what is wanted there, by ReadFile | when all of it arrived |
+| otherwise | a burst from the first wanted byte on | at once |
 
 `Burst` follows one stream. A packet belongs when seq and offset agree: offset == start + k * packet size and
 seq == request seq + 1 + k (mod 2^16). The packet size is what the server sends, not what was asked (PX4
@@ -35,25 +41,33 @@ _BARREN_BURSTS = 2
 
 
 class Burst:
-    """State of the running burst. start: offset asked for. size: of the file. asked: bytes per packet."""
+    """A running burst. start: offset asked for. size: of the file. asked: bytes per packet."""
 
     def __init__(self, seq: int, start: int, size: int, asked: int, now: float, rto: float) -> None:
         self.seq = seq
         self.start = start
         self.size = size
         self.asked = asked
-        self.sent_at = now
         self.rto = rto
-        self.packet = 0
-        self.packets = 0
-        self.highest = start
-        self.first_at = inf
-        self.last_at = now
-        self.interval = 0.0
-        self.complete_seen = False
+        self.packet = 0  # bytes per packet, as the server sends them, once known
+        self.highest = start  # one past the highest byte that came
+        self.last_at = now  # the last packet, or the request
+        self.interval = 0.0  # seconds between two packets, smoothed
+        self.ending = False  # burst_complete or a NAK came
+        self.nak: int | None = None  # the last one
         self.barren = 0  # packets without data since the last with some
-        self.over = False
-        self.nak: int | None = None
+
+    @property
+    def empty(self) -> bool:
+        """Whether no data came so far."""
+        return self.highest == self.start
+
+    @property
+    def over(self) -> bool:
+        """Whether it is certain that no more data comes. After a NAK behind data, ArduPilot stops after one
+        more packet, MAVSDK never: quiet, or the next packet, will tell."""
+        refused = self.nak is not None and self.empty
+        return self.highest == self.size or self.nak == NakCode.EOF or refused
 
     @property
     def endless(self) -> bool:
@@ -65,9 +79,9 @@ class Burst:
 
         Never early: ArduPilot queues each new request as another full burst (servers.md 14.16).
         """
-        if self.packets == 0:
-            return self.sent_at + max(_MIN_QUIET, 3 * self.rto)
-        if self.complete_seen:
+        if self.empty:
+            return self.last_at + max(_MIN_QUIET, 3 * self.rto)
+        if self.ending:
             return self.last_at + max(self.rto, 4 * self.interval)
         least = _SLOW_QUIET if self.interval > _SLOW_PACKET else _MIN_QUIET
         return self.last_at + max(least, _INTERVALS * self.interval)
@@ -81,30 +95,24 @@ class Burst:
         packets = (self.size - self.start) // (self.packet or self.asked) + 2
         if index > min(packets, _MOST_PACKETS) or reply.opcode not in (Opcode.ACK, Opcode.NAK):
             return None
+        self._touch(now)
         self.barren += 1
         if reply.opcode == Opcode.NAK:
+            self.ending = True
             self.nak = reply.data[0] if reply.data else int(NakCode.NONE)
-            self.over = self.nak == NakCode.EOF or not self.packets
-            # ArduPilot stops after one more packet, MAVSDK never: quiet, or the next packet, will tell.
-            self.complete_seen = self.complete_seen or not self.over
-        self._touch(now)
         return b""
 
     def _take_data(self, reply: Payload, index: int, now: float) -> bytes | None:
-        data = reply.data
-        offset = reply.offset
+        offset, data = reply.offset, reply.data
         stop = offset + len(data)
         if not self._fits(offset - self.start, len(data), index, at_end=stop >= self.size):
             return None
         self._touch(now)
-        self.packets += 1
         self.barren = 0
         if reply.burst_complete:
-            self.complete_seen = True
-        if stop >= self.size:
-            self.over = True
-            data = data[: max(0, self.size - offset)]
-            stop = self.size
+            self.ending = True
+        if stop > self.size:
+            stop, data = self.size, data[: max(0, self.size - offset)]
         self.highest = max(self.highest, stop)
         return data
 
@@ -124,10 +132,8 @@ class Burst:
         return True
 
     def _touch(self, now: float) -> None:
-        if self.first_at < inf:
+        if self.barren or not self.empty:  # otherwise it is the first packet
             self.interval += (now - self.last_at - self.interval) * 0.1
-        else:
-            self.first_at = now
         self.last_at = now
 
 
@@ -150,9 +156,8 @@ class BurstTransfer(ReadTransfer):
         super().__init__(session, size, sink, chunks, wants)
         self.by_requests = False
         self._burst: Burst | None = None
-        self._covered = 0  # where the last burst ended: what is wanted below is asked for by ReadFile
-        self._barren_bursts = 0
-        self._gave_up = False
+        self._covered = 0  # where the last burst ended, while its gaps are read
+        self._barren_bursts = 0  # one after the other
 
     @property
     def idle(self) -> bool:
@@ -160,17 +165,13 @@ class BurstTransfer(ReadTransfer):
         return self._burst is None and super().idle
 
     def next_requests(self, most: int, now: float) -> list[Request]:
-        """Return the BurstReadFile that is due, or ReadFiles: for what the last burst left out, or for
-        all."""
+        """Return the BurstReadFile that is due, or ReadFiles, as the module's table says."""
         if self._burst is not None:
             return []
-        if self.by_requests or self._gave_up:
-            return super().next_requests(most, now)
-        gap = self.wants.take(self.chunks.size, self._covered)
-        if gap is not None:
-            return self._requests_for(gap, self.chunks.size)
-        if self.wants.in_flight:
-            return []
+        by_requests = self.by_requests or self._barren_bursts >= _BARREN_BURSTS
+        requests = self._requests_below(self.size if by_requests else self._covered, most, now)
+        if requests or by_requests or self.wants.in_flight:
+            return requests
         self._covered = 0
         first = self.wants.demand.todo.first() or self.wants.ahead.todo.first()
         if first is None:
@@ -197,17 +198,14 @@ class BurstTransfer(ReadTransfer):
             self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
         elif burst.over:
             self._end_burst(burst)
-        elif burst.complete_seen or burst.packets == 1:  # from here on it is over sooner
+        else:
             self.timer = burst.quiet_deadline()
         return True
 
     def on_timer(self, now: float) -> None:
-        """End a burst that went quiet; packets that came meanwhile only moved the deadline."""
-        burst = self._burst
-        if burst is None or now < burst.quiet_deadline():
-            self.timer = inf if burst is None else burst.quiet_deadline()
-        else:
-            self._end_burst(burst)
+        """End a burst that went quiet."""
+        if self._burst is not None:
+            self._end_burst(self._burst)
 
     def finish(self) -> None:
         """End; ranges in flight lose their requests and stay pending."""
@@ -216,12 +214,9 @@ class BurstTransfer(ReadTransfer):
 
     def _end_burst(self, burst: Burst) -> None:
         self._burst, self.timer, self._covered = None, inf, burst.highest
-        if burst.packets:
+        if not burst.empty:
             self._barren_bursts = 0
-            return
-        # Lost, refused, or the session is gone. ReadFile answers more clearly.
-        self._barren_bursts += 1
-        if burst.nak in _SESSION_CODES:
+        elif burst.nak in _SESSION_CODES:
             self.fail(SessionLost(f"a burst was refused with NAK {burst.nak}", by_server=True))
-        elif burst.nak is not None or self._barren_bursts >= _BARREN_BURSTS:
-            self._gave_up = True
+        else:  # after a refusal ReadFile answers more clearly
+            self._barren_bursts += 1 if burst.nak is None else _BARREN_BURSTS

@@ -87,7 +87,6 @@ class Engine:
         self._timers = Timers()
         self._due = inf  # no timer of a request runs out before
         self._heard_at = -inf  # the last believed reply
-        self._burst_op: Operation | None = None  # to which burst packets belong
         self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
 
     # --- facts
@@ -156,8 +155,6 @@ class Engine:
             return
         self._ops.remove(op)
         self._ledger.release(op)
-        if op is self._burst_op:
-            self._burst_op = None
 
     # --- what comes in
 
@@ -265,8 +262,8 @@ class Engine:
 
     def _on_burst(self, reply: Payload, now: float) -> bool:
         self._burst_heard_at = now
-        op = self._burst_op
-        if op is None or not op.on_burst(reply, now):
+        op = next((one for one in self._ops if one.on_burst(reply, now)), None)
+        if op is None:
             return False
         self.stats.replies += 1
         self._heard_at = now
@@ -345,7 +342,6 @@ class Engine:
         else:
             ledger.launch(requests, now, timer)
         if first.opcode == _BURST:
-            self._burst_op = op
             ledger.leave(first)  # its packets tell what became of it, and it is never repeated
             # No later request may have the seq of one of its packets (servers.md 2, collision).
             ledger.jump(op.on_burst_sent(first, now))

@@ -172,11 +172,12 @@ class ReadTransfer(Operation):
 
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return ReadFile requests for a row of chunks; demand goes first."""
-        chunk = self.chunks.next_size(now)
-        limit = chunk if self.chunks.trying else most * chunk
-        return self._requests_for(self.wants.take(limit, self.size), chunk)
+        return self._requests_below(self.size, most, now)
 
-    def _requests_for(self, row: tuple[int, int] | None, chunk: int) -> list[Request]:
+    def _requests_below(self, below: int, most: int, now: float) -> list[Request]:
+        """Return such requests for what is wanted below an offset."""
+        chunk = self.chunks.next_size(now)
+        row = self.wants.take(chunk if self.chunks.trying else most * chunk, below)
         if row is None:
             return []
         session, (start, stop) = self.session, row

@@ -67,7 +67,7 @@ def test_the_size_is_learnt_from_a_later_packet_when_the_first_was_lost() -> Non
 def test_incoherent_first_packets_are_refused(reply: Payload) -> None:
     burst = make(5000)
     assert burst.take(reply, 0.0) is None
-    assert burst.packets == 0
+    assert burst.empty
     assert burst.packet == 0
 
 
