@@ -17,10 +17,8 @@ from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
 BEYOND = 100_000
-"""Offset of a listing that is beyond the end of any directory."""
+"""Offset of a listing that is beyond the end of any directory. No listing goes on there."""
 
-MAX_ENTRIES = 100_000
-MAX_PAGES = 60_000
 _MAX_EMPTY_PAGES = 4
 _USUAL_PACE = 0.1
 """The share of the slowest card's time that a usual card needs for a checksum. A checksum is asked for again
@@ -164,14 +162,13 @@ class ListDirectory(Operation):
 
     ArduPilot and MAVSDK answer EOF at the offset of a name that fits no reply, too. So behind an EOF the next
     offset is asked for, once. If it has names, the listing goes on there, and is not complete. PX4 answers an
-    empty page at such an offset; if names follow, the listing is not complete, either.
+    empty page at such an offset. Old PX4s answer one for an empty directory, too, so an empty page proves a
+    hidden name only if other pages have strings.
 
     Attributes:
-        entries: what was listed, each name once, `.` and `..` left out.
         complete: False when a cap, empty pages or a name that fits no reply hid something: absence of a name
             then proves nothing.
-        end: the offset at which the server said EOF, and behind which it has nothing; None if not known.
-        strings: how many strings were received so far, which is where the next page begins.
+        strings: how many strings were received or skipped so far, which is where the next page begins.
         on_page: called for each page, where it is not None.
 
     known_end: the directory's `end` when it was listed before; there the next offset is not asked for.
@@ -181,38 +178,44 @@ class ListDirectory(Operation):
     def __init__(
         self, path: bytes, with_time: bool = False, patience: float = inf, *, known_end: int | None = None
     ) -> None:
-        self.patience = patience
-        self.end: int | None = None
-        self._known_end = known_end
-        self._beyond = False  # the offset behind an EOF was asked for
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
-        self.entries: list[DirEntry] = []
+        self.patience = patience
+        self.opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
         self.complete = True
+        self._eof: int | None = None  # where the server said EOF, if nothing is known to be behind
+        self.strings = 0
         self.on_page: Callable[[], None] | None = None
         self._path = path
         self._with_time = with_time
-        self.opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
-        self._names: set[bytes] = set()
-        self.strings = 0
-        self._asked = False
-        self._pages = 0
+        self._known_end = known_end
+        self._entries: dict[bytes, DirEntry] = {}
+        self._asked = -1  # the offset that was asked for last
         self._first_page = b""
-        self._first_page_again = False
-        self._empty_pages = 0
+        self._barren = 0  # pages in a row that are empty or have no new name
+
+    @property
+    def entries(self) -> list[DirEntry]:
+        """What was listed, each name once, `.` and `..` left out."""
+        return list(self._entries.values())
+
+    @property
+    def end(self) -> int | None:
+        """The offset at which the server said EOF, and behind which it has nothing; None if not known."""
+        return self._eof if self.complete and self.error is None else None
 
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the request for the next page."""
-        if self._asked:
+        if self._asked == self.strings:
             return []
-        self._asked = True
+        self._asked = self.strings
         policy, path = RETRY_POLICIES[self.opcode], self._path
         return [Request(self, self.opcode, policy, 0, self.strings, len(path), path, follows=True)]
 
     def on_lost(self, request: Request, now: float) -> None:
         """Ask for the page again, unless it came."""
         if request.offset == self.strings:
-            self._asked = False
+            self._asked = -1
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""
@@ -227,65 +230,41 @@ class ListDirectory(Operation):
             else:
                 self.fail(nak)
             return
-        self._asked = False
-        self._pages += 1
         if self.on_page is not None:
             self.on_page()
         page = parse_page(reply.data, with_time=self._with_time)
-        if self._beyond:
-            if not any(entry.name not in self._names for entry in page.entries):
+        known = len(self._entries)
+        for entry in page.entries:  # a page may name something twice, too
+            self._entries.setdefault(entry.name, entry)
+        found = len(self._entries) > known
+        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
+        if found or not page.entries:
+            self.progress(now)
+        if self._eof is not None:
+            if not found:
                 self._on_eof()
                 return
-            self._beyond = self.complete = False
-        if page.strings == 0:
-            self.progress(now)
-            self._on_empty_page()
-            return
-        if self._empty_pages and page.entries:
-            self.complete = False  # a name that fits no page lies before these
-        self._empty_pages = 0
-        if self.strings == 0:
-            self._first_page = reply.data
-        elif page.entries and reply.data == self._first_page and self._ignores_offset():
+            self._eof, self.complete = None, False
+        if self.strings and bool(page.strings) != bool(self._first_page):
+            self.complete = False  # a name that fits no page lies here, or before
+        self._barren = 0 if found or (page.strings and not page.entries) else self._barren + 1
+        # MAVSDK repeats its first page, too, where it leaves out more entries than it shows (servers.md 6).
+        # But such a page has much room left, and comes only twice.
+        again = bool(page.entries) and reply.data == self._first_page
+        if page.strings:
+            self._first_page = self._first_page or reply.data
+        self.strings += page.strings or 1
+        if self.strings >= BEYOND or (again and (self._barren > 1 or len(reply.data) > MAX_DATA // 2)):
             self.complete = False
             self.finish()
-            return
-        self.strings += page.strings
-        known = len(self._names)
-        for entry in page.entries:  # a page may name something twice, too
-            if entry.name not in self._names:
-                self._names.add(entry.name)
-                self.entries.append(entry)
-        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
-        if len(self._names) > known or not page.entries:
-            self.progress(now)
-        if self._pages >= MAX_PAGES or len(self.entries) >= MAX_ENTRIES:
-            self.complete = False
+        elif not page.strings and self._barren >= _MAX_EMPTY_PAGES:
             self.finish()
 
     def _on_eof(self) -> None:
         """There is nothing at the offset: look behind it, or end."""
-        if not self._beyond and self.strings != self._known_end:
-            self.strings += 1
-            self._beyond, self._asked = True, False
-            return
-        self.end = self.strings - self._beyond if self.complete else None
+        if self._eof is None:
+            self._eof = self.strings
+            if self.strings != self._known_end:
+                self.strings += 1
+                return
         self.finish()
-
-    def _ignores_offset(self) -> bool:
-        """Return whether the server sends its first page for ever, now that the page came again.
-
-        MAVSDK repeats a first page, too, where it leaves out more entries than it shows (servers.md 6). But
-        such a page has much room left, and comes only twice.
-        """
-        again, self._first_page_again = self._first_page_again, True
-        return again or len(self._first_page) > MAX_DATA // 2
-
-    def _on_empty_page(self) -> None:
-        # Old PX4 ends so; newer ones when an entry fits no page, and offset + 1 gets past it.
-        self._empty_pages += 1
-        self.strings += 1
-        if self._empty_pages >= _MAX_EMPTY_PAGES:
-            # So many names in a row that fit no page look like the end, too: more may come behind them.
-            self.complete = self._pages == self._empty_pages
-            self.finish()

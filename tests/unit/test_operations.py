@@ -9,7 +9,7 @@ import pytest
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import (
-    MAX_ENTRIES,
+    BEYOND,
     ListDirectory,
     OpenRequest,
     Simple,
@@ -240,6 +240,20 @@ def test_an_entry_that_fits_no_page_is_stepped_over_and_several_prove_no_end() -
     assert not lister.op.complete
 
 
+@pytest.mark.holds("fault odd listing", "rule 14.29")
+@pytest.mark.parametrize(("first", "complete"), [(b"Fa\t1\0", False), (b"S\0", False), (b"", True)])
+def test_an_empty_page_behind_others_hides_a_name(first: bytes, complete: bool) -> None:
+    """An old PX4 answers one for an empty directory, and only there."""
+    lister = Lister()
+    lister.page(first)
+    if first:
+        lister.page(b"")
+    for _ in range(2):
+        lister.end(NakCode.EOF)
+    assert lister.op.done
+    assert lister.op.complete is complete
+
+
 @pytest.mark.holds("fault odd listing", "promise 10")
 def test_names_behind_an_early_eof_are_shown_and_prove_that_the_listing_is_not_complete() -> None:
     lister = Lister()
@@ -303,7 +317,7 @@ def test_a_server_that_ignores_the_offset_is_left() -> None:
 
 
 def test_endless_skip_marks_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mavftpfs.protocol.operations.MAX_PAGES", 50)
+    monkeypatch.setattr("mavftpfs.protocol.operations.BEYOND", 100)
     lister = Lister()
     while not lister.op.done:
         lister.page(b"S\0S\0")
@@ -319,4 +333,4 @@ def test_a_million_entries_end() -> None:
         lister.page(b"".join(b"F%d\0" % (count + index) for index in range(25)))
         count += 25
     assert not lister.op.complete
-    assert len(lister.op.entries) == MAX_ENTRIES
+    assert len(lister.op.entries) == BEYOND
