@@ -51,6 +51,10 @@ class ChunkSource(Protocol):
 
     ranges: Ranges
 
+    def has_more(self) -> bool:
+        """Return whether there are bytes to send now."""
+        ...
+
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """Return (offset, 1..limit bytes), moved to `ranges.out`, or None if there is nothing for now.
 
@@ -75,6 +79,10 @@ class Pieces:
         self._progress = progress
         self.ranges = Ranges()
         self.ranges.todo.add(0, len(self._content))
+
+    def has_more(self) -> bool:
+        """See ChunkSource."""
+        return not self.ranges.todo.empty
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See ChunkSource."""
@@ -103,8 +111,6 @@ class WriteTransfer(Operation):
         root: a directory to list when other requests with a path may disturb the next write (see
             `pathgate`); None: a write that is refused for that fails.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
-        on_drained: called when the source has nothing more. After a full window that shows only when all of
-            it was answered.
 
     Attributes:
         paused: send nothing new, but still take the answers to requests in flight.
@@ -126,36 +132,28 @@ class WriteTransfer(Operation):
         *,
         root: bytes | None = None,
         in_flight: int | None = None,
-        on_drained: Callable[[], None] = lambda: None,
     ) -> None:
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self._source = source
         self._root = root
-        self._needs_listing = False  # the root is to be listed before the next write
-        self._listing: Request | None = None
+        self._listing: Request | None = None  # of the root, to be answered before the next write
         self._listings = 0  # of the root, since something was ACKed
         self._in_flight = in_flight
-        self._on_drained = on_drained
+        self._full_ack = self.chunks.most.to_bytes(_COUNT_SIZE, "little")
         self.paused = False
-        self._drained = False
-        self._usual: bytes | None = None  # the data of an ACK to a full chunk
 
     # --- what the owner says and sees
 
-    def wake(self) -> None:
-        """Note that the source has more."""
-        self._drained = False
-
     @property
     def drained(self) -> bool:
-        """Whether the source had nothing when it was last asked, and all bytes that it gave were ACKed."""
-        return self._drained and self._source.ranges.out.empty
+        """Whether the source has nothing, and all bytes that it gave were ACKed."""
+        return self._source.ranges.out.empty and not self._source.has_more()
 
     @property
     def idle(self) -> bool:
         """Whether nothing is in flight, and nothing can be sent: the source is empty, or this is paused."""
-        return self._source.ranges.out.empty and (self.paused or self._drained)
+        return self._source.ranges.out.empty and (self.paused or not self._source.has_more())
 
     # --- requests
 
@@ -166,10 +164,9 @@ class WriteTransfer(Operation):
             most = min(most, self._in_flight - -(-self._source.ranges.out.total // chunk))
         if self.paused or most <= 0:
             return []
-        if self._needs_listing:
-            return self._list_root()
-        if self._drained:
-            return []
+        if self._listing is not None:
+            waits = self._listing.outstanding or not self._source.ranges.out.empty
+            return [] if waits else [self._listing]
         piece = self._new_piece((1 if self.chunks.trying else min(most, _ROW)) * chunk)
         if piece is None:
             return []
@@ -183,28 +180,18 @@ class WriteTransfer(Operation):
     def on_lost(self, request: Request, now: float) -> None:
         """Send its bytes again, or list the root again."""
         if request is self._listing:
-            self._listing = None
+            self._listing = request.anew()
         elif request.opcode == _WRITE:
             self.chunks.on_lost(request.size, request.sent_at, now)
-            self._send_again(request.offset, request.stop)
-
-    def _send_again(self, start: int, stop: int) -> None:
-        self._source.ranges.on_lost(start, stop)
-        self._drained = False
-
-    def _list_root(self) -> list[Request]:
-        """Return a listing of the root, once all else is answered. It sets right what paths disturb, and
-        clears a sticky errno. One request from beyond any end suffices; whatever it answers, the next write
-        tells."""
-        if self._listing is not None or self._root is None or not self._source.ranges.out.empty:
-            return []
-        root = self._root
-        self._listing = Request(self, _LIST, RETRY_POLICIES[_LIST], 0, BEYOND, len(root), root, follows=True)
-        return [self._listing]
+            self._source.ranges.on_lost(request.offset, request.stop)
 
     def on_paths(self) -> None:
-        """See Operation."""
-        self._needs_listing = self._root is not None
+        """Have the root listed before the next write. A listing sets right what paths disturb, and clears a
+        sticky errno. One request from beyond any end suffices; whatever it answers, the next write tells."""
+        root = self._root
+        if self._listing is None and root is not None:
+            policy = RETRY_POLICIES[_LIST]
+            self._listing = Request(self, _LIST, policy, 0, BEYOND, len(root), root, follows=True)
 
     def _new_piece(self, limit: int) -> tuple[int, bytes] | None:
         """Return at most `limit` bytes of the source; None if it has none, or fails."""
@@ -214,8 +201,6 @@ class WriteTransfer(Operation):
             self.fail(error)
             return None
         if piece is None:
-            self._drained = True
-            self._on_drained()
             return None
         offset, data = piece
         if not 1 <= len(data) <= limit or not 0 <= offset <= MAX_OFFSET - len(data):
@@ -229,21 +214,22 @@ class WriteTransfer(Operation):
         """Take what was written, or end with what a refusal means."""
         if request.opcode == _LIST:
             if request is self._listing:
-                self._listing, self._needs_listing = None, False
+                self._listing = None
                 self._listings += 1
         elif reply.opcode != _NAK:
             self.on_run([(request, reply.data)], now, placed=reply.offset == request.offset)
         else:
             nak = nak_of(request, reply)
             if is_path_refusal(nak) and self._root is not None and self._listings < _MOST_LISTINGS:
-                self._send_again(request.offset, request.stop)
-                self._needs_listing = self.port.traits.paths_block_writes = True
+                self._source.ranges.on_lost(request.offset, request.stop)
+                self.port.traits.paths_block_writes = True
+                self.on_paths()
             else:
                 self.fail(self._meaning(nak))
 
     def on_run(self, run: Run, now: float, *, placed: bool = True) -> None:
         """Take what was written, in a row at once. placed: answers have the requests' offsets."""
-        usual, full = self._usual, self.chunks.most
+        usual, full = self._full_ack, self.chunks.most
         first = run[0][0]
         start = stop = first.offset
         self.chunks.on_answered(first.size, len(run), first.sent_at, now)
@@ -253,13 +239,12 @@ class WriteTransfer(Operation):
             offset, count = request.offset, request.size
             if data != usual or count != full:
                 count = self._written(request, data)
-                usual = self._usual
             if offset != stop:
                 self._on_written(start, stop, now)
                 start = offset
             stop = offset + count
             if count < request.size:
-                self._send_again(stop, request.stop)
+                self._source.ranges.on_lost(stop, request.stop)
         self._on_written(start, stop, now)
 
     def _on_written(self, start: int, stop: int, now: float) -> None:
@@ -273,8 +258,6 @@ class WriteTransfer(Operation):
         if len(data) != _COUNT_SIZE:
             return request.size
         count = int.from_bytes(data, "little")
-        if count == self.chunks.most == request.size:
-            self._usual = data
         # More than was sent: an answer to something else. Nothing is proven, so it goes again.
         return count if count <= request.size else 0
 

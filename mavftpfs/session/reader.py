@@ -194,5 +194,3 @@ class FileStream(SessionUser):
         if count:
             self.tries.begin_anew()
             self._sink.on_batch(count)
-        if transfer.idle or transfer.done:
-            self._server.wake()

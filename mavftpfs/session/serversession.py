@@ -256,14 +256,22 @@ class ServerSession:
     @contextmanager
     def running(self, transfer: Operation, on_batch: Callable[[float], None] | None = None) -> Iterator[None]:
         """Run a transfer of the open file for the length of the body, unless `leave` cancels it. The body
-        waits by `look_again` until the transfer is done, or ends it before. on_batch: see `Driver.start`.
+        waits by `look_again` until the transfer is done or idle, or ends it before. on_batch: see
+        `Driver.start`.
 
         Raises:
             MavftpfsError: the error of the transfer.
         """
+
+        def after_batch(now: float) -> None:
+            if on_batch is not None:
+                on_batch(now)
+            if transfer.idle:
+                self.wake()
+
         self.transfer = transfer
         try:
-            self.driver.start(transfer, self.wake, on_batch)
+            self.driver.start(transfer, self.wake, after_batch)
             yield
         finally:
             self.transfer = None

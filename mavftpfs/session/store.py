@@ -275,7 +275,7 @@ class Store:
     async def _write_in_order(self, session: OpenSession, pieces: Pieces) -> None:
         server = self._server
         chunks = ChunkSize(min(self._scheduler.read_chunks.size, self._scheduler.write_chunks.size))
-        transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1, on_drained=server.wake)
+        transfer = WriteTransfer(session.id, pieces, chunks, in_flight=1)
         with server.running(transfer):
             while not transfer.done and not transfer.drained:
                 server.require_open(session)

@@ -13,7 +13,6 @@ Bytes that were ACKed before an ACKed Terminate are written.
 
 from __future__ import annotations
 
-from functools import partial
 from math import inf
 
 import trio
@@ -79,8 +78,6 @@ class Upload(SessionUser):
     def wake(self) -> None:
         """Note that the source has more."""
         self._changed.unpark_all()
-        if self._transfer is not None:
-            self._transfer.wake()
         self._server.wake()
 
     async def finish(self) -> None:
@@ -285,11 +282,10 @@ class Upload(SessionUser):
             self._scheduler.write_chunks,
             root=storage_root(self.path),
             in_flight=queue // 2 if queue and turn.interactive_waits else None,
-            on_drained=server.wake,
         )
         self._transfer = transfer
         try:
-            with server.running(transfer, partial(self._on_batch, transfer)):
+            with server.running(transfer, self._on_batch):
                 await self._watch(turn, session, transfer)
         except FtpNak as error:
             if is_path_refusal(error) and self._server.others.are_heard(self._clock()):
@@ -300,14 +296,11 @@ class Upload(SessionUser):
         finally:
             self._transfer = None
 
-    def _on_batch(self, transfer: WriteTransfer, now: float) -> None:
-        """Note progress, and wake the turn's task when a batch of replies left the transfer nothing to do.
-        Bytes that were ACKed before the session was lost are no progress."""
+    def _on_batch(self, now: float) -> None:
+        """Note progress. Bytes that were ACKed before the session was lost are none."""
         if self._source.reached > self._furthest:
             self._furthest = self._source.reached
             self.tries.begin_anew()
-        if transfer.idle or transfer.done:
-            self._server.wake()
 
     async def _watch(self, turn: Turn, session: OpenSession, transfer: WriteTransfer) -> None:
         """Return when the upload is to close its file: the vehicle is armed, the source has nothing more, the

@@ -165,7 +165,7 @@ def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, 
             return piece
 
     engine = make()
-    transfer = WriteTransfer(0, Broken())
+    transfer = WriteTransfer(0, Broken(b"x"))
     engine.start(transfer, 0.0)
     assert sent(engine, 0.0) == []
     assert isinstance(transfer.error, LocalProtocolError)
