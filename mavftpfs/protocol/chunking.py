@@ -39,21 +39,26 @@ class ChunkSize:
         fixed: the size that the user asked for, 1..239 bytes; None to choose it.
 
     Attributes:
-        most: bytes of the longest chunk. size: of a chunk as far as that is settled.
+        most: bytes of the longest chunk.
     """
 
     def __init__(self, fixed: int | None = None) -> None:
-        self.most = self.size = MAX_DATA if fixed is None else fixed
+        self.most = MAX_DATA if fixed is None else fixed
         self._least = SHORT if fixed is None else fixed
         self.trying = False
         """Whether full and short chunks alternate, so that each request needs a size of its own."""
-        self._short_until = inf
+        self._short_until = inf  # chunks are short until then; inf: they are not
         self._lost = 0  # full chunks in a row; while trying: beside the short ones
-        self._since = -inf  # older requests prove nothing: a later one passed, or the link was away
+        self._since = -inf  # requests sent before prove nothing more
         self._first_lost_at = 0.0
         self._shortest_lost = 0  # bytes: what is shorter proves nothing when it is answered
         self._answered = 0  # short chunks, while trying
         self._short_next = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of a chunk as far as that is settled."""
+        return self.most if self._short_until == inf else self._least
 
     def next_size(self, now: float) -> int:
         """Return the bytes of the next chunk."""
@@ -61,7 +66,7 @@ class ChunkSize:
             self._short_next = not self._short_next
             return self._least if self._short_next else self.most
         if now >= self._short_until:
-            self._short_until, self._lost, self.size = inf, 0, self.most
+            self._short_until = inf
         return self.size
 
     def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
@@ -82,7 +87,8 @@ class ChunkSize:
         if size > self._least and sent_at > self._since:
             if not self._lost:
                 self._first_lost_at = now
-                self._shortest_lost = min(size, self._shortest_lost) if self.trying else size
+                if not self.trying:
+                    self._shortest_lost = size
             self._shortest_lost = min(self._shortest_lost, size)
             self._lost += 1
             self._short_next = False  # a short one is next, also where there is one request at a time
@@ -95,6 +101,7 @@ class ChunkSize:
             return
         if self.trying:
             if self._answered >= PROOF and self._lost >= PROOF:
-                self.trying, self._short_until, self.size = False, now + SHORT_SECONDS, self._least
+                self.trying, self._short_until = False, now + SHORT_SECONDS
+                self._lost, self._since = 0, now  # long ones are still in flight
         elif self._lost >= SUSPICIOUS_LOSSES or (self._lost >= LONE_LOSSES and seconds >= LONE_SECONDS):
             self.trying, self._answered = True, 0

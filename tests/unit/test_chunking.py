@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from mavftpfs.protocol.chunking import LONE_LOSSES, LONE_SECONDS, ChunkSize
+from mavftpfs.protocol.chunking import LONE_LOSSES, LONE_SECONDS, SHORT, SUSPICIOUS_LOSSES, ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA
 
 pytestmark = pytest.mark.holds("fault long frames")
@@ -65,6 +65,15 @@ def test_what_was_lost_at_once_before_a_full_one_passed_changes_nothing() -> Non
     for _ in range(100):
         chunks.on_lost(MAX_DATA, 1.0, 2.1)
     assert not chunks.trying
+
+
+def test_long_ones_that_were_in_flight_when_only_short_ones_passed_prove_nothing_more() -> None:
+    chunks = ChunkSize()
+    use(chunks, 100, seconds=3.0)
+    assert (chunks.trying, chunks.size) == (False, SHORT)
+    for _ in range(SUSPICIOUS_LOSSES):
+        chunks.on_lost(MAX_DATA, 2.0, 3.0)
+    assert (chunks.trying, chunks.size) == (False, SHORT)
 
 
 def test_the_size_that_a_user_asked_for_stays() -> None:
