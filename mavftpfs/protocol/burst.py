@@ -66,8 +66,8 @@ class Burst:
     def over(self) -> bool:
         """Whether it is certain that no more data comes. After a NAK behind data, ArduPilot stops after one
         more packet, MAVSDK never: quiet, or the next packet, will tell."""
-        refused = self.nak is not None and self.empty
-        return self.highest == self.size or self.nak == NakCode.EOF or refused
+        ended = self.nak is not None and (self.nak == NakCode.EOF or self.empty)
+        return ended or self.highest == self.size
 
     @property
     def endless(self) -> bool:
@@ -79,7 +79,7 @@ class Burst:
 
         Never early: ArduPilot queues each new request as another full burst (servers.md 14.16).
         """
-        if self.empty:
+        if self.highest == self.start:
             return self.last_at + max(_MIN_QUIET, 3 * self.rto)
         if self.ending:
             return self.last_at + max(self.rto, 4 * self.interval)
@@ -132,7 +132,7 @@ class Burst:
         return True
 
     def _touch(self, now: float) -> None:
-        if self.barren or not self.empty:  # otherwise it is the first packet
+        if self.barren or self.highest > self.start:  # otherwise it is the first packet
             self.interval += (now - self.last_at - self.interval) * 0.1
         self.last_at = now
 

@@ -262,15 +262,15 @@ class Engine:
 
     def _on_burst(self, reply: Payload, now: float) -> bool:
         self._burst_heard_at = now
-        op = next((one for one in self._ops if one.on_burst(reply, now)), None)
-        if op is None:
-            return False
-        self.stats.replies += 1
-        self._heard_at = now
-        op.progress(now)
-        if op.done:
-            self.remove(op)
-        return True
+        for op in self._ops:
+            if op.on_burst(reply, now):
+                self.stats.replies += 1
+                self._heard_at = now
+                op.progress(now)
+                if op.done:
+                    self.remove(op)
+                return True
+        return False
 
     # --- what goes out
 
