@@ -15,8 +15,6 @@ from mavftpfs.link.messages import Address
 PATIENCE = 5.0
 """Seconds of silence after which another address may replace a sender's."""
 
-_MOST_SENDERS = 256
-
 NetAddress: TypeAlias = tuple[Any, ...]
 """A socket's name for its peer: host, port, and more for IPv6. A TCP peer is known by its host alone."""
 
@@ -28,7 +26,7 @@ class _Known:
 
 
 class AddressBook:
-    """The senders of one link."""
+    """The senders of one link: 65,536 at most, because system and component are a byte each."""
 
     def __init__(self) -> None:
         self._senders: dict[Address, _Known] = {}
@@ -47,10 +45,7 @@ class AddressBook:
         """
         known = self._senders.get(sender)
         if known is None:
-            if len(self._senders) >= _MOST_SENDERS:
-                self._drop_silent(now)
-            if len(self._senders) < _MOST_SENDERS:
-                self._senders[sender] = _Known(address, now)
+            self._senders[sender] = _Known(address, now)
             return True
         if known.address != address:
             if now - known.heard_at <= PATIENCE and known.address != distrusted:
@@ -58,11 +53,6 @@ class AddressBook:
             known.address = address
         known.heard_at = now
         return True
-
-    def _drop_silent(self, now: float) -> None:
-        self._senders = {
-            sender: known for sender, known in self._senders.items() if now - known.heard_at <= PATIENCE
-        }
 
 
 def readable_address(address: NetAddress) -> str:

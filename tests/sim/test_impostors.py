@@ -160,6 +160,21 @@ async def test_a_companion_has_an_address_of_its_own(monkeypatch: pytest.MonkeyP
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("promise 10")
+async def test_a_vehicle_of_a_large_swarm_has_an_address_too() -> None:
+    """It is heard after 500 others; the one that spoke last is another one."""
+    scene = Crowd()
+    others = [Address(system, component) for system in range(2, 252) for component in (1, 154)]
+    for other in others:
+        scene.link.intrude(THERE, heartbeat(other))
+    options = ConnectOptions(target_system=1)
+    async with scene.rig.connected(options) as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(scene.beat, THERE)
+        assert await read_file(connection, b"/f") == OURS
+        assert connection.status()["link"]["address"] == "10.0.0.1:14550"
+        nursery.cancel_scope.cancel()
+
+
 def forge(request: Payload) -> bytes:
     """Return the ACK of a read with everything right but the bytes."""
     return ftp(ack(request, b"\xee" * request.size).encode(), Address(254, 191))
