@@ -20,6 +20,10 @@ BEYOND = 100_000
 """Offset of a listing that is beyond the end of any directory. No listing goes on there."""
 
 _MAX_EMPTY_PAGES = 4
+_MAX_BARREN_PAGES = 40
+"""Pages in a row without a new name: MAVSDK repeats those that come behind what it leaves out (servers.md 6),
+and a server that ignores the offset repeats a page for ever."""
+
 _USUAL_PACE = 0.1
 """The share of the slowest card's time that a usual card needs for a checksum. A checksum is asked for again
 when a usual card would have answered, under the same seq: PX4 and ArduPilot, whose cards may be slower,
@@ -237,9 +241,7 @@ class ListDirectory(Operation):
         for entry in page.entries:  # a page may name something twice, too
             self._entries.setdefault(entry.name, entry)
         found = len(self._entries) > known
-        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
-        if found or not page.entries:
-            self.progress(now)
+        self.progress(now)
         if self._eof is not None:
             if not found:
                 self._on_eof()
@@ -248,13 +250,12 @@ class ListDirectory(Operation):
         if self.strings and bool(page.strings) != bool(self._first_page):
             self.complete = False  # a name that fits no page lies here, or before
         self._barren = 0 if found or (page.strings and not page.entries) else self._barren + 1
-        # MAVSDK repeats its first page, too, where it leaves out more entries than it shows (servers.md 6).
-        # But such a page has much room left, and comes only twice.
-        again = bool(page.entries) and reply.data == self._first_page
+        # The first page again may hide others. With much room left it hides none: they would have been in it.
+        again = reply.data == self._first_page and len(reply.data) > MAX_DATA // 2
         if page.strings:
             self._first_page = self._first_page or reply.data
         self.strings += page.strings or 1
-        if self.strings >= BEYOND or (again and (self._barren > 1 or len(reply.data) > MAX_DATA // 2)):
+        if self.strings >= BEYOND or self._barren >= _MAX_BARREN_PAGES or (self._barren and again):
             self.complete = False
             self.finish()
         elif not page.strings and self._barren >= _MAX_EMPTY_PAGES:

@@ -316,6 +316,22 @@ def test_a_server_that_ignores_the_offset_is_left() -> None:
     assert lister.engine.stats.requests < 50
 
 
+@pytest.mark.holds("fault odd listing")
+@pytest.mark.parametrize("hidden", [1, 2, 7, 30])
+def test_a_server_that_counts_what_it_leaves_out_is_listed_to_its_end(hidden: int) -> None:
+    """MAVSDK leaves out sockets and the like; here they come first in the directory."""
+    lister = Lister()
+    shown = [b"Fa\t1\0", b"Fb\t1\0"]
+    while not lister.op.done:
+        request = lister.ask()
+        page = b"".join(shown[max(0, request.offset - hidden) :])
+        reply = ack(request, page) if page else nak(request, NakCode.EOF)
+        lister.engine.receive(reply, 0.0)
+    assert lister.names == [b"a", b"b"]
+    assert lister.op.complete
+    assert lister.op.end is not None
+
+
 def test_endless_skip_marks_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mavftpfs.protocol.operations.BEYOND", 100)
     lister = Lister()
