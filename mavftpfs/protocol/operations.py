@@ -19,10 +19,9 @@ from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 BEYOND = 100_000
 """Offset of a listing that is beyond the end of any directory. No listing goes on there."""
 
-_MAX_EMPTY_PAGES = 4
 _MAX_BARREN_PAGES = 40
-"""Pages in a row without a new name: MAVSDK repeats those that come behind what it leaves out (servers.md 6),
-and a server that ignores the offset repeats a page for ever."""
+"""Pages in a row without a new name: MAVSDK repeats those that come behind what it leaves out (servers.md 6).
+A server that ignores the offset repeats a page for ever, and a PX4 that cannot read its card sends `S`."""
 
 _USUAL_PACE = 0.1
 """The share of the slowest card's time that a usual card needs for a checksum. A checksum is asked for again
@@ -166,8 +165,8 @@ class ListDirectory(Operation):
 
     ArduPilot and MAVSDK answer EOF at the offset of a name that fits no reply, too. So behind an EOF the next
     offset is asked for, once. If it has names, the listing goes on there, and is not complete. PX4 answers an
-    empty page at such an offset. Old PX4s answer one for an empty directory, too, so an empty page proves a
-    hidden name only if other pages have strings.
+    empty page at such an offset. Old PX4s answer one for an empty directory, too, so an empty first page
+    proves a hidden name only if another page follows.
 
     Attributes:
         complete: False when a cap, empty pages or a name that fits no reply hid something: absence of a name
@@ -196,7 +195,7 @@ class ListDirectory(Operation):
         self._entries: dict[bytes, DirEntry] = {}
         self._asked = -1  # the offset that was asked for last
         self._first_page = b""
-        self._barren = 0  # pages in a row that are empty or have no new name
+        self._barren = 0  # pages in a row without a new name
 
     @property
     def entries(self) -> list[DirEntry]:
@@ -241,24 +240,23 @@ class ListDirectory(Operation):
         for entry in page.entries:  # a page may name something twice, too
             self._entries.setdefault(entry.name, entry)
         found = len(self._entries) > known
+        self._barren = 0 if found else self._barren + 1
         self.progress(now)
         if self._eof is not None:
             if not found:
                 self._on_eof()
                 return
             self._eof, self.complete = None, False
-        if self.strings and bool(page.strings) != bool(self._first_page):
+        if self.strings and not (page.strings and self._first_page):
             self.complete = False  # a name that fits no page lies here, or before
-        self._barren = 0 if found or (page.strings and not page.entries) else self._barren + 1
         # The first page again may hide others. With much room left it hides none: they would have been in it.
-        again = reply.data == self._first_page and len(reply.data) > MAX_DATA // 2
+        again = page.entries and reply.data == self._first_page
         if page.strings:
             self._first_page = self._first_page or reply.data
         self.strings += page.strings or 1
-        if self.strings >= BEYOND or self._barren >= _MAX_BARREN_PAGES or (self._barren and again):
+        endless = self.strings >= BEYOND or self._barren >= _MAX_BARREN_PAGES
+        if endless or (again and len(reply.data) > MAX_DATA // 2):
             self.complete = False
-            self.finish()
-        elif not page.strings and self._barren >= _MAX_EMPTY_PAGES:
             self.finish()
 
     def _on_eof(self) -> None:
