@@ -82,12 +82,12 @@ class Identity:
     def __init__(
         self,
         on_doubt: Callable[[], None],
-        on_trusted: Callable[[bool], None],
+        on_trusted: Callable[[], None],
         on_stranger: Callable[[bool], None],
         patience: float,
     ) -> None:
-        """on_doubt: it is to be asked, because it may have restarted, or be another one. on_trusted: called
-        with whether it was a STRANGER until now. on_stranger: called with whether it told another id."""
+        """on_doubt: it is to be asked, because it may have restarted, or be another one. on_trusted: it is
+        TRUSTED again. on_stranger: called with whether it told another id."""
         self._patience = patience
         self.standing = Standing.TRUSTED
         self._on_doubt, self._on_trusted, self._on_stranger = on_doubt, on_trusted, on_stranger
@@ -130,9 +130,9 @@ class Identity:
             return False
         if self._known is None and (version.uid or any(version.uid2)):
             self._known = version
-        before, self.standing = self.standing, Standing.TRUSTED
-        if before is not Standing.TRUSTED:
-            self._on_trusted(before is Standing.STRANGER)
+        if self.standing is not Standing.TRUSTED:
+            self.standing = Standing.TRUSTED
+            self._on_trusted()
         return True
 
     def _is_stranger(self, *, told: bool) -> None:
@@ -350,8 +350,10 @@ class Vehicle:
         self._timed_out = False
         self.on_heartbeat(was_lost)
 
-    def _on_trusted(self, was_stranger: bool) -> None:
-        if not was_stranger and self._disarmed_at > self.identity.left_at:  # it was this one that said so
+    def _on_trusted(self) -> None:
+        """Believe that it is disarmed if it said so since it was away. Exception: after a STRANGER, who may
+        have said so, or a request that timed out, only its next heartbeat is believed."""
+        if not self._timed_out and self._disarmed_at > self.identity.left_at:
             self._on_armed(False)
         self._lives(self._timed_out)
 

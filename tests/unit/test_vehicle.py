@@ -29,11 +29,11 @@ def heartbeat(source: Address, *, autopilot: int = 12, armed: bool = False) -> H
     return Heartbeat(source, 2, autopilot, armed)
 
 
-def version(source: Address) -> AutopilotVersion:
-    return AutopilotVersion(source, 0x20, 1, 1, b"")
+def version(source: Address, uid: int = 1) -> AutopilotVersion:
+    return AutopilotVersion(source, 0x20, 1, uid, b"")
 
 
-OURS = version(PILOT)
+OURS, THEIRS = version(PILOT), version(PILOT, 2)
 FLIES, LANDED = heartbeat(PILOT, armed=True), heartbeat(PILOT)
 
 
@@ -102,6 +102,10 @@ def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
         pytest.param(
             [(10.0, LANDED, True), (11.0, FLIES, True), (12.0, OURS, True)],
             id="but not if it was armed again meanwhile",
+        ),
+        pytest.param(
+            [(1.0, THEIRS, True), (5.0, LANDED, True), (5.1, OURS, True), (6.0, LANDED, False)],
+            id="nor if another vehicle, which was away too, may have said so",
         ),
     ],
 )
