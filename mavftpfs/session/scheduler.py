@@ -9,8 +9,9 @@ runs in the caller's task. Between turns the janitor closes files that nobody ne
 task of its own, so that no cancelled caller interrupts a Terminate.
 
 The user with the least score is next. Its score is its recent usage in seconds, at most 0.3, less a tenth of
-the seconds that it waited. So an editor or `head` goes before a copy at once, and a row of small files keeps
-a copy waiting for three seconds at most.
+the seconds that it waited. So an editor or `head` goes before a copy at once, and beside small files a copy
+gets its next turn after about three seconds. If its turn began earlier, the next small read ends it at once,
+so beside small reads every few round trips little of a copy arrives.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 **Did that change happen?** A request whose answer was lost is sent again, and the server may execute it
 twice. It refuses the second execution, or that hits the name's next file (docs/servers.md 14.4). So after
-such a refusal, and after a silence, `_perform` lists the directory to see whether the change happened. While
-ACKs are suspect (`ServerSession.distrust`), the network may also have doubled a request that was sent once. A
-changed name may be in quarantine (`session.quarantine`); only `wait_out` waits for its end.
+such a refusal, a refused rename, or a silence, `_perform` lists the directory to see whether the change
+happened. While ACKs are suspect (`ServerSession.distrust`), the network may also have doubled a request that
+was sent once. A changed name may be in quarantine (`session.quarantine`); only `wait_out` waits for its end.
 """
 
 from __future__ import annotations
