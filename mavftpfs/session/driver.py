@@ -180,8 +180,7 @@ class Driver:
         now = self._clock()
         may_send = self._refill(now)
         for operation, (on_finished, _) in list(self._under_way.items()):
-            if operation.done:
-                self._under_way.pop(operation, None)
+            if operation.done and self._under_way.pop(operation, None) is not None:
                 if isinstance(operation.error, RequestTimeout):
                     self.vehicle.note_timeout()
                 on_finished()

@@ -121,6 +121,23 @@ async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str) -
         nursery.cancel_scope.cancel()
 
 
+async def test_an_operation_that_ends_is_told_once_and_a_cancelled_one_never() -> None:
+    async with rig("px4") as here:
+        driver, told = here.connection.driver, list[str]()
+        first, second, third = (Simple(Opcode.CALC_FILE_CRC32, b"/%d" % number) for number in range(3))
+
+        def on_first() -> None:
+            told.append("first")
+            driver.cancel(second)
+
+        driver.start(first, on_first)
+        driver.start(second, lambda: told.append("second"))
+        driver.start(third, lambda: told.append("third"))
+        await trio.sleep(1.0)
+        assert (first.done, second.done, third.done) == (True, True, True)
+        assert told == ["first", "third"]
+
+
 async def test_a_reboot_forgets_what_was_seen_of_the_server() -> None:
     async with rig("px4", {b"/d/small": b"hello"}) as here:
         await here.connection.store.list_directory(b"/d")
