@@ -8,6 +8,7 @@ cannot be stopped: ArduPilot sends 500 to 2000 packets, and answers nothing else
 |---|---|---|
 | a burst is running | nothing | with the burst |
 | `by_requests`: others wait for answers | what is wanted, by ReadFile | when its owner says so |
+| full chunks are lost, and short ones may pass | what is wanted, by ReadFile | when full ones pass |
 | a burst was refused, or two in a row brought no data | what is wanted, by ReadFile | never |
 | the last burst left gaps below `_covered` | what is wanted there, by ReadFile | when all of it arrived |
 | otherwise | a burst from the first wanted byte on | at once |
@@ -168,7 +169,8 @@ class BurstTransfer(ReadTransfer):
         """Return the BurstReadFile that is due, or ReadFiles, as the module's table says."""
         if self._burst is not None:
             return []
-        by_requests = self.by_requests or self._barren_bursts >= _BARREN_BURSTS
+        only_short = self.chunks.trying or self.chunks.size < self.chunks.most
+        by_requests = self.by_requests or only_short or self._barren_bursts >= _BARREN_BURSTS
         requests = self._requests_below(self.size if by_requests else self._covered, most, now)
         if requests or by_requests or self.wants.in_flight:
             return requests

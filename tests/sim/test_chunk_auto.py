@@ -9,7 +9,7 @@ import trio
 
 from mavftpfs.protocol.chunking import SHORT, SHORT_SECONDS
 from mavftpfs.protocol.payload import MAX_DATA
-from mavftpfs.session.connection import Connection
+from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.rigs import Rig
 from tests.support.transfers import content, path, put, read_file
@@ -52,3 +52,22 @@ async def test_a_file_is_read_where_no_full_frame_passes_until_they_do_again(pro
         assert await read_file(connection, path(profile, "file")) == data
         assert sizes(connection)[0] == MAX_DATA
         assert connection.engine.stats.requests - requests < 20_000 / MAX_DATA + 8
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_file_is_read_to_its_end_where_no_full_frame_passes_any_more(profile: str) -> None:
+    """The gaps that a burst left show it. PX4's bursts have full packets, whatever is asked for."""
+    data = content(40_000)
+    here = Rig(profile, {b"/d/file": data}, replace(RADIO, loss=0.2))
+    async with (
+        here.connected(ConnectOptions(read_mode="burst")) as connection,
+        trio.open_nursery() as nursery,
+    ):
+
+        async def spoil() -> None:
+            await trio.sleep(3.0)
+            here.model.settings = replace(RADIO, mtu=LIMIT)
+
+        nursery.start_soon(spoil)
+        assert await read_file(connection, path(profile, "file")) == data
+        assert sizes(connection)[0] == SHORT
