@@ -384,9 +384,14 @@ class Store:
         """Run a request; if it failed and may have been executed all the same, return or raise by what
         listings show. A refused request of which they show that it was not executed is sent once more.
 
+        A refused rename is looked at in any case, because its caller would take the refusal for proof that
+        nothing is renamed. If the old name is gone then, the network doubled the request, or another client
+        removed the file, and the new name has the one that it had before. Both are a reason for doubt.
+
         after: the state of each name once the change happened.
         """
         error: FtpNak | RequestTimeout
+        renames = After.PRESENT in after.values()
         for last in (False, True):
             self._under_way += 1
             began, repeated = self._clock(), True  # as long as no answer came
@@ -407,18 +412,16 @@ class Store:
                     self._quarantine.on_changed(path, now, now - began if counts else 0.0)
             silent = isinstance(error, RequestTimeout)
             # A refusal may answer the second execution.
-            may_have_happened = (
-                last
-                or isinstance(error, RequestTimeout)
-                or error.retransmitted
-                or error.opcode == Opcode.RENAME  # the caller would take it for proof that nothing is renamed
-                or self._server.in_doubt()
+            twice = (
+                last or isinstance(error, RequestTimeout) or error.retransmitted or self._server.in_doubt()
             )
             # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
-            if isinstance(error, FtpNak) and not may_have_happened and error.code != NakCode.FILE_EXISTS:
+            if isinstance(error, FtpNak) and not (twice or renames or error.code == NakCode.FILE_EXISTS):
                 raise error
             outcome = await self._look(after, silent=silent)
-            if outcome is Outcome.HAPPENED and may_have_happened:
+            if outcome is Outcome.HAPPENED and (twice or renames):
+                if not twice:
+                    self._server.distrust(reads=True)
                 return
             if outcome is Outcome.UNKNOWN or (silent and outcome is Outcome.CONFLICT):
                 raise OutcomeUnknown(f"{error}; whether it was done is not known") from error

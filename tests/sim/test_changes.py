@@ -178,6 +178,25 @@ async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool) -> No
                 nursery.start_soon(one, number)
 
 
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "ardupilot5", "mavsdk"])
+async def test_a_file_whose_temporary_file_another_client_removed_is_sent_again(profile: str) -> None:
+    here = Rig(profile, {b"/file": b"before"})
+    async with here.mounted(listed=b"/") as tree:
+        await write_file(tree, b"/other", b"teaches how this server renames")
+        litter: list[bytes] = []
+
+        def remove() -> None:
+            new = [name for name in here.litter() if here.data(name) == b"after"]
+            litter.extend(new)
+            for name in new:
+                here.take(name)
+
+        here.faults.at(Opcode.RENAME, remove)
+        await write_file(tree, b"/file", b"after")
+        assert litter
+        assert await read_file(tree, b"/file") == here.data(b"/file") == b"after"
+
+
 @pytest.mark.holds("promise 2", "rule 14.4")
 @pytest.mark.parametrize("removes", ["source", "target"])
 async def test_a_rename_without_an_answer_is_not_done_twice_beside_a_reader_on_nuttx(removes: str) -> None:
