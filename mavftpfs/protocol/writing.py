@@ -115,8 +115,8 @@ class WriteTransfer(Operation):
     Attributes:
         paused: send nothing new, but still take the answers to requests in flight.
 
-    Fails with SessionLost (from the FtpNak that showed it), FtpNak, RequestTimeout, or the source's error. At
-    the end, `finish` included, bytes that were not ACKed return to `todo` of the source.
+    Fails with SessionLost (from the FtpNak, if that may be a full card), FtpNak, RequestTimeout, or the
+    source's error. At the end, `finish` included, bytes that were not ACKed return to `todo` of the source.
     """
 
     urgent = False
@@ -262,11 +262,12 @@ class WriteTransfer(Operation):
         return count if count <= request.size else 0
 
     def _meaning(self, nak: FtpNak) -> MavftpfsError:
-        # On MAVSDK 1 may be a full card, too: then the session is lost again and again, without getting
-        # further.
+        # On MAVSDK 1 may be a full card, too: then the session is lost again and again without progress, and
+        # the upload fails with the refusal, after which nobody tries it again.
         if nak.code in NO_FILE_CODES or nak.server_errno in _NO_FILE_ERRNOS:
             lost = SessionLost(str(nak), by_server=True)
-            lost.__cause__ = nak
+            if nak.code == NakCode.FAIL:
+                lost.__cause__ = nak
             return lost
         return nak
 

@@ -31,6 +31,7 @@ from mavftpfs.shared.errors import (
     NotDeliveredYet,
     OutcomeUnknown,
     RequestTimeout,
+    SessionLost,
     SpoolFailed,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -582,3 +583,17 @@ async def test_a_directory_that_others_put_in_the_place_of_a_file_that_is_writte
         with pytest.raises(FileChanged):
             await file.release()
         assert tree.undelivered() == [FILE]
+
+
+@pytest.mark.parametrize(
+    ("profile", "codes"), [("px4", (NakCode.FAIL_ERRNO, 9)), ("ardupilot", (NakCode.FILE_NOT_FOUND,))]
+)
+async def test_a_session_that_is_lost_for_long_is_no_refusal(profile: str, codes: tuple[int, ...]) -> None:
+    here = Rig(profile, {b"/d": None})
+    async with here.mounted() as tree:
+        here.faults.refuse(Opcode.WRITE_FILE, *codes, times=100_000)
+        with pytest.raises(SessionLost):
+            await write_file(tree, b"/d/file", b"whole")
+        here.faults.call_off()
+        await trio.sleep(60)
+        assert here.data(b"/d/file") == b"whole"

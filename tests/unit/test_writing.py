@@ -121,7 +121,7 @@ def test_a_lost_session_gives_everything_back(codes: tuple[int, ...]) -> None:
     engine.receive(nak(requests[2], *codes), 0.1)
     assert isinstance(transfer.error, SessionLost)
     assert transfer.error.by_server
-    assert isinstance(transfer.error.__cause__, FtpNak)
+    assert isinstance(transfer.error.__cause__, FtpNak) is (codes == (1,))  # which may be a full card
     assert source.in_flight.empty
     assert list(source.todo) == [(239, len(CONTENT))]
     engine.receive(ack(requests[1]), 0.2)  # too late to count for this file
