@@ -267,5 +267,9 @@ def _follow(card: Card, old: bytes, new: bytes) -> None:
     target.prune()
     for file in card.files_below(new):
         file.blocks.close_reader()  # the next read opens the file under its new name
+        if card.store.in_doubt():  # others may have removed it, and the new name have the file of before
+            file.blocks.drop()
+            file.in_kernel = False
+            card.tell_changed(file.path)
         if file.content.spooled is not None:
             file.content.spooled.name = file.path

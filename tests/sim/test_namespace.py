@@ -509,3 +509,20 @@ async def test_old_files_of_a_name_go_with_it_also_those_of_other_mounts(torn: R
     assert left not in torn.files()
     await trio.sleep(SAME_FOR)
     assert FILE not in torn.files()
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5", "mavsdk"])
+async def test_a_file_that_another_client_removed_before_its_rename_shows_what_the_card_has(
+    profile: str,
+) -> None:
+    here = Rig(profile, {b"/a": b"A" * 500, b"/b": b"B" * 500})
+    async with here.mounted(listed=b"/") as tree:
+        assert await read_file(tree, b"/a") == b"A" * 500
+        await trio.sleep(30)
+        await tree.list(b"/")
+        here.take(b"/a")
+        with suppress(MavftpfsError):
+            await tree.rename(b"/a", b"/b")
+        await trio.sleep(60)
+        assert await read_file(tree, b"/b") == here.data(b"/b")
