@@ -199,7 +199,7 @@ class ListDirectory(Operation):
 
     @property
     def entries(self) -> list[DirEntry]:
-        """What was listed, each name once, `.` and `..` left out."""
+        """The listed entries, each name once, without `.` and `..`."""
         return list(self._entries.values())
 
     @property

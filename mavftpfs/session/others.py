@@ -39,7 +39,7 @@ _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # their positions in a payload
 
 
 class Heard(Enum):
-    """What a request of another client, or the answer to it, tells of its session."""
+    """An event in the session of another client, told by its request or by the answer."""
 
     ASKED = "asked to open"
     OPENED = "opened"
@@ -49,7 +49,7 @@ class Heard(Enum):
 
 
 class Theirs(Enum):
-    """What other clients have, as far as it was heard."""
+    """The state of other clients' sessions, as far as it was heard."""
 
     NOTHING = "nothing"
     ASKED = "an open that is not answered yet"
@@ -61,7 +61,7 @@ _THEN: dict[Theirs, dict[Heard | None, Theirs]] = {
     Theirs.ASKED: {Heard.REFUSED: Theirs.NOTHING, Heard.OPENED: Theirs.FILE, Heard.USED: Theirs.FILE},
     Theirs.FILE: {Heard.CLOSED: Theirs.NOTHING},
 }
-"""What they have -> what is heard -> what they have then; anything else changes nothing."""
+"""The state -> the event -> the next state. Any other event changes nothing."""
 
 
 class OtherClients:

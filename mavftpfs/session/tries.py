@@ -1,4 +1,4 @@
-"""What a user of the session tried since its last progress, and when it tries again. Layer: session; pure.
+"""The tries of a session user since its last progress, and the time of the next. Layer: session; pure.
 
 Progress is a byte that arrived, or was ACKed, for the first time. A user fails if it made none for
 `op_deadline` from the beginning of its first turn without progress.
